@@ -104,7 +104,8 @@ class Listener:
 
 def swept(plan: SweepPlan, out: Path, port: int, **more: Any) -> Recorded:
     link = Link(robot=plan.robot.name, address=Address.parse("lcm", port=port), fresh=FRESH)
-    return record_wire(plan, out, link, limits=PATIENT, real_time=True, **more)
+    more = {"limits": PATIENT, "standby_s": 2.0, **more}
+    return record_wire(plan, out, link, real_time=True, **more)
 
 
 def early(action: Callable[[], object]) -> Callable[[float], None]:
@@ -144,7 +145,7 @@ def cut(out: Path, reason: str) -> JointLog:
 def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
     plan = plan_of("gripper", "so101", 0.05)
     link = Link(robot="so101", address=Address.parse("sim://bench"))
-    recorded = record_wire(plan, tmp_path, link, limits=PATIENT)
+    recorded = record_wire(plan, tmp_path, link, limits=PATIENT, real_time=False)
     log = read_mcap(recorded.logs[0])
     assert recorded.virtual
     assert log.complete

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -132,15 +132,14 @@ def record_wire(
     link: Link,
     *,
     overwrite: bool = False,
-    real_time: bool = False,
-    limits: Mapping[str, float] | None = None,
     progress: Callable[[float], None] = lambda share: None,
+    **more: Any,
 ) -> Recorded:
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
-    The caller has checked the plan. `limits` are other values for scalar limits of the safety
-    filter. If the robot may not be moved, the filter stops it or a process is killed, a PronkError
-    is raised and what was recorded stays.
+    The caller has checked the plan; `more` is of the runtime's `Plan`. If the robot may not be
+    moved, the filter stops it or a process is killed, a PronkError is raised and what was recorded
+    stays.
     """
     from pronk.runtime.plan import Plan
     from pronk.runtime.run import run_sweep
@@ -153,10 +152,10 @@ def record_wire(
     def notify(event: Event) -> None:
         if event.kind == "log":
             whole.append(event.text)
-        elif event.kind == "system" and real_time:
+        elif event.kind == "system" and job.real_time:
             console.say(event.text)
 
-    job = Plan(link=link, sweep=task, real_time=real_time, limits=limits or {})
+    job = Plan(link=link, sweep=task, **more)
     try:
         return run_sweep(job, clamp_operator=console.Person(), notify=notify, progress=progress)
     except BaseException:
