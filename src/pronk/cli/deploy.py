@@ -11,7 +11,8 @@ import tyro
 from pronk.cli import console
 from pronk.cli.options import Base, LinkOptions
 from pronk.errors import HardwareError, PronkError
-from pronk.runtime import BLEND_S, TILT
+from pronk.runtime.safety import Limits
+from pronk.runtime.state_machine import Timing
 
 if TYPE_CHECKING:
     from pronk.policy.contract import Contract
@@ -32,8 +33,8 @@ def deploy(
     log: Path | None = None,
     capture: Path | None = None,
     seconds: float | None = None,
-    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = BLEND_S,
-    tilt: float = TILT,
+    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = Timing.blend_s,
+    tilt: float = Limits.tilt,
     ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
 ) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
@@ -57,7 +58,6 @@ def deploy(
     from pronk.policy.runtime import load_policy
     from pronk.runtime.plan import Link, Plan
     from pronk.runtime.run import run
-    from pronk.runtime.state_machine import Timing
     from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
 
     contract = load_policy(policy).contract

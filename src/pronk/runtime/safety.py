@@ -27,7 +27,6 @@ from pronk.actuator.model import voltage_limits, winding_loss
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
-from pronk.runtime import TILT
 from pronk.runtime.supervision import Supervision
 
 
@@ -136,7 +135,7 @@ class Limits:
     """Largest bus power of a command, computed from the torques that the drives can give at their
     speeds, with winding losses and without recovery [W]. Twelve standing drives at their effort
     limits would take 4.4 kW."""
-    tilt: float = TILT
+    tilt: float = 0.8
     """Largest angle of the trunk's z axis from the vertical [rad]; infinite for a hung robot."""
     temperature: float = 80.0
     """Of any motor, where it is measured [deg C]."""

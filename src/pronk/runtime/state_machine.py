@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pronk.errors import RobotError
 from pronk.links.machine import Command
 from pronk.robots.robot import RobotSpec
-from pronk.runtime import BLEND_S
 from pronk.runtime.ipc import Mode, OperatorRequest, Record
 from pronk.runtime.safety import FilterAction, Reason, SafetyFilter
 
@@ -58,7 +57,7 @@ class Timing:
     """From there to the default pose."""
     ramp_s: float = 0.5
     """In which the stiffness grows from none to that of the robot's drives."""
-    blend_s: float = BLEND_S
+    blend_s: float = 0.4
     """In which the policy's targets replace the pose; 0 as in training."""
     halt_s: float = 1.0
     """With a zero command before the robot sits down."""
