@@ -1,7 +1,7 @@
 """Drive laws beside the real engines: SAPIEN (PhysX), Drake, PyBullet, where installed; MuJoCo.
 
-With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`: MJX, Newton
-and Genesis too (docs/simulators.md has the results).
+With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`: MJX, Newton,
+Genesis and ovphysx too (docs/simulators.md has the results).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pronk.simulators.engines.engine import EngineSimulator
 from pronk.simulators.engines.genesis import Genesis
 from pronk.simulators.engines.mujoco import Mjx, Mujoco
 from pronk.simulators.engines.newton import Newton
+from pronk.simulators.engines.ovphysx import OvPhysx
 from pronk.simulators.engines.pybullet import PyBullet
 from pronk.simulators.engines.sapien import Sapien
 from pronk.simulators.mujoco import Chain
@@ -36,6 +37,8 @@ BAND = (1.0, 15.0)
 CASES: list[tuple[type[EngineSimulator], DriveLaw]] = [
     (Sapien, DriveLaw()),
     *((Sapien, DriveLaw(kind="implicit", iterations=n)) for n in (1, 4, 10)),
+    (OvPhysx, DriveLaw()),
+    *((OvPhysx, DriveLaw(kind="implicit", iterations=n)) for n in (1, 4)),
     (Drake, DriveLaw()),
     (Drake, DriveLaw(kind="implicit")),
     (PyBullet, DriveLaw(passive_damping="explicit")),
@@ -145,7 +148,7 @@ def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: D
     command, expected, got, joints = both(engine, robot, "FR_hip_pitch", chirp(step))
     assert len(joints) == 3
     # PhysX solves joint by joint, the others all joints of a chain at once, as the law does.
-    exact = law.kind != "implicit" or engine is not Sapien
+    exact = law.kind != "implicit" or engine not in (Sapien, OvPhysx)
     for k, joint in enumerate(joints):
         u = command[:, joints.index("FR_hip_pitch")]
         ours, law_db = level(u, got[:, k], step), level(u, expected[:, k], step)
@@ -155,14 +158,15 @@ def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: D
             assert np.abs(10.0 ** (ours / 20.0) - 10.0 ** (law_db / 20.0)).max() < 0.02, joint
 
 
-@pytest.mark.parametrize("engine", [Sapien, Drake, PyBullet])
+@pytest.mark.parametrize("engine", [Sapien, OvPhysx, Drake, PyBullet])
 def test_explicit_drives_have_the_motors_limits(engine: type[EngineSimulator]) -> None:
     limits = {"effort_limit": 1.0, "stall_torque": 1.4, "no_load_speed": 12.0}
-    robot = prepared(PENDULUM, DriveLaw(), **limits)
+    # The motor's limits are those of its torque alone; PyBullet's include passive damping.
+    passive = {"viscous_damping": 0.0 if engine is PyBullet else 0.1}
+    robot = prepared(PENDULUM, DriveLaw(), **limits, **passive)
     _, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
-    _, free, _, _ = both(
-        engine, prepared(PENDULUM, DriveLaw(), **LINEAR), "swing", chirp(0.005, seconds=4.0)
-    )
+    robot = prepared(PENDULUM, DriveLaw(), **LINEAR, **passive)
+    _, free, _, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
     assert np.abs(expected - free).max() > 0.02
     assert np.abs(expected - got).max() < 1e-4
 

@@ -59,7 +59,7 @@ class EngineSimulator(ABC):
     """
 
     extra: ClassVar[str]
-    """Extra of pronk that installs the engine; empty if pronk's MuJoCo excludes it."""
+    """Extra of pronk that installs the engine; empty if it has a Python of its own."""
     module: ClassVar[str]
     """What is imported to see that the engine is installed."""
     package: ClassVar[str]
