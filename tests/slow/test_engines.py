@@ -161,11 +161,11 @@ def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: D
 @pytest.mark.parametrize("engine", [Sapien, OvPhysx, Drake, PyBullet])
 def test_explicit_drives_have_the_motors_limits(engine: type[EngineSimulator]) -> None:
     limits = {"effort_limit": 1.0, "stall_torque": 1.4, "no_load_speed": 12.0}
-    # The motor's limits are those of its torque alone; PyBullet's include passive damping.
-    passive = {"viscous_damping": 0.0 if engine is PyBullet else 0.1}
-    robot = prepared(PENDULUM, DriveLaw(), **limits, **passive)
+    law = DriveLaw(passive_damping="explicit" if engine is PyBullet else "implicit")
+    # The motor's limits are those of its torque alone, without passive damping.
+    robot = prepared(PENDULUM, law, **limits, viscous_damping=0.1)
     _, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
-    robot = prepared(PENDULUM, DriveLaw(), **LINEAR, **passive)
+    robot = prepared(PENDULUM, law, **LINEAR, viscous_damping=0.1)
     _, free, _, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
     assert np.abs(expected - free).max() > 0.02
     assert np.abs(expected - got).max() < 1e-4

@@ -1,7 +1,7 @@
 """PyBullet with explicit torques (law E), the chain written as a URDF.
 
 PyBullet has no armature: that of one joint is added to its link's inertia, which is the same thing.
-In a chain it would also turn with the parents, so chains take none. Passive damping is part of the
+In a chain it would also turn with the parents, so chains take none. Passive damping is an
 explicit torque (`DriveLaw.passive_damping`). Dry friction is that of a velocity motor, which holds
 a joint at rest.
 """
@@ -9,7 +9,6 @@ a joint at rest.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +67,6 @@ class PyBullet(EngineSimulator):
                 forces=drives.frictionloss[order],
                 physicsClientId=client,
             )
-            drives = replace(drives, damping=drives.damping + drives.viscous, viscous=0.0 * start)
             out, speed = np.empty(command.shape), np.zeros(len(order))
             for row, target in zip(out, command, strict=True):
                 states = bullet.getJointStates(chain, index, physicsClientId=client)
@@ -76,7 +74,7 @@ class PyBullet(EngineSimulator):
                 speed[order] = [state[1] for state in states]
                 bullet.setJointMotorControlArray(
                     *(chain, index, bullet.TORQUE_CONTROL),
-                    forces=drives.torque(target, row, speed)[order],
+                    forces=(drives.torque(target, row, speed) - drives.viscous * speed)[order],
                     physicsClientId=client,
                 )
                 bullet.stepSimulation(physicsClientId=client)
