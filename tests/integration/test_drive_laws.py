@@ -21,6 +21,7 @@ from pronk.simulators.mujoco import Chain, JointTestRig
 Array = NDArray[np.float64]
 LAWS = [
     DriveLaw(),
+    DriveLaw(passive_damping="explicit"),
     DriveLaw(kind="implicit_damping"),
     *(DriveLaw(kind="implicit", iterations=n) for n in (1, 4, 10)),
 ]
@@ -63,7 +64,9 @@ def integrated(robot: RobotSpec, joint: str, command: Array, start: Array) -> Ar
             mujoco.mj_makeM(model, data)
             mujoco.mj_rne(model, data, 0, data.qfrc_bias)
             mujoco.mj_fullM(model, data, mass)
-            matrix = mass + h * np.diag(passive)
+            matrix = mass.copy()
+            if law.passive_damping == "implicit":
+                matrix += h * np.diag(passive)
             force = -kd * data.qvel - passive * data.qvel - data.qfrc_bias
             if law.kind != "explicit":
                 matrix = matrix + h * np.diag(kd)
@@ -123,8 +126,10 @@ def test_the_linearized_response_is_that_of_a_sine(law: DriveLaw) -> None:
     assert abs(np.angle(got / expected)) < 1e-3
 
 
-def test_a_law_without_iterations_takes_none() -> None:
+def test_a_law_takes_only_what_it_has() -> None:
     with pytest.raises(PronkError, match="iterations"):
         DriveLaw(kind="implicit_damping", iterations=4)
     with pytest.raises(PronkError, match="explicit, implicit_damping, implicit"):
         DriveLaw(kind="implicit_stiffness")  # type: ignore[arg-type]
+    with pytest.raises(PronkError, match="passive_damping"):
+        DriveLaw(kind="implicit", passive_damping="explicit")

@@ -357,7 +357,7 @@ def test_gains_of_another_drive_law_are_refused() -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin"])
+@pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin", "newton-featherstone"])
 def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     arm = load_robot("so101")
     loss = {"frictionloss": 0.0, "stribeck_speed": 0.0, "effort_limit": 1e6, "stall_torque": 1e6}
@@ -367,7 +367,7 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     robot = replace(profile(name).robot(arm), joints=tuple(joints))
     drives = actuators(matched("so101", name), robot, "joint")
     # Only a large stiffness makes the law with implicit damping diverge.
-    field = "damping" if name == "mjlab" else "stiffness"
+    field = "stiffness" if name == "mjlab-builtin" else "damping"
     low, high = 0.1, 1e3
     while high / low > 1.001:
         scale = np.sqrt(low * high)
