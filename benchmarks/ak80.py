@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.runner import finish
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
@@ -41,8 +42,6 @@ from pronk.match.torque import (
 )
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "ak80"
 RIG = Path(__file__).with_name("ak80.xml")

@@ -18,9 +18,9 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from benchmarks.runner import machine
+from pronk.arrays import Array, ComplexArray
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.tables import table
@@ -36,9 +36,6 @@ from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.simulators.profiles import profile
 from pronk.simulators.simulator import Closing, joint_rigs, load_simulator
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 ENGINES = {
     "mjlab": "mujoco",

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk import robots
+from pronk.arrays import Array
 from pronk.policy.contract import METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.observation import ESTIMATE, JOINTS, MEASURED, MEASURED_SIZE
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 
 def write_linear(

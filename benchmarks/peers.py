@@ -26,12 +26,12 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import RobotSpec
 
-Array = NDArray[np.float64]
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Lowest and highest stiffness, lowest and highest damping."""
 

@@ -16,10 +16,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.runner import finish, in_parallel
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.robots import load_robot
@@ -34,7 +34,6 @@ from pronk.simulators.probe import Probe
 from pronk.simulators.probe import probe as look
 from pronk.simulators.simulator import SimulatorInfo
 
-Array = NDArray[np.float64]
 ROBOTS = (
     (str(Path(__file__).parents[1] / "examples" / "pendulum"), "swing"),
     ("mini_cheetah", "FR_knee"),

@@ -15,8 +15,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.cli.sweep import AMPLITUDES
 from pronk.excitation.plan import Excitation, SweepPlan, make_plan
 from pronk.excitation.signals import Chirp, Multisine, Signal
@@ -27,8 +27,6 @@ from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import JointParams, SimParams, load_sim_params
-
-Array = NDArray[np.float64]
 
 ROBOT = "mini_cheetah"
 FRICTION = (0.0, 3.0)

@@ -25,6 +25,7 @@ import numpy as np
 import tyro
 
 from benchmarks.runner import Row, finish, rows_in, rows_of
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import HardwareError
 from pronk.links.machine import State
@@ -32,7 +33,7 @@ from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
 from pronk.runtime.rollout import PolicyRunner
-from pronk.runtime.safety import Array, Decision, Limits, Reason, SafetyFilter
+from pronk.runtime.safety import Decision, Limits, Reason, SafetyFilter
 from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import StateMachine, Timing
 from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled

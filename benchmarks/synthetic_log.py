@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
+from pronk.arrays import Array
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.simulators.simulator import JointRigs
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
+from pronk.arrays import Array
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.arm import ArmProblem, trusted
 from pronk.match.fit import solve
@@ -26,8 +26,6 @@ from pronk.simulators.chain import ChainSimulation, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.mujoco import Drives
 from pronk.simulators.simulator import JointRigs
-
-Array = NDArray[np.float64]
 
 FREE = ("stiffness", "damping", "delay")
 MAX_DELAY_S = 0.04

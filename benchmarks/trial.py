@@ -18,17 +18,15 @@ from unittest.mock import patch
 import mujoco
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from benchmarks.runner import Progress, finish, in_turn, machine, paired_ratio, spread
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.protocol import PAPER_COMMANDS
 from pronk.evaluation.trial import Job, Plan, load_subjects, plan_jobs, run_job
 from pronk.robots import load_robot
 from pronk.virtual.sim_params import SimParams, load_sim_params
-
-Array = NDArray[np.float64]
 
 LIMIT = 0.6
 """Least speed over that of the bare loop."""

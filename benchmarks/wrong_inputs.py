@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
 from benchmarks.runner import Progress, finish, in_parallel
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.excitation.plan import make_plan
@@ -42,8 +42,6 @@ from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.plant import leg_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams, load_sim_params
-
-Array = NDArray[np.float64]
 
 ROBOT = "mini_cheetah"
 FRICTION = {"random": 0, "wrong": 1, "right": 2}

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import chirp, cont2discrete, lfilter
 
+from pronk.arrays import Array, ComplexArray
 from pronk.logs.joint_log import JointLog, Segment
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 KNEE = {"stiffness": 21.9, "damping": 0.54, "inertia": 0.0068}
 HIP = {"stiffness": 20.6, "damping": 0.49, "inertia": 0.02}

@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError, HardwareError
 from pronk.files import save_arrays
@@ -19,8 +18,6 @@ from pronk.virtual.ground import Ground, Start
 from pronk.virtual.plant import Plant, legs_of, motor_of
 from pronk.virtual.robot import VirtualRobot
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains
-
-Array = NDArray[np.float64]
 
 FEET = [f"{leg}_foot" for leg in ("FR", "FL", "HR", "HL")]
 KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]

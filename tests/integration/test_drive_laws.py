@@ -7,9 +7,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
@@ -18,7 +18,6 @@ from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.linear import plant
 from pronk.simulators.mujoco import Chain, JointTestRig
 
-Array = NDArray[np.float64]
 LAWS = [
     DriveLaw(),
     DriveLaw(passive_damping="explicit"),

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
@@ -31,8 +31,6 @@ from pronk.virtual.sim_params import (
     with_changes,
 )
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet
-
-Array = NDArray[np.float64]
 
 ARM = load_robot("so101")
 GRAVITY = 9.81

@@ -7,7 +7,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
@@ -18,6 +17,7 @@ from torch import Tensor
 
 import training_env
 from parts import where
+from pronk.arrays import Array
 from pronk.policy.observation import ACTOR_INDICES, MEASURED
 from pronk.robots.legged import legged
 from pronk.train.mdp.commands import motion_command
@@ -26,7 +26,6 @@ from training_env import MANY, ROBOT, N
 
 pytestmark = pytest.mark.train
 
-Array = NDArray[np.float64]
 BODY = legged("mini_cheetah")
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
 STAND = torch.tensor([0.0, 0.2, -0.7] * 4).expand(N, 12)

@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from benchmarks.probe import ENGINES, ROBOTS, Drawn, Truth, drawn, score
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.cli.main import run
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.simulators.engines.mujoco import Mujoco
 from pronk.simulators.probe import probe
 
-Array = NDArray[np.float64]
 PENDULUM, SWING = ROBOTS[0]
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import signal
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
@@ -18,8 +18,6 @@ from pronk.virtual.plant import Plant, motor_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet
-
-Array = NDArray[np.float64]
 
 NAMES = ROBOT.joint_names
 TICK = 0.02

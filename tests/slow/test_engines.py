@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -31,7 +31,6 @@ from pronk.simulators.engines.sapien import Sapien
 from pronk.simulators.mujoco import Chain
 from pronk.simulators.simulator import Closing, load_simulator
 
-Array = NDArray[np.float64]
 PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
 BAND = (1.0, 15.0)
 CASES: list[tuple[type[EngineSimulator], DriveLaw]] = [

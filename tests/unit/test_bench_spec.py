@@ -10,16 +10,15 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import chirp
 
 from pronk.actuator.model import pd_torque, torque_limits
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passive
 from pronk.robots.robot import RobotSpec
 
-Array = NDArray[np.float64]
 CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")
 
 

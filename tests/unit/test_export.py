@@ -9,9 +9,9 @@ from typing import Any, get_args
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pronk.actuator.model import torque_limits
+from pronk.arrays import Array
 from pronk.cli.export import Target
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
@@ -25,7 +25,6 @@ from pronk.simulators.chain import ChainSimulation
 from pronk.simulators.mujoco import Chain
 from pronk.simulators.profiles import profile, profiles
 
-Array = NDArray[np.float64]
 ROBOT = load_robot("mini_cheetah")
 _ISAACLAB = {"joint_names_expr", "stiffness", "damping", "armature"} | {
     *("friction", "dynamic_friction", "viscous_friction"),

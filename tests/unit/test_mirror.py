@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from parts import where
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
@@ -26,7 +26,6 @@ from pronk.train.rl.symmetry import GROUPS, mirrored, with_mirror_image
 
 pytestmark = pytest.mark.train
 
-Array = NDArray[np.float64]
 
 ROBOT = load_robot("mini_cheetah")
 BODY = legged("mini_cheetah")

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import search
@@ -20,8 +20,6 @@ from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import JointTestRig, MujocoSimulator, rig_on
-
-Array = NDArray[np.float64]
 
 ROBOT = load_robot("mini_cheetah")
 STIFFNESS = np.array([13.0, 27.0, 20.0, 13.0, 27.0])

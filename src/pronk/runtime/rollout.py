@@ -11,8 +11,8 @@ import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, Machine, State
 from pronk.policy.contract import check
@@ -21,7 +21,6 @@ from pronk.policy.runtime import Policy
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import Commanded
 
-Array = NDArray[np.float64]
 Source = Callable[[float], Commanded]
 """The command at a time since the policy started [s]."""
 

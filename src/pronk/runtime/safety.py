@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.actuator.model import voltage_limits, winding_loss
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
@@ -87,8 +88,6 @@ class Reason(IntEnum):
     CLIPPED = 27, "a joint's target was beyond its torque for too long; the joint may be blocked"
     SWAPPED = 28, "another joint moved than the one that was swung; their encoders are swapped"
 
-
-Array = NDArray[np.float64]
 
 _UNLIMITED = ("tilt", "measured_torque")
 """Limits that may be infinite."""

@@ -16,15 +16,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.links.machine import Command
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode, OperatorRequest, Record
 from pronk.runtime.safety import FilterAction, Reason, SafetyFilter
-
-Array = NDArray[np.float64]
 
 PREFLIGHT_S = 0.5
 """How long states are checked before anything is sent [s]."""

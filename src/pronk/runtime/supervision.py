@@ -30,11 +30,9 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.links.machine import State
-
-Array = NDArray[np.float64]
 
 WINDOW_S = 0.06
 """Over which attitude and position are compared with their rates [s]."""

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.excitation.plan import POSE_RAMP_S, Excitation, SweepPlan
 from pronk.links.machine import Command, Machine, State, TorqueKind
@@ -29,8 +29,6 @@ from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dtype
 from pronk.runtime.safety import Limits, SafetyFilter
 from pronk.runtime.state_machine import VALID_S
-
-Array = NDArray[np.float64]
 
 _SAG = 0.05
 """How much farther out than at first a joint may be on the way to its pose [rad]."""

@@ -14,8 +14,8 @@ from functools import partial
 import mujoco
 import mujoco.rollout
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
 from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
@@ -30,7 +30,6 @@ from pronk.simulators.simulator import (
     Values,
 )
 
-Array = NDArray[np.float64]
 Drives = Mapping[str, Mapping[str, float]]
 """Parameter name to value by joint name; the robot's own where one is missing."""
 

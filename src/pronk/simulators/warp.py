@@ -31,14 +31,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from pronk.actuator.law import EXPLICIT
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.model import set_drive_gains
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.simulator import Values
-
-Array = NDArray[np.float64]
 
 LEAST = 200
 """Fewer simulations than this run on the processor: a 20 s chirp takes an H200 1.0 s for 10

@@ -15,11 +15,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.files import save_arrays, stored_arrays
 from pronk.virtual.plant import Plant
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCHEMA = "pronk/capture/1"

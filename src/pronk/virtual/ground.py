@@ -31,10 +31,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.virtual.bounds import Bounded
 
-Array = NDArray[np.float64]
 _Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 _Size = Annotated[float, Meta(gt=0.0, le=1e6)]
 _Span = Annotated[float, Meta(ge=0.0, le=1e6)]

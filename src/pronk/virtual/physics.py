@@ -11,15 +11,13 @@ from collections import deque
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, damping_command
 from pronk.virtual.capture import Capture, Recorder, capture_of
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import MachineParams
-
-Array = NDArray[np.float64]
 
 _LEAST_SHARE = -0.5
 """Bounds the bus voltage at twice the battery's, also where numbers run away."""

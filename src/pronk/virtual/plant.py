@@ -36,12 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.actuator.model import motor_constants
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, RobotSpec
 from pronk.virtual.ground import Ground
 from pronk.virtual.sim_params import JointParams, SimParams, TrunkParams
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Largest angular frequency of a spring times the step; the symplectic step is stable below 2.

@@ -17,14 +17,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.links.machine import State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.plant import Plant, RawStates
 from pronk.virtual.sim_params import SimParams
-
-Array = NDArray[np.float64]
 
 _GRAVITY = 9.81
 _AHEAD = 512

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
-
-Array = NDArray[np.float64]
 
 
 class Drake(EngineSimulator):

@@ -10,15 +10,13 @@ from importlib.metadata import version
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.links import Links, links_of
 from pronk.simulators.simulator import SimulatorInfo
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 from pronk.simulators.engines.pybullet import urdf
-
-Array = NDArray[np.float64]
 
 
 class Genesis(EngineSimulator):

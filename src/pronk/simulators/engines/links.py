@@ -10,12 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots.robot import RobotSpec
 
-Array = NDArray[np.float64]
 _SAG_ROUNDS = 4
 """Rounds of `q = target + gravity(q) / stiffness`, as in `pronk.simulators.mujoco`."""
 

@@ -11,14 +11,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
-Array = NDArray[np.float64]
 _SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {
     "explicit": ("SolverFeatherstone", {"angular_damping": 0.0}),
     "implicit_damping": (

@@ -12,13 +12,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
-Array = NDArray[np.float64]
 _MAX_SPEED = 1e4
 """Above every speed of a joint [rad/s]; PyBullet clips at 100 by default."""
 

@@ -10,14 +10,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links, along_x, principal, quaternion
 
-Array = NDArray[np.float64]
 _MAX_SPEED = 1e4
 """Above every speed of a joint [rad/s]; PhysX clips at 100 by default."""
 
