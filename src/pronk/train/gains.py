@@ -17,8 +17,9 @@ from pronk.files import sha256
 from pronk.match.gains import GroupGains, MatchedGains, load
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import mujoco_info
-from pronk.train.settings import NAIVE
 
+NAIVE = "naive"
+"""The choice of gains that needs no file."""
 NAIVE_STIFFNESS_RANGE = 2.0
 """Half-width of the randomization of naive stiffness [N m/rad] (paper D3)."""
 NAIVE_DAMPING_RANGE = 0.05

@@ -20,11 +20,11 @@ import torch
 from pronk.errors import ArtefactError
 from pronk.files import sha256, written_whole
 from pronk.train import devices, provenance
-from pronk.train.gains import TrainingGains, training_gains
+from pronk.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.train.phases import STEPS_PER_ITERATION
 from pronk.train.provenance import RunFolder
 from pronk.train.rl import checkpoint
-from pronk.train.settings import NAIVE, TrainSettings
+from pronk.train.settings import TrainSettings
 
 _COPIED = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
 """Variables of the environment that the processes get, beside torchrunx's own."""

@@ -12,9 +12,6 @@ import tyro
 from pronk.errors import PronkError
 from pronk.train.phases import PHASES, TASKS
 
-NAIVE = "naive"
-"""The choice of gains that needs no file."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings:
@@ -63,7 +60,7 @@ class TrainSettings:
                 raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
         if self.minutes is not None and not self.minutes > 0.0:
             raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
-        if self.ranges_from is not None and self.gains not in (None, NAIVE):
+        if self.ranges_from is not None and self.gains_file != self.ranges_from:
             raise PronkError(
                 f"--ranges-from {self.ranges_from} goes with --gains naive; {self.gains} has its "
                 "own ranges."
@@ -99,7 +96,7 @@ class TrainSettings:
     @property
     def gains_file(self) -> Path | None:
         """The gains.yaml that is read, if any."""
-        return self.ranges_from if self.gains in (None, NAIVE) else Path(self.gains)
+        return self.ranges_from if self.gains in (None, "naive") else Path(self.gains)
 
     def completed(self) -> Self:
         """With the defaults of a new run in place of None; refuses what a new run lacks."""

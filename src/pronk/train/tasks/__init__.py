@@ -24,10 +24,9 @@ from mjlab.tasks.registry import register_mjlab_task
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.train.gains import training_gains
+from pronk.train.gains import NAIVE, training_gains
 from pronk.train.phases import TASKS
 from pronk.train.rl.runner import PronkRunner
-from pronk.train.settings import NAIVE
 from pronk.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
 from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
 
