@@ -416,8 +416,8 @@ For the Go2, of which no policy was trained, a linear one squats, sways and pitc
 the stiffness of Unitree's stand example (60 N m/rad).
 The joint of the faults of one encoder is a hip roll, which moves and is loaded least. The time of
 swapped legs and joints is that from the request to stand; the robot has not risen. `refused` is of
-the pre-flight, after which nothing is sent. A stopped or
-killed servo is followed by the standby process.
+the pre-flight, after which nothing is sent. A stopped or killed servo is followed by the standby
+process. What it takes to find a fault is in [hardware.md](hardware.md).
 
 {lines}
 
@@ -429,6 +429,7 @@ killed servo is followed by the standby process.
 - A constant encoder of a joint whose load does not change while no other joint moves: the robot
   stands still. It is found once the others have moved by 0.05 rad in sum.
 - An encoder at zero whose joint rests at zero, until its velocity says that it moved by 0.005 rad.
+- A stuck attitude of a trunk that hardly turns, until the gyro says that it turned by 0.03 rad.
 - Hip roll and hip pitch of one leg swapped with each other: a knee swings before the robot rises.
 - Swapped encoders in a sweep, before their joint is excited.
 """
