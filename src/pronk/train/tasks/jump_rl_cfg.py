@@ -20,6 +20,8 @@ def jump_rl_cfg(*, iterations: int, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
         actor=EstimatorActorCfg(),
         critic=JumpCriticCfg(),
         algorithm=EstimatorPpoCfg(
+            # The first; it follows the KL divergence of an update.
+            learning_rate=1e-3,
             # With the mirror image an epoch has every sample twice: three of them are six.
             num_learning_epochs=3,
             # A clipped value moves by 0.2 at most in an update; a jump earns ten.
