@@ -129,7 +129,7 @@ def test_the_command_names_law_and_faults(
     out = tmp_path / "probe.json"
     assert run(["probe", "mujoco", "--robot", PENDULUM, "--json", str(out)]) == 0
     found = json.loads(out.read_text())["probe"]
-    assert found["law"] == {"kind": "explicit", "iterations": 1}
+    assert found["law"] == {"kind": "explicit", "iterations": 1, "passive_damping": "implicit"}
     assert found["wrong"] == {}
     assert run(["probe", "mujoco", "--robot", PENDULUM, "--joint", "knee"]) == 2
     assert "swing" in capsys.readouterr().err
