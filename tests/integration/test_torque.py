@@ -87,7 +87,7 @@ def test_unknown_links_leave_the_scale_open(logs: list[JointLog]) -> None:
     assert not fit.joints["elbow"]["scale"].identified
 
 
-def test_armature_of_the_first_joint_is_not_told_from_its_link(logs: list[JointLog]) -> None:
+def test_armature_of_the_first_joint_is_not_separated_from_its_link(logs: list[JointLog]) -> None:
     fit = fit_torque(logs, rig(), JOINTS[0], links_known=False)
     assert not fit.joints["shoulder"]["armature"].identified
     assert np.isnan(fit.joints["shoulder"]["armature"].value)

@@ -49,7 +49,7 @@ def log_of(*parts: tuple[str, np.ndarray], begin: np.ndarray | None = None) -> J
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mcap"])
-def test_repeats_and_amplitudes_in_one_file_are_told_apart(tmp_path: Path, suffix: str) -> None:
+def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path, suffix: str) -> None:
     knee = [("FR_knee", size * CHIRP) for size in (1.0, 0.4, 1.0, 1.0)]
     made = log_of(*knee)
     path = tmp_path / f"a{suffix}"
