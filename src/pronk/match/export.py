@@ -625,11 +625,14 @@ def check_target(target: str, holds: Profile) -> None:
         return
     wanted = profile(name)
     if (wanted.drive_law, wanted.timestep_s) != (holds.drive_law, holds.timestep_s):
+        own, other = (
+            f"drive law {one.drive_law.label} at {1000.0 * one.timestep_s:g} ms with "
+            f"{one.passive_damping} passive damping"
+            for one in (holds, wanted)
+        )
         raise PronkError(
-            f"the gains hold for {holds.name} (drive law {holds.drive_law.label} at "
-            f"{1000.0 * holds.timestep_s:g} ms), and {target} has drive law "
-            f"{wanted.drive_law.label} at {1000.0 * wanted.timestep_s:g} ms, with which they are "
-            f"another joint; give `pronk match LOGS --for {name}`, or without logs "
+            f"the gains hold for {holds.name} ({own}), and {target} has {other}, with which they "
+            f"are another joint; give `pronk match LOGS --for {name}`, or without logs "
             f"`pronk translate GAINS --to {name}`."
         )
 
