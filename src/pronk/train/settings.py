@@ -60,7 +60,7 @@ class TrainSettings:
                 raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
         if self.minutes is not None and not self.minutes > 0.0:
             raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
-        if self.ranges_from is not None and self.gains_file != self.ranges_from:
+        if self.ranges_from is not None and self.gains not in (None, "naive"):
             raise PronkError(
                 f"--ranges-from {self.ranges_from} goes with --gains naive; {self.gains} has its "
                 "own ranges."
