@@ -38,6 +38,7 @@ NAIVE = ("--gains", "naive")
         (("walk", *NAIVE, "--phase", "walk=many"), "walk=many|walk=300"),
         (("walk", *NAIVE, "--phase", "walk=3", "--phase", "walk=4"), "--phase walk|twice"),
         (("walk", "--gains", "a.yaml", "--ranges-from", "b.yaml"), "b.yaml|--gains naive"),
+        (("walk", "--gains", "a.yaml", "--ranges-from", "a.yaml"), "--gains naive"),
         (("walk", *NAIVE, "--ranges-from", "b.yaml"), "b.yaml|no such file"),
         (("jump", *NAIVE), "--init-checkpoint|pronk train all"),
         (("walk", *NAIVE, "--init-checkpoint", "x"), "--init-checkpoint x|jump"),
