@@ -34,8 +34,9 @@ from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, branches, moves_together
+from pronk.simulators.load import joint_rigs, load_simulator
 from pronk.simulators.profiles import profile
-from pronk.simulators.simulator import Closing, joint_rigs, load_simulator
+from pronk.simulators.simulator import Closing
 
 ENGINES = {
     "mjlab": "mujoco",

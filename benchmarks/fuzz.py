@@ -42,8 +42,8 @@ from pronk.cli.main import run
 from pronk.errors import PronkError
 from pronk.evaluation import bodies, results
 from pronk.evaluation.crossing import CROSSING
-from pronk.evaluation.training_sim.evaluation import SCHEMA as EVALUATION
-from pronk.evaluation.training_sim.evaluation import load_speed_errors
+from pronk.evaluation.training_sim.results import SCHEMA as EVALUATION
+from pronk.evaluation.training_sim.results import load_speed_errors
 from pronk.evaluation.variation import VARIATION
 from pronk.evaluation.walk import WALK
 from pronk.files import write_text

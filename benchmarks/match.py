@@ -52,8 +52,9 @@ from pronk.match.predict import drives_of
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation
+from pronk.simulators.load import joint_rigs
 from pronk.simulators.mujoco import Drives
-from pronk.simulators.simulator import JointRigs, joint_rigs
+from pronk.simulators.simulator import JointRigs
 
 Kind = Literal["hip_roll", "hip_pitch", "knee"]
 JOINTS: tuple[Kind, ...] = ("hip_roll", "hip_pitch", "knee")

@@ -26,13 +26,8 @@ from pronk.actuator.law import DriveLaw
 from pronk.cli import console
 from pronk.evaluation.tables import table
 from pronk.evaluation.training_sim import adapter
-from pronk.evaluation.training_sim.evaluation import (
-    JUMPS,
-    WALKS,
-    Evaluation,
-    Plan,
-    evaluate_policy,
-)
+from pronk.evaluation.training_sim.evaluation import JUMPS, WALKS, Evaluation, Plan
+from pronk.evaluation.training_sim.run import evaluate_policy
 from pronk.match.gains import MatchedGains
 from pronk.match.translate import stated_gains, translate
 from pronk.robots.robot import RobotSpec

@@ -28,7 +28,7 @@ from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
 from pronk.robots import load_robot
-from pronk.simulators.simulator import joint_rigs
+from pronk.simulators.load import joint_rigs
 from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")

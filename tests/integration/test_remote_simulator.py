@@ -23,7 +23,7 @@ from pronk.excitation.signals import Chirp
 from pronk.match.gains import load
 from pronk.robots import load_robot
 from pronk.simulators.engines.links import links_of
-from pronk.simulators.simulator import joint_rigs, load_simulator
+from pronk.simulators.load import joint_rigs, load_simulator
 from pronk.testing import check_simulator
 
 ROBOT = load_robot("mini_cheetah")
@@ -164,7 +164,7 @@ def test_it_ends_with_a_killed_parent(python: Path, adapters: Path, tmp_path: Pa
     pid_file = tmp_path / "pid"
     code = (
         "import numpy as np; from pathlib import Path; from pronk.robots import load_robot\n"
-        "from pronk.simulators.simulator import load_simulator\n"
+        "from pronk.simulators.load import load_simulator\n"
         f"s = load_simulator({str(adapters) + ':Endless'!r}, load_robot('mini_cheetah'),\n"
         f"    python=Path({str(python)!r}))\n"
         "s.rollout(np.zeros((1, 2, 3)), {})\n"

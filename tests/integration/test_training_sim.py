@@ -22,13 +22,13 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.training_sim.adapter import (
-    TERM,
     blank_actor,
     evaluate,
     evaluation_cfg,
     load_subject,
 )
-from pronk.evaluation.training_sim.evaluation import NEVER, Plan, evaluate_policy
+from pronk.evaluation.training_sim.evaluation import NEVER, Plan
+from pronk.evaluation.training_sim.run import TERM, evaluate_policy
 from pronk.robots import load_robot
 from pronk.runtime.script import STILL, Script
 from pronk.train.gains import training_gains

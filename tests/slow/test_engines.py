@@ -28,8 +28,9 @@ from pronk.simulators.engines.newton import Newton
 from pronk.simulators.engines.ovphysx import OvPhysx
 from pronk.simulators.engines.pybullet import PyBullet
 from pronk.simulators.engines.sapien import Sapien
+from pronk.simulators.load import load_simulator
 from pronk.simulators.mujoco import Chain
-from pronk.simulators.simulator import Closing, load_simulator
+from pronk.simulators.simulator import Closing
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
 BAND = (1.0, 15.0)

@@ -20,9 +20,8 @@ from pronk.evaluation.training_sim.evaluation import (
     CommandResult,
     Evaluation,
     Plan,
-    load_speed_errors,
-    save,
 )
+from pronk.evaluation.training_sim.results import load_speed_errors, save
 from pronk.robots import load_robot
 
 DT, ROBOT = 0.005, load_robot("mini_cheetah")

@@ -18,7 +18,7 @@ from benchmarks.fuzz import fuzz
 from pronk.cli.main import run
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.evaluation import results
-from pronk.evaluation.training_sim.evaluation import SCHEMA, load_speed_errors
+from pronk.evaluation.training_sim.results import SCHEMA, load_speed_errors
 from pronk.evaluation.variation import VARIATION
 from pronk.files import LIMIT, read_yaml, write_text
 from pronk.logs.joint_log import Segment

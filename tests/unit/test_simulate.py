@@ -21,8 +21,9 @@ from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace, policy_clock
+from pronk.simulators.load import joint_rigs, load_simulator
 from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
-from pronk.simulators.simulator import RolloutRigs, joint_rigs, load_simulator
+from pronk.simulators.simulator import RolloutRigs
 from pronk.testing import check_simulator
 
 ROBOT = load_robot("mini_cheetah")

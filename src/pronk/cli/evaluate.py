@@ -53,7 +53,7 @@ def evaluate(
     where = "cuda:0" if find_devices(device) else "cpu"
 
     from pronk.evaluation.training_sim import adapter
-    from pronk.evaluation.training_sim.evaluation import load_speed_errors, save, sheets
+    from pronk.evaluation.training_sim.results import load_speed_errors, save, sheets
     from pronk.train.gains import training_gains
     from pronk.train.tasks import load_task
 

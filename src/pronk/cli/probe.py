@@ -26,8 +26,8 @@ def probe(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
     """
     from pronk.robots import load_robot
+    from pronk.simulators.load import load_simulator
     from pronk.simulators.probe import probe as look
-    from pronk.simulators.simulator import load_simulator
 
     known = load_robot(robot)
     made = load_simulator(simulator, known, threads=1, python=simulator_python)

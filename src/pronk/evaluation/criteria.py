@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pronk.evaluation.jumps import RISE
 from pronk.evaluation.protocol import TABLE_III
 from pronk.evaluation.results import Results
-
-if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.evaluation import Evaluation
+from pronk.evaluation.training_sim.evaluation import Evaluation
 
 Sense = Literal["<=", ">="]
 

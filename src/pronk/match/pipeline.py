@@ -57,9 +57,10 @@ from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together, published
 from pronk.simulators.linear import Plant
+from pronk.simulators.load import joint_rigs
 from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.simulators.profiles import profile
-from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
+from pronk.simulators.simulator import JointRigs, SimulatorInfo
 
 Progress = Callable[[str, float], None]
 Mode = Literal["gains", "drive"]

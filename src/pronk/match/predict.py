@@ -27,8 +27,9 @@ from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, branches, moves_together, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
+from pronk.simulators.load import joint_rigs
 from pronk.simulators.profiles import profile_of
-from pronk.simulators.simulator import JointRigs, joint_rigs
+from pronk.simulators.simulator import JointRigs
 
 SCHEMA = "pronk/prediction/2"
 

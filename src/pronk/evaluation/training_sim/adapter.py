@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +22,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pronk.errors import ArtefactError
-from pronk.evaluation.training_sim.evaluation import Evaluation, Plan, evaluate_policy
+from pronk.evaluation.training_sim.evaluation import Evaluation, Plan
+from pronk.evaluation.training_sim.run import TERM, Estimate, Policy, StepListener, evaluate_policy
 from pronk.files import sha256
 from pronk.policy.contract import check
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
@@ -31,7 +32,6 @@ from pronk.policy.runtime import Policy as ExportedPolicy
 from pronk.robots import load_robot
 from pronk.train.devices import device_facts
 from pronk.train.gains import TrainingGains
-from pronk.train.mdp.commands import motion_command as motion_command
 from pronk.train.phases import TASKS
 from pronk.train.provenance import RunFolder
 from pronk.train.rl import checkpoint
@@ -40,26 +40,6 @@ from pronk.train.rl.networks import EstimatorActor
 from pronk.train.tasks import load_task
 from pronk.train.tasks.jump_env_cfg import without_randomization
 from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
-
-if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.run import Estimate, Policy
-
-TERM = "evaluation"
-"""The metrics term's name."""
-
-
-class StepListener:
-    """A metrics term that calls a listener after every physics step."""
-
-    def __init__(self, cfg: MetricsTermCfg, env: ManagerBasedRlEnv) -> None:
-        self.listener: Callable[[], None] | None = None
-        self._nothing = torch.zeros(env.num_envs, device=env.device)
-
-    def __call__(self, env: ManagerBasedRlEnv) -> Tensor:
-        """Call the listener; the metric itself is zero. (N,)."""
-        if self.listener is not None:
-            self.listener()
-        return self._nothing
 
 
 def evaluation_cfg(

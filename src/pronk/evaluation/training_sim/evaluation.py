@@ -1,45 +1,27 @@
-"""Evaluate a policy in the training simulator: every command at once, many robots each.
-
-    plan = Plan(robot=robot, robots=1000)
-    env = ManagerBasedRlEnv(evaluation_cfg(env_cfg(gains=gains), plan), device="cuda:0")
-    evaluation = evaluate_policy(policy, env, plan, estimate=actor.estimate)
-    save(Path("evaluation.json"), evaluation)
+"""The commands of an evaluation in the training simulator, and its figures.
 
 Walking robots have one velocity from the first sample on. Jumping robots do what the paper's robot
 did (E1): stand, accelerate, jump while running, run on for a moment, stop. The jump input rises at
-each robot's own time, so that it meets every phase of the gait. `run` records the robots,
-`pronk.evaluation.jumps` and `walk` measure them; `pronk.evaluation.criteria` has the acceptance
-criteria; `adapter` has all that is of `pronk.train`.
+each robot's own time, so that it meets every phase of the gait.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.arrays import Array
-from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation.criteria import evaluation_checks
-from pronk.evaluation.jumps import JumpRules, fallen_at, measure, sample_at, uncommanded_height
+from pronk.errors import PronkError
+from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
-from pronk.evaluation.results import Spread, load_json, save_json
-from pronk.evaluation.tables import Sheet, check_sheet, number, percent, spread, table
-from pronk.evaluation.walk import measure_walk, walk_script
+from pronk.evaluation.results import Spread
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script
-from pronk.virtual.capture import Capture
 
-if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.run import Estimate, Policy
-
-SCHEMA = "pronk/evaluation/3"
 Samples = NDArray[np.int64]
 
 NEVER = 2**30
@@ -177,147 +159,3 @@ class Evaluation:
     def speed_errors(self) -> dict[str, float]:
         """Mean speed error by walk [m/s]."""
         return {walk.name: walk["speed_error"].mean for walk in self.walks}
-
-
-def evaluate_policy(
-    policy: Policy,
-    env: Any,
-    plan: Plan,
-    *,
-    estimate: Estimate | None = None,
-    progress: Callable[[float], None] = lambda share: None,
-    about: Mapping[str, Any] | None = None,
-    before: Mapping[str, float] | None = None,
-) -> Evaluation:
-    """Run the whole plan in one batch and measure every robot.
-
-    `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
-    random generators of the process are seeded with the plan's seed. `estimate` is the policy's
-    estimator, if it is evaluated too; `about` and `before` are as of `Evaluation`.
-    """
-    from pronk.evaluation.training_sim.run import Run
-
-    began = time.perf_counter()
-    run = Run(env.unwrapped, plan)
-    run.go(policy, estimate, progress)
-    facts = [part.cpu().numpy() for part in (run.fell_at, run.on, run.diverged)]
-    results = []
-    for i, case in enumerate((*plan.walks, *plan.jumps)):
-        own = (part[i * plan.robots : (i + 1) * plan.robots] for part in facts)
-        robots = []
-        for capture, fell, on, diverged in zip(run.captures(i), *own, strict=True):
-            if i < len(plan.walks):
-                figures = _walk(capture, case, plan)
-            else:
-                figures = _jump(capture, case, plan, on=float(on) * run.dt)
-            robots.append(figures | {"fell": fell < NEVER, "non_finite": diverged})
-        spreads = {name: Spread.of([each[name] for each in robots]) for name in robots[0]}
-        results.append(CommandResult(name=case.name, command=case.command, figures=spreads))
-    return Evaluation(
-        walks=tuple(results[: len(plan.walks)]),
-        jumps=tuple(results[len(plan.walks) :]),
-        estimator=run.estimator_errors(),
-        plan=vars(plan) | {"robot": plan.robot.name, "rules": plan.jump_rules},
-        seconds=time.perf_counter() - began,
-        about=dict(about or {}),
-        before=dict(before or {}),
-    )
-
-
-def _walk(capture: Capture, case: Case, plan: Plan) -> dict[str, float]:
-    """The figures of a robot that walks."""
-    script, rules = walk_script(case.command, seconds=plan.walk_s), plan.jump_rules
-    script = replace(script, stand_s=0.0)
-    how: Any = {"began": 0.0, "rules": rules, "settle_s": plan.settle_s}
-    found = measure_walk(capture, script, plan.robot, **how)
-    first, last = round(plan.settle_s / capture.dt), fallen_at(capture) - 1
-    x, y, _ = capture.position[last] - capture.position[min(first, last)]
-    return vars(found) | {
-        "uncommanded": found.uncommanded - rules.standing_height,
-        "drift": math.hypot(x, y) if first <= last else math.nan,
-    }
-
-
-def _jump(capture: Capture, case: Case, plan: Plan, *, on: float) -> dict[str, float]:
-    """The figures of a robot that jumps; its jump input rises at `on` [s]."""
-    rules, run_s = plan.jump_rules, on - plan.script.start
-    script = replace(plan.script, command=case.command, run_s=run_s)
-    found = measure(capture, script, plan.robot, began=0.0, rules=rules)
-    rise = sample_at(capture, on) if found.standing else None
-    figures = {name: value for name, value in vars(found).items() if not isinstance(value, tuple)}
-    return figures | {
-        "uncommanded": uncommanded_height(capture, rise, rules) - rules.standing_height,
-        "single": float(found.high_flights == 1.0) if found.standing else math.nan,
-    }
-
-
-def save(path: Path, evaluation: Evaluation) -> None:
-    """Write an evaluation and its checks as JSON, whole or not at all; NaN becomes null."""
-    checks = [check.row() for check in evaluation_checks(evaluation)]
-    save_json(path, SCHEMA, {"checks": checks, **asdict(evaluation)})
-
-
-def load_speed_errors(path: Path) -> dict[str, float]:
-    """Read the mean speed errors by walk [m/s] of a saved evaluation."""
-    with load_json(path, SCHEMA, "pronk evaluate") as body:
-        errors = {
-            str(walk["name"]): float(walk["figures"]["speed_error"]["mean"] or math.nan)
-            for walk in body["walks"]
-        }
-    if not errors:
-        raise ArtefactError(f"{path}: has no walks; evaluate that policy with --what walk.")
-    return errors
-
-
-def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
-    """The tables of an evaluation."""
-    walks = []
-    for walk in evaluation.walks:
-        errors = (
-            f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
-            for name in ("speed_error", "yaw_error")
-        )
-        velocity = ", ".join(number(walk[n].mean, 2) for n in ("forward", "left", "yaw_rate"))
-        shares = percent(walk["fell"].mean), percent(walk["uncommanded"].most)
-        walks.append((walk.name, *errors, velocity, walk["drift"].mean, *shares))
-    jumps = [
-        (
-            jump.name,
-            spread(jump["height"]),
-            *(spread(jump[name], 2) for name in ("distance", "lift_off_velocity", "delay")),
-            *(jump[name].mean for name in ("along", "flights", "high_flights")),
-            *(percent(jump[n].mean) for n in ("single", "found", "upright", "non_foot_contact")),
-        )
-        for jump in evaluation.jumps
-    ]
-    notes, estimator = [], evaluation.estimator
-    if estimator:
-        axes = " / ".join(f"{estimator[axis]:.3f}" for axis in ("forward", "left", "up"))
-        notes.append(
-            f"estimator while walking: velocity RMSE {estimator['velocity']:.3f} m/s (forward / "
-            f"left / up {axes}), contacts right {percent(estimator['contacts_right'])} %"
-        )
-    notes.append(
-        f"PASSED; {evaluation.plan['robots']} robots a command, randomization "
-        f"{evaluation.about.get('randomization', '-')}, seed {evaluation.plan['seed']}, "
-        f"{evaluation.seconds:.0f} s"
-    )
-    found = (
-        table(
-            "command | speed error [m/s] | yaw rate error [rad/s] | mean velocity [m/s, m/s, rad/s]"
-            " | drift [m];2 | falls [%] | flight over standing [cm]",
-            walks,
-            title="Walking: mean over robots and time; in brackets with the stride averaged out",
-        ),
-        table(
-            "command | height [m] | distance [m] | lift-off up [m/s] | after [s] | along [m];2"
-            " | flights;2 | high ones;2 | one [%] | jumped [%] | upright [%]"
-            " | non-foot contact [%]",
-            jumps,
-            "non-foot contact: anything but a foot on the ground, from the jump input to 2 s after "
-            "touchdown; a trial counts no such jump as a success.",
-            title="Jumping: mean +- standard deviation over robots",
-        ),
-        check_sheet("Acceptance criteria", evaluation_checks(evaluation), *notes),
-    )
-    return tuple(one for one in found if one.rows)

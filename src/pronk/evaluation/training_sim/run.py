@@ -1,4 +1,8 @@
-"""One pass through an evaluation plan: commands and recording of every robot.
+"""Evaluate a policy in the training simulator: every command at once, many robots each.
+
+    plan = Plan(robot=robot, robots=1000)
+    env = ManagerBasedRlEnv(evaluation_cfg(env_cfg(gains=gains), plan), device="cuda:0")
+    evaluation = evaluate_policy(policy, env, plan, estimate=actor.estimate)
 
 Trunk and contacts are recorded at every physics step, on the device, by a metrics term of mjlab.
 mjlab's contacts lag its positions by one physics step there, so each position is kept until its
@@ -8,24 +12,50 @@ contacts are known.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers.metrics_manager import MetricsTermCfg
 from tensordict import TensorDict
 from torch import Tensor
 
 from pronk.errors import PronkError
-from pronk.evaluation.training_sim.adapter import TERM, StepListener, motion_command
-from pronk.evaluation.training_sim.evaluation import NEVER, Plan
+from pronk.evaluation.jumps import fallen_at, measure, sample_at, uncommanded_height
+from pronk.evaluation.protocol import Case
+from pronk.evaluation.results import Spread
+from pronk.evaluation.training_sim.evaluation import NEVER, CommandResult, Evaluation, Plan
+from pronk.evaluation.walk import measure_walk, walk_script
 from pronk.policy.observation import ESTIMATE, JOINTS
+from pronk.train.mdp.commands import motion_command
 from pronk.virtual.capture import Capture
 
 Policy = Callable[[TensorDict], Tensor]
 """Observation groups to actions (N, 12)."""
 Estimate = Callable[[TensorDict], tuple[Tensor, Tensor]]
 """Observation groups to contact probabilities (N, 4) and trunk velocity [m/s] (N, 3)."""
+
+
+TERM = "evaluation"
+"""The metrics term's name."""
+
+
+class StepListener:
+    """A metrics term that calls a listener after every physics step."""
+
+    def __init__(self, cfg: MetricsTermCfg, env: ManagerBasedRlEnv) -> None:
+        self.listener: Callable[[], None] | None = None
+        self._nothing = torch.zeros(env.num_envs, device=env.device)
+
+    def __call__(self, env: ManagerBasedRlEnv) -> Tensor:
+        """Call the listener; the metric itself is zero. (N,)."""
+        if self.listener is not None:
+            self.listener()
+        return self._nothing
 
 
 class Run:
@@ -180,3 +210,73 @@ class Run:
         }
         errors = {name: math.sqrt(total / count) for name, total in sums.items()}
         return errors | {"contacts_right": right / count}
+
+
+def evaluate_policy(
+    policy: Policy,
+    env: Any,
+    plan: Plan,
+    *,
+    estimate: Estimate | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+    about: Mapping[str, Any] | None = None,
+    before: Mapping[str, float] | None = None,
+) -> Evaluation:
+    """Run the whole plan in one batch and measure every robot.
+
+    `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
+    random generators of the process are seeded with the plan's seed. `estimate` is the policy's
+    estimator, if it is evaluated too; `about` and `before` are as of `Evaluation`.
+    """
+    began = time.perf_counter()
+    run = Run(env.unwrapped, plan)
+    run.go(policy, estimate, progress)
+    facts = [part.cpu().numpy() for part in (run.fell_at, run.on, run.diverged)]
+    results = []
+    for i, case in enumerate((*plan.walks, *plan.jumps)):
+        own = (part[i * plan.robots : (i + 1) * plan.robots] for part in facts)
+        robots = []
+        for capture, fell, on, diverged in zip(run.captures(i), *own, strict=True):
+            if i < len(plan.walks):
+                figures = _walk(capture, case, plan)
+            else:
+                figures = _jump(capture, case, plan, on=float(on) * run.dt)
+            robots.append(figures | {"fell": fell < NEVER, "non_finite": diverged})
+        spreads = {name: Spread.of([each[name] for each in robots]) for name in robots[0]}
+        results.append(CommandResult(name=case.name, command=case.command, figures=spreads))
+    return Evaluation(
+        walks=tuple(results[: len(plan.walks)]),
+        jumps=tuple(results[len(plan.walks) :]),
+        estimator=run.estimator_errors(),
+        plan=vars(plan) | {"robot": plan.robot.name, "rules": plan.jump_rules},
+        seconds=time.perf_counter() - began,
+        about=dict(about or {}),
+        before=dict(before or {}),
+    )
+
+
+def _walk(capture: Capture, case: Case, plan: Plan) -> dict[str, float]:
+    """The figures of a robot that walks."""
+    script, rules = walk_script(case.command, seconds=plan.walk_s), plan.jump_rules
+    script = replace(script, stand_s=0.0)
+    how: Any = {"began": 0.0, "rules": rules, "settle_s": plan.settle_s}
+    found = measure_walk(capture, script, plan.robot, **how)
+    first, last = round(plan.settle_s / capture.dt), fallen_at(capture) - 1
+    x, y, _ = capture.position[last] - capture.position[min(first, last)]
+    return vars(found) | {
+        "uncommanded": found.uncommanded - rules.standing_height,
+        "drift": math.hypot(x, y) if first <= last else math.nan,
+    }
+
+
+def _jump(capture: Capture, case: Case, plan: Plan, *, on: float) -> dict[str, float]:
+    """The figures of a robot that jumps; its jump input rises at `on` [s]."""
+    rules, run_s = plan.jump_rules, on - plan.script.start
+    script = replace(plan.script, command=case.command, run_s=run_s)
+    found = measure(capture, script, plan.robot, began=0.0, rules=rules)
+    rise = sample_at(capture, on) if found.standing else None
+    figures = {name: value for name, value in vars(found).items() if not isinstance(value, tuple)}
+    return figures | {
+        "uncommanded": uncommanded_height(capture, rise, rules) - rules.standing_height,
+        "single": float(found.high_flights == 1.0) if found.standing else math.nan,
+    }

@@ -1,0 +1,62 @@
+"""Simulators by name, path or entry point."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pronk.errors import PronkError
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.remote import RemoteSimulator
+from pronk.simulators.simulator import JointRigs, RolloutRigs, Simulator, factory
+
+
+def load_simulator(
+    choice: str,
+    robot: RobotSpec,
+    *,
+    threads: int = 2,
+    device: str = "cpu",
+    python: Path | None = None,
+) -> Simulator:
+    """Make a simulator of a robot.
+
+    The choice is `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`; what it names
+    is called with the robot and returns a `Simulator`. Threads are those of MuJoCo; its large runs
+    are simulated on `device`, one of `pronk.simulators.mujoco.DEVICES`. With `python`, the path of
+    an interpreter, the simulator is made there (`pronk.simulators.remote`). A PronkError says that
+    there is no such simulator, or that it lacks what the protocol needs.
+    """
+    if choice == "mujoco" and python is not None:
+        raise PronkError(
+            "simulator mujoco runs in this Python only; leave --simulator-python out, or name "
+            "another with --simulator."
+        )
+    if choice == "mujoco":
+        return MujocoSimulator(robot, threads=threads, device=device)
+    if device != "cpu":
+        raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
+    made = RemoteSimulator(choice, robot, python) if python else factory(choice)(robot)
+    simulator: Simulator = made
+    members = ("info", "joints", "parameters", "rollout")
+    if lacking := [name for name in members if not hasattr(simulator, name)]:
+        raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
+    if not {"stiffness", "damping"} <= set(simulator.parameters):
+        raise PronkError(
+            f"simulator {choice} sets {', '.join(sorted(simulator.parameters)) or 'nothing'}; "
+            "expected at least stiffness and damping."
+        )
+    return simulator
+
+
+def joint_rigs(
+    choice: str,
+    robot: RobotSpec,
+    *,
+    threads: int = 2,
+    device: str = "cpu",
+    python: Path | None = None,
+) -> JointRigs:
+    """Rigs of a robot's joints in a simulator; arguments and errors are `load_simulator`'s."""
+    simulator = load_simulator(choice, robot, threads=threads, device=device, python=python)
+    return simulator if isinstance(simulator, MujocoSimulator) else RolloutRigs(simulator, robot)
