@@ -206,7 +206,8 @@ def _act(process: _Process, action: str) -> None:
 def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> dict[str, Any]:
     """One run; a row of figures and faults. A `length_s` of zero: nothing is killed."""
     rng, faults = np.random.default_rng([seed, i]), list[str]()
-    row: dict[str, Any] = {"program": program, "i": i, "action": ACTIONS[i // 5 % 4]}
+    row: dict[str, Any] = {"program": program, "seed": seed, "i": i}
+    row["action"] = ACTIONS[i // 5 % 4]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         port = int(probe.getsockname()[1])
@@ -311,7 +312,7 @@ def kills(
         count: Runs of each; of deploy, of each of its five processes.
         seed: Of moments and processes.
         jobs: Runs at once.
-        out: JSON lines, one a run, written as it goes.
+        out: JSON lines, one a run, written as it goes; runs that are there are not repeated.
     """
     programs = programs or PROGRAMS
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as threads:
@@ -327,7 +328,11 @@ def kills(
                 if alone["status"] or alone["faults"]:
                     raise PronkError(f"{program} by itself: {alone}")
                 lengths[program] = alone["length_s"]
-        todo = [(p, i) for p in programs for i in range(count * (5 if p == "deploy" else 1))]
+        there = out.read_text().splitlines() if out is not None and out.exists() else []
+        rows = [row for row in map(json.loads, there) if row["seed"] == seed]
+        done = {(row["program"], row["i"]) for row in rows}
+        runs = [(p, i) for p in programs for i in range(count * (5 if p == "deploy" else 1))]
+        todo = [run for run in runs if run not in done]
 
         def one(job: tuple[Program, int]) -> dict[str, Any]:
             program, i = job
@@ -337,7 +342,7 @@ def kills(
                     file.write(json.dumps(row) + "\n")
             return row
 
-        rows = list(threads.map(one, todo))
+        rows += threads.map(one, todo)
     by = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
     for row in rows:
         by[row["program"], row["target"]].append(row)
