@@ -62,7 +62,7 @@ PROCESSES = {
 }
 """Process of a `Deployment`, and what it gets."""
 FAULTS = (*SENSOR_FAULTS, *PROCESSES)
-BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK")
+BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK", "STANDBY")
 """Reasons of a computer that is too busy."""
 FOUND_S = 3.0
 """For which a fault is waited for [s]."""
@@ -243,7 +243,7 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
             if damped is None or not reasons:
                 rows.append((fault, math.nan, "not found"))
                 break
-            if reasons[0] in BUSY and not fault.startswith("policy"):
+            if reasons[0] in BUSY and not fault.startswith(("policy", "servo")):
                 break
             rows.append((fault, passed if fault in SWAPPED else damped, reasons[0]))
             if fault in SWAPPED or (struck is not None and fault != "policy-stopped"):

@@ -247,6 +247,12 @@ def test_the_standby_damps_after_a_servo_that_stopped(
             struck = time.monotonic()
             os.kill(deployment.servo.pid or 0, number)
             hold(deployment, 20.0, Mode.ENDED)
+            if number == signal.SIGSTOP:
+                # One that goes on names what has damped the joints, and writes nothing else.
+                os.kill(deployment.servo.pid or 0, signal.SIGCONT)
+                hold(deployment, 0.2)
+                seen = [each.reason for each in deployment.events_seen() if each.kind == "fault"]
+                assert seen == ["STANDBY"]
         assert deployment.summary.standby
         assert deployment.summary.servo == {}
         time.sleep(0.2)

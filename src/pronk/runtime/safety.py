@@ -87,6 +87,7 @@ class Reason(IntEnum):
     HELD = 26, "states were too old, and the last target held, for too much of a second"
     CLIPPED = 27, "a joint's target was beyond its torque for too long; the joint may be blocked"
     SWAPPED = 28, "another joint moved than the one that was swung; their encoders are swapped"
+    STANDBY = 29, "the servo was silent for too long, and the standby process damped the joints"
 
 
 _UNLIMITED = ("tilt", "measured_torque")

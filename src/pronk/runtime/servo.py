@@ -268,7 +268,11 @@ class Servo:
         self.action = action if fresh else before
         # An action may be younger than the begin of a tick that was interrupted.
         now = time.monotonic()
-        if link_error:
+        damped = self.shared.standby.written > 0
+        if damped:
+            # Its commands are another program's to the link.
+            self.safety.fault(FilterAction.LATCH, Reason.STANDBY, begun)
+        elif link_error:
             self.safety.fault(FilterAction.LATCH, Reason.LINK, begun)
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
             self.safety.fault(FilterAction.DAMP, Reason.ENDED, begun)
@@ -288,7 +292,9 @@ class Servo:
             sent, decision = self.safety.judge(states, desired.command, now, held=held)
         why = self._send(machine, sent) or link_error
         done = time.monotonic()
-        if why:
+        if damped:
+            why = ""
+        elif why:
             self.safety.fault(FilterAction.LATCH, Reason.LINK, done)
         self._act_on_faults(level, begun, why or (decision.detail and decision.text))
         if self._sweep is not None and mode is Mode.SWEEP:
