@@ -247,7 +247,9 @@ def test_the_standby_damps_after_a_servo_that_stopped(
             struck = time.monotonic()
             os.kill(deployment.servo.pid or 0, number)
             hold(deployment, 20.0, Mode.ENDED)
+            went_on = np.inf
             if number == signal.SIGSTOP:
+                went_on = time.monotonic()
                 # One that goes on ends the tick in which it stopped, and names what has damped.
                 os.kill(deployment.servo.pid or 0, signal.SIGCONT)
                 hold(deployment, 0.2)
@@ -260,9 +262,10 @@ def test_the_standby_damps_after_a_servo_that_stopped(
         after = when > struck + 0.002
         assert damps[after].any()
         first = when[after & damps][0]
-        # From there on damping, for long enough to come to rest.
-        assert (~damps[when >= first]).sum() <= (number == signal.SIGSTOP)
-        assert damps[when > first + 1.0].all()
+        # From there on nothing but damping, but for that tick, for long enough to come to rest.
+        assert damps[(when >= first) & (when < went_on)].all()
+        assert (~damps[when >= went_on]).sum() <= 1
+        assert damps[when > went_on + 1.0].all()
         assert when[-1] - first > 2.0
         late.append(first - struck)
         if late[-1] <= DAMPED_S:
