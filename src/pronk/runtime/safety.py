@@ -1,9 +1,9 @@
 """The safety filter: limits, rules, and the fault that lasts from one tick to the next.
 
-`apply_rules` is a pure function of arrays with any leading shape (...,) and joints last. Its rules
-have an order, that of its table of faults: the first that is met gives the reason. A command passes
-unchanged, or its target is moved into the range that all limits allow, or it is replaced by
-damping. Gains are never changed: a robot with another stiffness is not the one that was matched.
+`apply_rules` is a pure function of arrays with any leading shape (...,) and joints last. Its faults
+have an order: the first that is met gives the reason. A command passes unchanged, or its target is
+moved into the range that all limits allow, or it is replaced by damping. Gains are never changed: a
+robot with another stiffness is not the one that was matched.
 
 `SafetyFilter` judges the states and the command of a tick by these rules, and the states so far by
 `Supervision`: whether they can all be true. A fault damps for at least one second; a latched fault
@@ -47,7 +47,7 @@ class FilterAction(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why the filter acted. Those up to `POWER` hold or move the target; the others damp."""
+    """Why the filter acted. Those up to `POWER` hold or move the target; the others are faults."""
 
     text: str
     """One line."""
@@ -57,6 +57,11 @@ class Reason(IntEnum):
         reason = int.__new__(cls, value)
         reason._value_, reason.text = value, text
         return reason
+
+    @property
+    def level(self) -> FilterAction:
+        """What the filter does for this reason; a fault is latched unless it only damps."""
+        return _NOT_LATCHED.get(self, FilterAction.LATCH)
 
     NONE = 0, "no limit met"
     OLD_STATE = 1, "the newest state is older than 20 ms; the last target is held"
@@ -89,6 +94,22 @@ class Reason(IntEnum):
     SWAPPED = 28, "another joint moved than the one that was swung; their encoders are swapped"
     STANDBY = 29, "the servo was silent for too long, and the standby process damped the joints"
 
+
+_NOT_LATCHED = {
+    Reason.NONE: FilterAction.PASS,
+    Reason.OLD_STATE: FilterAction.HOLD,
+    Reason.POSITION: FilterAction.LIMIT,
+    Reason.CHANGE: FilterAction.LIMIT,
+    Reason.TORQUE: FilterAction.LIMIT,
+    Reason.POWER: FilterAction.LIMIT,
+    Reason.NO_STATE: FilterAction.DAMP,
+    Reason.DEAD_MAN: FilterAction.DAMP,
+    Reason.ENDED: FilterAction.DAMP,
+    Reason.HELD: FilterAction.DAMP,
+}
+# As plain numbers: members of an enumeration cost as much as a rule.
+_LEVELS = np.array([int(reason.level) for reason in Reason])
+_OLD_STATE, _POSITION, _CHANGE, _TORQUE, _POWER = range(Reason.OLD_STATE, Reason.POWER + 1)
 
 _UNLIMITED = ("tilt", "measured_torque")
 """Limits that may be infinite."""
@@ -248,33 +269,6 @@ _ABSURD = 1e6
 _NO_STIFFNESS = 1e-9
 """Stiffness below which a target moves nothing [N m/rad]."""
 
-_DAMP, _LATCH = FilterAction.DAMP, FilterAction.LATCH
-FAULTS = {
-    Reason.STATE_NOT_FINITE: _LATCH,
-    Reason.COMMAND_NOT_FINITE: _LATCH,
-    Reason.GAINS: _LATCH,
-    Reason.CLOCK: _LATCH,
-    Reason.EXPIRED: _LATCH,
-    Reason.STATE_LOST: _LATCH,
-    Reason.NO_STATE: _DAMP,
-    Reason.LAG: _LATCH,
-    Reason.OVERRUN: _LATCH,
-    Reason.TILT: _LATCH,
-    Reason.SPEED: _LATCH,
-    Reason.TEMPERATURE: _LATCH,
-    # After the measurements, which explain more.
-    Reason.IMPOSSIBLE: _LATCH,
-    Reason.DEAD_MAN: _DAMP,
-    Reason.OVERLOAD: _LATCH,
-}
-"""Faults that the rules find, in their order: the first that is met gives the reason."""
-# As plain numbers: members of an enumeration cost as much as a rule.
-_REASONS, _LEVELS = (np.array([int(x) for x in each]) for each in (FAULTS, FAULTS.values()))
-_LIMIT, _HOLD, _OLD_STATE = int(FilterAction.LIMIT), int(FilterAction.HOLD), int(Reason.OLD_STATE)
-_POSITION, _CHANGE, _TORQUE, _POWER = (
-    int(each) for each in (Reason.POSITION, Reason.CHANGE, Reason.TORQUE, Reason.POWER)
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyInput:
@@ -340,35 +334,33 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
     # A quaternion far from unit length is no attitude.
     state_wrong = ~state_fine | np.isnan(state_age) | (np.abs(square - 1.0) > 0.1)
     command_wrong = ~command_fine | np.isnan(command_age) | np.isnan(given.valid_for)
-    # In the order of `FAULTS`.
-    faults: tuple[Mask, ...] = (
-        state_wrong,
-        command_wrong,
-        gains_wrong,
-        np.minimum(state_age, command_age) < -limits.future_s,
-        command_age > np.minimum(given.valid_for, limits.expiry_s),
-        state_age > limits.latch_s,
-        state_age > limits.damp_s,
-        np.asarray(given.lag > limits.lag),
-        beyond[..., 0],
-        upright < math.cos(min(limits.tilt, math.pi)) - _SLACK,
-        beyond[..., 1],
-        beyond[..., 3],
-        ~possible,
-        np.logical_not(given.held),
-        beyond[..., 2],
+    # The first that is met gives the reason.
+    faults: tuple[tuple[Reason, Mask], ...] = (
+        (Reason.STATE_NOT_FINITE, state_wrong),
+        (Reason.COMMAND_NOT_FINITE, command_wrong),
+        (Reason.GAINS, gains_wrong),
+        (Reason.CLOCK, np.minimum(state_age, command_age) < -limits.future_s),
+        (Reason.EXPIRED, command_age > np.minimum(given.valid_for, limits.expiry_s)),
+        (Reason.STATE_LOST, state_age > limits.latch_s),
+        (Reason.NO_STATE, state_age > limits.damp_s),
+        (Reason.LAG, np.asarray(given.lag > limits.lag)),
+        (Reason.OVERRUN, beyond[..., 0]),
+        (Reason.TILT, upright < math.cos(min(limits.tilt, math.pi)) - _SLACK),
+        (Reason.SPEED, beyond[..., 1]),
+        (Reason.TEMPERATURE, beyond[..., 3]),
+        # After the measurements, which explain more.
+        (Reason.IMPOSSIBLE, ~possible),
+        (Reason.DEAD_MAN, np.logical_not(given.held)),
+        (Reason.OVERLOAD, beyond[..., 2]),
     )
     found = np.empty((*why.shape, len(faults)), dtype=np.bool_)
-    for k, met in enumerate(faults):
+    for k, (_, met) in enumerate(faults):
         found[..., k] = met
-    level, reason = np.where(why > 0, _LIMIT, 0), why
-    if hold.any():
-        level, reason = np.where(hold, _HOLD, level), np.where(hold, _OLD_STATE, reason)
+    reason = np.where(hold, _OLD_STATE, why) if hold.any() else why
     if found.any():
-        first, faulted = found.argmax(axis=-1), found.any(axis=-1)
-        level = np.where(faulted, _LEVELS[first], level)
-        reason = np.where(faulted, _REASONS[first], reason)
-    return SafetyResult(level=level, reason=reason, target=fitted)
+        first = np.array([int(each) for each, _ in faults])[found.argmax(axis=-1)]
+        reason = np.where(found.any(axis=-1), first, reason)
+    return SafetyResult(level=_LEVELS[reason], reason=reason, target=fitted)
 
 
 def _finite(*parts: Array) -> tuple[Mask, Array]:
@@ -457,11 +449,15 @@ LEAST_DAMPING_S = 1.0
 
 
 class Decision(NamedTuple):
-    """The filter's action on a command; `detail` has joint and numbers of a new fault."""
+    """Why the filter acts on a command; `detail` has joint and numbers of a new fault."""
 
-    level: FilterAction
     reason: Reason
     detail: str = ""
+
+    @property
+    def level(self) -> FilterAction:
+        """What it does."""
+        return self.reason.level
 
     @property
     def text(self) -> str:
@@ -476,10 +472,8 @@ class SafetyFilter:
     limits: Limits
     state_rate_hz: float = LAG_RATE_HZ
     """States per second of the robot."""
-    level: FilterAction = FilterAction.PASS
-    """`DAMP` or `LATCH` while a fault lasts."""
     reason: Reason = Reason.NONE
-    """Of the fault."""
+    """Of the fault that lasts."""
     since: float = 0.0
     """When it began [s]."""
     last: Array | None = None
@@ -505,28 +499,33 @@ class SafetyFilter:
         self.blocked = self._anchor = np.zeros(len(self.limits.joints))
 
     @property
+    def level(self) -> FilterAction:
+        """`DAMP` or `LATCH` while a fault lasts, else `PASS`."""
+        return self.reason.level
+
+    @property
     def faulted(self) -> bool:
         """Whether a fault lasts."""
-        return self.level >= _DAMP
+        return self.reason is not Reason.NONE
 
-    def fault(self, level: FilterAction, reason: Reason, t: float) -> None:
+    def fault(self, reason: Reason, t: float) -> None:
         """Begin a fault, or make one more severe; one that is at least as severe stays."""
-        if level > self.level:
+        if reason.level > self.level:
             self.since = self.since if self.faulted else t
-            self.level, self.reason = level, reason
+            self.reason = reason
 
     def release(self, t: float, *, acknowledged: bool = False) -> None:
         """End a fault that has lasted long enough; a latched one only if `acknowledged`."""
         over = self.faulted and t - self.since >= LEAST_DAMPING_S
         if over and (acknowledged or self.level is FilterAction.DAMP):
-            self.level, self.reason, self.last = FilterAction.PASS, Reason.NONE, None
+            self.reason, self.last = Reason.NONE, None
 
     def damped(self) -> Decision:
         """Note a tick without a target; the next one is limited to near the measured position."""
         self.last = None
         self.supervision.begin()
         self._judged, self._pushed, self.clipped = None, None, 0.0
-        return Decision(self.level, self.reason)
+        return Decision(self.reason)
 
     def judge(
         self, states: Sequence[State], command: Command, t: float, *, held: bool = True
@@ -538,48 +537,45 @@ class SafetyFilter:
         """
         result = apply_rules(self._input(states, command, t, held), self.limits)
         # A fault in any of the states decides; the newest if there is none.
-        faulted = result.level >= _DAMP
+        faulted = result.level >= int(FilterAction.DAMP)
         row = int(np.argmax(faulted)) if faulted.any() else -1
-        level, reason = FilterAction(int(result.level[row])), Reason(int(result.reason[row]))
-        detail = ""
-        if level >= _DAMP:
-            detail = _detail(reason, states[row], command, self.limits, t)
+        found = Decision(Reason(int(result.reason[row])))
+        if faulted.any():
+            detail = _detail(found.reason, states[row], command, self.limits, t)
+            found = found._replace(detail=detail)
         elif not self.faulted:
-            wrong = self._implausible(states) or self._persistent(
-                level, reason, t, command, states[-1]
-            )
-            if wrong is not None:
-                level, reason, detail = wrong
-        if self.faulted or level >= _DAMP:
-            detail = "" if self.faulted else detail
-            if level >= _DAMP:
-                self.fault(level, reason, t)
+            wrong = self._supervise(states)
+            found = wrong or self._persistent(found.reason, t, command, states[-1]) or found
+        if self.faulted or found.level >= FilterAction.DAMP:
+            detail = "" if self.faulted else found.detail
+            if found.level >= FilterAction.DAMP:
+                self.fault(found.reason, t)
             return None, self.damped()._replace(detail=detail)
         self.last = result.target[-1]
         self.supervision.command(np.asarray(command.stiffness) * self.last)
-        return replace(command, position=self.last), Decision(level, reason)
+        return replace(command, position=self.last), found
 
-    def _implausible(self, states: Sequence[State]) -> Decision | None:
+    def _supervise(self, states: Sequence[State]) -> Decision | None:
         """Supervise the new states; the first fault."""
         for state in states:
             self.supervision.observe(state)
             found = _contradiction(self.supervision, self.limits)
             if found is not None:
-                return Decision(_LATCH, *found)
+                return found
         return None
 
     def _persistent(
-        self, level: FilterAction, reason: Reason, t: float, command: Command, state: State
+        self, reason: Reason, t: float, command: Command, state: State
     ) -> Decision | None:
         """Note a tick that holds or limits; a fault if it has been so for too long."""
         seconds, limits = 0.0 if self._judged is None else t - self._judged, self.limits
         self._judged = t
         while self._ticks and self._ticks[0][0] < t - 1.0:
             self._ticks.popleft()
-        if level is FilterAction.HOLD:
+        if reason is Reason.OLD_STATE:
             self._ticks.append((t, seconds))
             if (held := sum(each for _, each in self._ticks)) > limits.held_s:
-                return Decision(_DAMP, Reason.HELD, f"{1e3 * held:.0f} ms")
+                return Decision(Reason.HELD, f"{1e3 * held:.0f} ms")
         if reason is not Reason.TORQUE:
             self._pushed, self.clipped = None, 0.0
             return None
@@ -594,9 +590,9 @@ class SafetyFilter:
         i = int(np.argmax(self.blocked))
         if self.blocked[i] > limits.blocked_s:
             text = f"{limits.joints[i]}, for {1e3 * self.blocked[i]:.0f} ms without moving"
-            return Decision(_LATCH, Reason.CLIPPED, text)
+            return Decision(Reason.CLIPPED, text)
         if self.clipped > limits.clipped_s:
-            return Decision(_LATCH, Reason.CLIPPED, f"{1e3 * self.clipped:.0f} ms")
+            return Decision(Reason.CLIPPED, f"{1e3 * self.clipped:.0f} ms")
         return None
 
     def _input(
@@ -638,45 +634,49 @@ def _rows(rows: Sequence[object], count: int) -> Array:
     return np.concatenate([_rows([row], count) for row in rows])
 
 
-def _contradiction(seen: Supervision, limits: Limits) -> tuple[Reason, str] | None:
+def _contradiction(seen: Supervision, limits: Limits) -> Decision | None:
     """What states say against each other, and the numbers; None if nothing."""
     joints, n = limits.joints, len(limits.joints)
-    if math.isfinite(limits.tilt):  # else the trunk is fixed, and a robot may have no such unit
+    free = math.isfinite(limits.tilt)  # else the trunk is fixed, and may have no inertial unit
+    if free:
         for name, seconds in seen.repeated.items():
             if seconds > limits.repeat_s:
-                return Reason.REPEATED, f"{name}, for {1e3 * seconds:.0f} ms"
-        if seen.attitude > limits.attitude:
-            return Reason.ATTITUDE, f"the gyro's integral is {seen.attitude:.2f} rad off"
+                return Decision(Reason.REPEATED, f"{name}, for {1e3 * seconds:.0f} ms")
         path, turned = seen.paths
+        if seen.attitude > limits.attitude:
+            text = f"the gyro's integral is {seen.attitude:.2f} rad off"
+            return Decision(Reason.ATTITUDE, text)
         if turned > limits.turned and path < _STUCK * turned:
-            return Reason.ATTITUDE, f"it is stuck while the gyro's integral is {turned:.2f} rad"
-        if (lean := seen.lean) > limits.upright:
-            return Reason.ATTITUDE, f"the mean specific force is {lean:.2f} rad off the vertical"
+            text = f"it is stuck while the gyro's integral is {turned:.2f} rad"
+            return Decision(Reason.ATTITUDE, text)
+        if seen.lean > limits.upright:
+            text = f"the mean specific force is {seen.lean:.2f} rad off the vertical"
+            return Decision(Reason.ATTITUDE, text)
     if (seen.encoder > limits.encoder).any():
         i = int(np.argmax(seen.encoder))
-        return Reason.ENCODER, f"{joints[i]}, by {seen.encoder[i]:.2f} rad"
+        return Decision(Reason.ENCODER, f"{joints[i]}, by {seen.encoder[i]:.2f} rad")
     constant = (seen.constant_s > limits.repeat_s).reshape(2, n)
     if not constant.any():
         return None
     both = constant.all(axis=0)
-    if math.isfinite(limits.tilt) and (alone := both & (seen.others > limits.others)).any():
+    alone = both & (seen.others > limits.others)
+    if free and alone.any():
         i = int(np.argmax(alone))
-        return (
-            Reason.ENCODER,
-            f"{joints[i]}, constant while others moved by {seen.others[i]:.2f} rad",
-        )
+        text = f"{joints[i]}, constant while others moved by {seen.others[i]:.2f} rad"
+        return Decision(Reason.ENCODER, text)
     share = np.where(constant.all(axis=1), _ALL, 1.0)[:, None]
     excess = np.where(constant, seen.moved.reshape(2, n) / limits.moved, 0.0)
     if (excess > 1.0).any():
         kind, i = divmod(int(np.argmax(excess)), n)
         which = ("position", "velocity")[kind]
-        return Reason.ENCODER, f"{joints[i]}, whose {which} is constant"
+        return Decision(Reason.ENCODER, f"{joints[i]}, whose {which} is constant")
     unmoved = both & (seen.load > limits.felt * share.max())
-    if math.isinf(limits.tilt):  # a robot on its stand may be simulated without some of its legs
+    if not free:  # a robot on its stand may be simulated without some of its legs
         unmoved &= seen.live
     if unmoved.any():
         i = int(np.argmax(unmoved))
-        return Reason.ENCODER, f"{joints[i]}, constant while {seen.load[i]:.1f} N m were added"
+        text = f"{joints[i]}, constant while {seen.load[i]:.1f} N m were added"
+        return Decision(Reason.ENCODER, text)
     return None
 
 

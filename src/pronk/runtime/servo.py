@@ -271,11 +271,11 @@ class Servo:
         damped = self.shared.standby.written > 0
         if damped:
             # Its commands are another program's to the link.
-            self.safety.fault(FilterAction.LATCH, Reason.STANDBY, begun)
+            self.safety.fault(Reason.STANDBY, begun)
         elif link_error:
-            self.safety.fault(FilterAction.LATCH, Reason.LINK, begun)
+            self.safety.fault(Reason.LINK, begun)
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
-            self.safety.fault(FilterAction.DAMP, Reason.ENDED, begun)
+            self.safety.fault(Reason.ENDED, begun)
         objection = ""
         if mode is Mode.STAND and not self.plan.ignore_latency:
             measured = self.latency.quantile(0.95), self.latency.count
@@ -295,7 +295,7 @@ class Servo:
         if damped:
             why = ""
         elif why:
-            self.safety.fault(FilterAction.LATCH, Reason.LINK, done)
+            self.safety.fault(Reason.LINK, done)
         self._act_on_faults(level, begun, why or (decision.detail and decision.text))
         if self._sweep is not None and mode is Mode.SWEEP:
             if sent is not None:
@@ -311,7 +311,8 @@ class Servo:
             latency = done - float(self.action["state_time"])
             self.latency.add(max(0.0, latency))
         if self.plan.sweep is None:  # the log of a sweep is of its samples
-            self._log_tick(state, begun, done, desired, sent, decision, latency)
+            times = {"begun": begun, "done": done, "latency": latency}
+            self._log_tick(state, desired, sent, decision, times)
 
     def _act_on_faults(self, level: FilterAction, begun: float, why: str) -> None:
         """Report a fault that is worse than the `level` before the tick, and leave the mode."""
@@ -336,31 +337,23 @@ class Servo:
     def _log_tick(
         self,
         state: State,
-        begun: float,
-        done: float,
         desired: DesiredCommand,
         sent: Command | None,
         decision: Decision,
-        latency: float,
+        times: dict[str, float],
     ) -> None:
         """Put a tick into the logger's queue."""
         tick, action, wanted = self._tick_record, self.action, desired.command
         ipc.put_state(tick, state)
+        ipc.fill(tick, **times, tick=self.pace.tick, deadline=self.pace.deadline)
+        ipc.fill(tick, mode=self.modes.mode, level=decision.level, reason=decision.reason)
         ipc.fill(
             tick,
-            tick=self.pace.tick,
-            mode=self.modes.mode,
             damped=sent is None and not self.modes.silent,
-            level=decision.level,
-            reason=decision.reason,
             action=-1 if action is None else action["sequence"],
             action_state=-1 if action is None else action["state_sequence"],
-            deadline=self.pace.deadline,
-            begun=begun,
-            done=done,
             blend=desired.blend,
             stiffness=0.0 if sent is None else desired.stiffness,
-            latency=latency,
             desired=np.nan if wanted is None else wanted.position,
             sent=np.nan if sent is None else sent.position,
         )

@@ -148,11 +148,6 @@ def stand_up(
     )
 
 
-def sit_down(robot: RobotSpec, measured: Array, began: float, timing: Timing) -> Path:
-    """From the measured pose to the folded pose."""
-    return Path(began=began, poses=(measured.copy(), folded_pose(robot)), seconds=(timing.sit_s,))
-
-
 class DesiredCommand(NamedTuple):
     """The command of a tick, before the safety filter."""
 
@@ -251,7 +246,7 @@ class StateMachine:
             return self._follow(t, self._path.target(t), action, safety)
         if self._path is not None and self.mode in (Mode.STAND, Mode.SIT):
             if self.mode is Mode.STAND and not self._known and self._swapped(t, position):
-                safety.fault(FilterAction.LATCH, Reason.SWAPPED, t)
+                safety.fault(Reason.SWAPPED, t)
                 return DesiredCommand()
             if self.mode is Mode.STAND or not self._path.done(t):
                 return self._pose(t, self._path.target(t), self._path.stiffness(t))
@@ -294,7 +289,8 @@ class StateMachine:
             self._request = OperatorRequest.NONE
 
     def _sit(self, t: float, position: Array) -> None:
-        self._path = sit_down(self.robot, position, t, self.timing)
+        poses = position.copy(), folded_pose(self.robot)
+        self._path = Path(began=t, poses=poses, seconds=(self.timing.sit_s,))
         self.enter(Mode.SIT, t)
 
     def _swapped(self, t: float, position: Array) -> bool:
@@ -329,7 +325,7 @@ class StateMachine:
         # Halted before its first action, the policy may act for either mode.
         if self._blending is None and (action is None or action["entry"] < self._first_entry):
             if t - self.since > FIRST_ACTION_S:
-                safety.fault(FilterAction.LATCH, Reason.EXPIRED, t)
+                safety.fault(Reason.EXPIRED, t)
                 return DesiredCommand()
             return self._pose(t, pose, 1.0)
         assert action is not None
