@@ -159,9 +159,9 @@ def _write(folder: Path) -> None:
         for name in ("deadline", "begun", "done", "time"):
             tick[name] = k / 500.0
         tick["mode"], tick["latency"], step["begun"], step["live"] = Mode.POLICY, 0.003, k / 500, 1
-        made.tick(np.frombuffer(tick.tobytes(), TICK)[0])
+        made.write(np.frombuffer(tick.tobytes(), TICK)[0])
         if k % 10 == 0:
-            made.step(np.frombuffer(step.tobytes(), STEP)[0])
+            made.write(np.frombuffer(step.tobytes(), STEP)[0])
     made.end(complete=True, figures={})
     shutil.copytree(Path(load_robot.__code__.co_filename).parent / robot.name, folder / "robot")
     shutil.copy(folder / "robot" / f"{robot.name}.xml", folder / "model.xml")

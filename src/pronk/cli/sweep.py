@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
     from pronk.runtime.ipc import Event
     from pronk.runtime.plan import Link
-    from pronk.runtime.run import Recorded
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
 """Excitation signals: classes of `pronk.excitation.signals`, `log-chirp` for `LogChirp`."""
@@ -112,8 +111,7 @@ def sweep(
             figures["logs"] = logs
         else:
             link = Link(robot=known.source or known.name, address=address, release=machine.release)
-            recorded = record_wire(plan, out, link, real_time=machine.real_time, **how)
-            figures |= vars(recorded)
+            figures |= record_wire(plan, out, link, real_time=machine.real_time, **how)
     where = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
     console.say(f"wrote {len(figures['logs'])} logs of {where} to {out}")
     if late := figures.get("servo"):
@@ -134,19 +132,25 @@ def record_wire(
     overwrite: bool = False,
     progress: Callable[[float], None] = lambda share: None,
     **more: Any,
-) -> Recorded:
+) -> dict[str, Any]:
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
-    The caller has checked the plan; `more` is of the runtime's `Plan`. If the robot may not be
-    moved, the filter stops it or a process is killed, a PronkError is raised and what was recorded
-    stays.
+    The caller has checked the plan; `more` is of the runtime's `Plan`. Returns the `logs`, whether
+    the robot was `virtual`, and how late the `servo` was.
+
+    Raises:
+        PronkError: The robot may not be moved, the filter stopped the sweep, or a process was
+            killed. What was recorded until then stays readable, with the reason.
+        KeyboardInterrupt: The run was interrupted; the joints were damped.
     """
     from pronk.runtime.plan import Plan
-    from pronk.runtime.run import run_sweep
+    from pronk.runtime.run import run
     from pronk.runtime.sweep import SweepTask
+    from pronk.runtime.teleop import BenchOperator
 
     metadata = {"link": str(link.address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
+    job, operator = Plan(link=link, sweep=task, **more), BenchOperator(console.Person())
     whole: list[str] = []
 
     def notify(event: Event) -> None:
@@ -155,9 +159,19 @@ def record_wire(
         elif event.kind == "system" and job.real_time:
             console.say(event.text)
 
-    job = Plan(link=link, sweep=task, **more)
     try:
-        return run_sweep(job, clamp_operator=console.Person(), notify=notify, progress=progress)
+        summary = run(job, operator, notify, progress)
+        servo = summary.servo
+        if summary.interrupted:
+            raise KeyboardInterrupt
+        if operator.error is not None:
+            raise operator.error
+        if summary.log_error:
+            raise HardwareError(f"{summary.log_error}; the joints were damped.")
+        if reasons := summary.refusals or servo["faults"]:
+            raise HardwareError(" ".join(reasons))
+        if not servo["finished"]:
+            raise HardwareError("the sweep was ended (SIGTERM); the joints were damped.")
     except BaseException:
         cut = [path.name for path in task.paths if path.exists() and path.name not in whole]
         if whole or cut:
@@ -167,3 +181,5 @@ def record_wire(
                 + "; sweep the others with --joints"
             )
         raise
+    late = {**servo["lateness"], "missed": servo["missed_ticks"]}
+    return {"logs": task.paths, "virtual": bool(servo["virtual"]), "servo": late}

@@ -41,7 +41,7 @@ from pronk.logs.mcap import (
     Record,
     records,
 )
-from pronk.runtime.ipc import STEP, TICK, VIRTUAL, Event, Mode, Shared
+from pronk.runtime.ipc import EVENT, STEP, TICK, VIRTUAL, Event, Mode, Shared
 from pronk.runtime.plan import Plan
 from pronk.runtime.safety import Reason
 from pronk.runtime.sweep import SweepLogs
@@ -98,41 +98,27 @@ class DeployLogWriter:
 
     def drain(self, shared: Shared) -> None:
         """Write everything that waits, events first: they explain the rest."""
-        for ring, write in (
-            (shared.events, self.event),
-            (shared.policy_events, self.event),
-            (shared.ticks, self.tick),
-            (shared.steps, self.step),
-        ):
+        for ring in (shared.events, shared.policy_events, shared.ticks, shared.steps):
             for record in ring.take():
-                write(record)
+                self.write(record)
 
-    def tick(self, record: np.void) -> None:
-        """Write one tick of the servo, a record of `TICK`."""
-        names = {
-            "mode_name": Mode(record["mode"]).name,
-            "reason_name": Reason(record["reason"]).name,
-        }
-        self._put_record(_TICK, record, names)
-
-    def step(self, record: np.void) -> None:
-        """Write one step of the policy, a record of `STEP`."""
-        self._put_record(_STEP, record, {})
-
-    def event(self, record: np.void) -> None:
-        """Write a record of `EVENT`."""
-        event = Event.of(record)
-        self._put(_EVENT, event.time, vars(event))
+    def write(self, record: np.void) -> None:
+        """Write a record of `EVENT`, `TICK` or `STEP`, as plain numbers and lists."""
+        names = record.dtype.names or ()
+        if names == EVENT.names:
+            event = Event.of(record)
+            self._put(_EVENT, event.time, vars(event))
+            return
+        topic, row = _STEP, {name: record[name].tolist() for name in names}
+        if names == TICK.names:
+            topic, mode, reason = _TICK, Mode(record["mode"]), Reason(record["reason"])
+            row |= {"mode_name": mode.name, "reason_name": reason.name}
+        self._put(topic, row["begun"], row)
 
     def end(self, *, complete: bool, figures: dict[str, Any]) -> None:
         """Write the end and close the file."""
         self._put(_END, time.monotonic(), {"complete": complete, "figures": figures})
         self._file.close()
-
-    def _put_record(self, topic: str, record: np.void, names: dict[str, str]) -> None:
-        """Write a record as plain numbers and lists, at the time at which it was begun."""
-        row = {name: record[name].tolist() for name in record.dtype.names or ()}
-        self._put(topic, row["begun"], row | names)
 
     def _put(self, topic: str, t: float, body: dict[str, Any]) -> None:
         self._file.put(topic, t + self._wall, body)
@@ -147,7 +133,7 @@ _LAST_S = 6.0
 three at most [s]."""
 
 
-def write_log(plan: Plan, header: dict[str, Any], name: str, talk: Connection) -> None:
+def write_log(plan: Plan, name: str, header: dict[str, Any], talk: Connection) -> None:
     """Body of the logger's process; ends on request, or after the servo.
 
     `talk` sends `READY` or an error, and receives the figures of the run, JSON, at its end.
@@ -204,11 +190,19 @@ def _write(
         writer.end(complete=bool(figures) and not any(shared.dropped().values()), figures=figures)
 
 
-_TICK_NAMES = {"time": "begun", "state_time": "time", "state_sequence": "sequence"} | {
-    "action_number": "action"
-}
-_STEP_NAMES = {"step_time": "begun", "step_live": "live"}
-"""Arrays of a log whose fields in the records have other names."""
+_ARRAYS = (
+    {name: ("steps", name) for name in STEP.names or ()}
+    | {name: ("ticks", name) for name in TICK.names or () if name != "action"}
+    | {
+        "time": ("ticks", "begun"),
+        "state_time": ("ticks", "time"),
+        "state_sequence": ("ticks", "sequence"),
+        "action_number": ("ticks", "action"),
+        "step_time": ("steps", "begun"),
+        "step_live": ("steps", "live"),
+    }
+)
+"""Records and field of each array of a log."""
 _DIFFERENCES = {
     "lateness": ("ticks", "begun", "deadline"),
     "work": ("ticks", "done", "begun"),
@@ -252,14 +246,10 @@ class DeployLog:
         if name in _DIFFERENCES:
             which, end, begin = _DIFFERENCES[name]
             return np.asarray(getattr(self, which)[end] - getattr(self, which)[begin])
-        if name in _STEP_NAMES:
-            found = self.steps[_STEP_NAMES[name]]
-        elif name in _TICK_NAMES or (name in (TICK.names or ()) and name != "action"):
-            found = self.ticks[_TICK_NAMES.get(name, name)]
-        elif name in (STEP.names or ()):
-            found = self.steps[name]
-        else:
+        if name not in _ARRAYS:
             raise AttributeError(name)
+        which, field = _ARRAYS[name]
+        found: NDArray[Any] = getattr(self, which)[field]
         return found.astype(bool) if name in _FLAGS else found
 
     @property

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -20,7 +19,6 @@ import orjson
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.address import SIM
-from pronk.links.link import ClampOperator
 from pronk.links.realtime import Interrupts, sleep_until, terminal_blocked
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
@@ -30,7 +28,7 @@ from pronk.runtime.plan import SERVO_PRIORITY, Plan
 from pronk.runtime.policy_process import serve_policy
 from pronk.runtime.servo import serve_robot
 from pronk.runtime.standby import serve_standby
-from pronk.runtime.teleop import BenchOperator, Operator, OperatorCommand
+from pronk.runtime.teleop import Operator, OperatorCommand
 
 _RATE_HZ = 50.0
 """Of the operator's program."""
@@ -128,6 +126,8 @@ class Deployment:
         self.logger: BaseProcess | None = None
         self.standby: BaseProcess | None = None
         """Of a robot behind a network."""
+        self._ends: dict[BaseProcess, Connection] = {}
+        """This end of the pipe to each process."""
         self._record = np.zeros((), dtype=OPERATOR)
         self._written, self._beating = threading.Event(), False
         self._heart = threading.Thread(target=self._beat, name="pronk heartbeat", daemon=True)
@@ -136,30 +136,20 @@ class Deployment:
 
     def __enter__(self) -> Self:
         """Start everything; HardwareError if the link could not be opened."""
-        plan, context = self.plan, get_context("spawn")
+        plan = self.plan
         with terminal_blocked():
             self.shared = Shared(joints=len(plan.robot.joints))
-        name = self.shared.name
         self.write(OperatorCommand())
         self._beating = True
         with terminal_blocked():
             self._heart.start()
-        self._servo_end, servo_end = context.Pipe(duplex=False)
-        self._policy_end, policy_end = context.Pipe(duplex=False)
-        self._logger_end, talk = context.Pipe()
-        trained = self.summary.trained_delay_s
-
-        def process(what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
-            return context.Process(target=body, args=given, name=f"pronk {what}")
-
-        self.servo = process("servo", serve_robot, plan, name, trained, servo_end)
+        self.servo = self._process("servo", serve_robot, self.summary.trained_delay_s)
         if plan.policy is not None:
-            self.policy = process("policy", serve_policy, plan, name, policy_end)
+            self.policy = self._process("policy", serve_policy)
         if plan.log is not None or plan.sweep is not None:
-            self.logger = process("log", write_log, plan, self._header, name, talk)
+            self.logger = self._process("log", write_log, self._header)
         if plan.link.address.kind != SIM:
-            self._standby_end, standby_end = context.Pipe(duplex=False)
-            self.standby = process("standby", serve_standby, plan, name, standby_end)
+            self.standby = self._process("standby", serve_standby)
         self._interrupts.__enter__()
         self._open = True
         try:
@@ -168,14 +158,16 @@ class Deployment:
                     if started is not None:
                         started.start()
             if self.logger is not None:
-                self._await_logger(self.logger)
+                silent = f"{plan.log}: the process that writes the log did not start."
+                reply = self._first(self.logger, LogError(silent))
+                if reply != READY:
+                    raise LogError(reply.decode())
             if self.standby is not None:
-                self._await_standby(self.standby)
+                silent = "the process that damps in place of the servo did not start."
+                self._first(self.standby, HardwareError(silent))
             # Last, so that its first tick is logged.
             with terminal_blocked():
                 self.servo.start()
-            for end in (servo_end, policy_end):
-                end.close()
             self._await_servo()
         except BaseException:
             self.close()
@@ -184,6 +176,15 @@ class Deployment:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _process(self, what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
+        """A process that is not started yet; the pipe's other end is its last argument."""
+        context = get_context("spawn")
+        end, other = context.Pipe()
+        given = (self.plan, self.shared.name, *given, other)
+        process = context.Process(target=body, args=given, name=f"pronk {what}")
+        self._ends[process] = end
+        return process
 
     @property
     def mode(self) -> Mode:
@@ -236,7 +237,7 @@ class Deployment:
     ) -> RunSummary:
         """Send the operator's commands until the servo ends.
 
-        `progress` is called with the share of a sweep that is done, 0 to 1.
+        `progress` gets the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
         while True:
@@ -267,16 +268,13 @@ class Deployment:
         try:
             if self.servo.pid is not None:
                 self._stop_servo()
-            if self.standby is not None and self.standby.pid is not None:
-                self.standby.terminate()
-                self.standby.join(_END_S)
-                self.summary.standby = self.shared.standby.written > 0
-            self.summary.servo = _received(self._servo_end)
-            if self.policy is not None:
-                if self.policy.pid is not None:
-                    self.policy.terminate()
-                    self.policy.join(_END_S)
-                self.summary.policy = _received(self._policy_end)
+            for process in (self.standby, self.policy):
+                if process is not None and process.pid is not None:
+                    process.terminate()
+                    process.join(_END_S)
+            self.summary.standby = self.shared.standby.written > 0
+            self.summary.servo = self._figures(self.servo)
+            self.summary.policy = self._figures(self.policy)
             self.events_seen()
             if self.logger is not None and self.logger.pid is not None:
                 self._stop_logger(self.logger)
@@ -305,25 +303,33 @@ class Deployment:
             self.servo.terminate()
             self.servo.join(_END_S)
 
+    def _figures(self, process: BaseProcess | None) -> dict[str, Any]:
+        """What a process sent when it ended; {} if it was killed."""
+        if process is None:
+            return {}
+        end = self._ends[process]
+        try:
+            return dict(orjson.loads(end.recv_bytes())) if end.poll(1.0) else {}
+        except (EOFError, OSError):
+            return {}
+
     def _stop_logger(self, logger: BaseProcess) -> None:
-        summary = self.summary
+        summary, end = self.summary, self._ends[logger]
         figures = summary.figures()
         if not summary.servo:
             figures["reason"] = "the servo's process was killed"
         ended = time.time()
         try:
-            if not self._logger_end.poll():
-                self._logger_end.send_bytes(orjson.dumps(figures))
+            if not end.poll():
+                end.send_bytes(orjson.dumps(figures))
                 logger.join(_END_S)
-            if self._logger_end.poll():  # an error, or the end of the process
-                summary.log_error = self._logger_end.recv_bytes().decode()
+            if end.poll():  # an error, or the end of the process
+                summary.log_error = end.recv_bytes().decode()
             elif logger.exitcode is None:
                 summary.log_error = f"the log was not ended within {_END_S:.0f} s"
-        except EOFError:
+        except (EOFError, OSError):
             if logger.exitcode != 0:
                 summary.log_error = "the process that writes the log was killed"
-        except OSError:
-            summary.log_error = "the process that writes the log was killed"
         dropped = sum(summary.servo.get("dropped", {}).values())
         if dropped and not summary.log_error:
             summary.log_error = f"the log lacks {dropped} records: its process was too slow"
@@ -332,22 +338,14 @@ class Deployment:
             where = f"{self.plan.log} ends {max(lacking, 0.0):.1f} s before the run"
             summary.log_error = f"{summary.log_error.rstrip('.')}; {where}"
 
-    def _await_logger(self, logger: BaseProcess) -> None:
-        until = time.monotonic() + _START_S
-        while not self._logger_end.poll(0.05):
+    def _first(self, process: BaseProcess, silent: PronkError) -> bytes:
+        """The first message of a process; raises `silent` if none comes."""
+        end, until = self._ends[process], time.monotonic() + _START_S
+        while not end.poll(0.05):
             self.write(OperatorCommand())
-            if logger.exitcode is not None or time.monotonic() > until:
-                raise LogError(f"{self.plan.log}: the process that writes the log did not start.")
-        reply = self._logger_end.recv_bytes()
-        if reply != READY:
-            raise LogError(reply.decode())
-
-    def _await_standby(self, standby: BaseProcess) -> None:
-        until = time.monotonic() + _START_S
-        while not self._standby_end.poll(0.05):
-            self.write(OperatorCommand())
-            if standby.exitcode is not None or time.monotonic() > until:
-                raise HardwareError("the process that damps in place of the servo did not start.")
+            if process.exitcode is not None or time.monotonic() > until:
+                raise silent
+        return end.recv_bytes()
 
     def _await_servo(self) -> None:
         until = time.monotonic() + _START_S
@@ -364,28 +362,24 @@ class Deployment:
                 )
 
 
-def _received(end: Connection) -> dict[str, Any]:
-    """The figures that a process sent when it ended; {} if it was killed."""
-    try:
-        return dict(orjson.loads(end.recv_bytes())) if end.poll(1.0) else {}
-    except (EOFError, OSError):
-        return {}
-
-
-def run(plan: Plan, operator: Operator, notify: Callable[[Event], None]) -> RunSummary:
-    """Run a policy from beginning to end; PronkError if it could not start."""
+def run(
+    plan: Plan,
+    operator: Operator,
+    notify: Callable[[Event], None],
+    progress: Callable[[float], None] = lambda share: None,
+) -> RunSummary:
+    """Run a plan from beginning to end; HardwareError if it could not start."""
     with Deployment(plan) as deployment:
-        summary = deployment.run(operator, notify)
+        summary = deployment.run(operator, notify, progress)
     if not summary.servo:
-        raise PronkError(f"the servo's process was killed; {_who_damped(summary)}.")
+        damped = (
+            "the standby process damped the joints"
+            if summary.standby
+            else "only the robot's own watchdog damps the joints now: secure them before anything "
+            "else"
+        )
+        raise HardwareError(f"the servo's process was killed; {damped}.")
     return summary
-
-
-def _who_damped(summary: RunSummary) -> str:
-    """What damped the joints after the servo had been killed."""
-    if summary.standby:
-        return "the standby process damped the joints"
-    return "only the robot's own watchdog damps the joints now: secure them before anything else"
 
 
 def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
@@ -404,50 +398,3 @@ def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
         "timing": vars(plan.timing),
         "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
     }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """The result of a sweep in real time."""
-
-    logs: list[Path]
-    virtual: bool
-    servo: dict[str, float | int]
-    """Lateness of the servo's ticks, and how many were `missed`."""
-
-
-def run_sweep(
-    plan: Plan,
-    *,
-    clamp_operator: ClampOperator,
-    notify: Callable[[Event], None] = lambda event: None,
-    progress: Callable[[float], None] = lambda share: None,
-) -> Recorded:
-    """Carry out a sweep on a machine in real time.
-
-    `clamp_operator` runs in a thread of its own; `progress` gets the share done, 0 to 1.
-
-    Raises:
-        PronkError: The robot may not be moved, the filter stopped the sweep, or a process was
-            killed. What was recorded until then stays readable, with the reason.
-        KeyboardInterrupt: The run was interrupted; the joints were damped.
-    """
-    assert plan.sweep is not None
-    operator = BenchOperator(clamp_operator)
-    with Deployment(plan) as deployment:
-        summary = deployment.run(operator, notify, progress)
-    servo = summary.servo
-    if not servo:
-        raise HardwareError(f"the servo's process was killed; {_who_damped(summary)}.")
-    if summary.interrupted:
-        raise KeyboardInterrupt
-    if operator.error is not None:
-        raise operator.error
-    if summary.log_error:
-        raise HardwareError(f"{summary.log_error}; the joints were damped.")
-    if reasons := summary.refusals or servo["faults"]:
-        raise HardwareError(" ".join(reasons))
-    if not servo["finished"]:
-        raise HardwareError("the sweep was ended (SIGTERM); the joints were damped.")
-    figures = {**servo["lateness"], "missed": servo["missed_ticks"]}
-    return Recorded(logs=plan.sweep.paths, virtual=bool(servo["virtual"]), servo=figures)
