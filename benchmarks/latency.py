@@ -32,9 +32,8 @@ from pronk.evaluation.criteria import Check
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.runtime import load_policy
-from pronk.robots import load_robot
 from pronk.runtime.policy_process import WARM_UP, standing, warm_up_until
-from pronk.runtime.rollout import PolicyRunner
+from pronk.runtime.rollout import measurement
 from pronk.runtime.script import STILL
 
 RATE_HZ = 50.0
@@ -116,19 +115,18 @@ def _hog() -> None:
 
 def _loop(case: Case, path: Path, seconds: float) -> Row:
     policy = load_policy(path)
-    robot = load_robot(policy.contract.robot)
-    runner, stand_in = PolicyRunner(policy, robot), PolicyRunner(policy.sibling(), robot)
+    stand_in = policy.sibling()
     states = _states(standing(policy.contract))
     counts = {way: {name: Histogram() for name in QUANTILES} for way in WAYS}
 
     def warm_up() -> None:
         stand_in.reset()
-        stand_in.decide(states[0], (STILL, False), 0.0)
+        stand_in.step(measurement(states[0]), STILL)
 
     def decide(number: int, way: str) -> None:
         state = states[number % len(states)]
         begun = time.monotonic()
-        runner.decide(state, (STILL, False), begun)
+        policy.step(measurement(state), STILL)
         counts[way]["decision"].add(time.monotonic() - begun)
         counts[way]["network"].add(policy.network_s)
 

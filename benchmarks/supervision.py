@@ -32,7 +32,7 @@ from pronk.links.machine import State
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
-from pronk.runtime.rollout import PolicyRunner
+from pronk.runtime.rollout import measurement
 from pronk.runtime.safety import Decision, Limits, Reason, SafetyFilter
 from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import StateMachine, Timing
@@ -184,7 +184,6 @@ class Flight:
         )
         machine.connect()
         safety, modes = SafetyFilter(limits=Limits.of(robot)), StateMachine(robot, Timing())
-        runner = PolicyRunner(policy, robot)
         modes.enter(Mode.DAMP, 0.0)
         modes.request(OperatorRequest.STAND)
         command, jump, change = STILL, False, math.inf
@@ -240,13 +239,14 @@ class Flight:
             jump = jump_at <= t < jump_at + 0.5
             if tick % STEP_TICKS == 0:
                 if entry != modes.entry:
-                    runner.reset()
+                    policy.reset()
                     entry = modes.entry
                 live = modes.mode is Mode.POLICY
-                made = runner.decide(newest, (command, jump) if live else (STILL, False), t)
+                given = (command, jump) if live else (STILL, False)
+                target = policy.step(measurement(newest), *given)
                 record = np.zeros((), ACTIONS)
                 fill(record, sequence=tick, state_sequence=newest.sequence, entry=entry)
-                fill(record, made=t, valid_for=0.05, position=made.position)
+                fill(record, made=t, valid_for=0.05, position=target)
                 under_way.append((tick + LATE_TICKS, record))
 
 

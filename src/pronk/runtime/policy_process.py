@@ -22,13 +22,13 @@ import numpy as np
 from pronk.errors import PronkError
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
-from pronk.policy.contract import Contract
+from pronk.policy.contract import Contract, check
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
 from pronk.processes import die_with_parent
 from pronk.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, fill, get_state, serve
 from pronk.runtime.plan import POLICY_PRIORITY, Plan
-from pronk.runtime.rollout import PolicyRunner, measurement
+from pronk.runtime.rollout import measurement
 from pronk.runtime.script import STILL, Commanded
 
 WARM_UP = 20
@@ -104,15 +104,16 @@ class PolicyProcess:
         """
         self.plan = plan
         self.shared = shared
-        self.runner = PolicyRunner(policy, plan.robot)
+        check(policy.contract, plan.robot)
+        self.policy = policy
         self.rate_hz = policy.contract.policy_rate_hz
         self.lateness = Histogram()
         self.decision = Histogram()
         """Observation built and network run."""
         self.network = Histogram()
         """The network alone."""
-        self._stand_in = PolicyRunner(policy.sibling(), plan.robot)
-        self._standing = standing(policy.contract)
+        self._stand_in = policy.sibling()
+        self._standing = measurement(standing(policy.contract))
         self._history = History(policy.contract.default_position)
         self._jumps = policy.contract.jump
         self._least, self._most = zip(*policy.contract.command_ranges.values(), strict=True)
@@ -152,7 +153,7 @@ class PolicyProcess:
     def warm_up(self) -> None:
         """Run the first step of a robot that stands, with the second instance of the policy."""
         self._stand_in.reset()
-        self._stand_in.decide(self._standing, (STILL, False), 0.0)
+        self._stand_in.step(self._standing, STILL)
 
     def figures(self) -> dict[str, Any]:
         """Of the run so far."""
@@ -173,7 +174,7 @@ class PolicyProcess:
         if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
             mode, entry = Mode(int(record["mode"])), int(record["entry"])
             if entry != self._entry and not (mode is Mode.HALT and self._mode is Mode.POLICY):
-                self.runner.reset()
+                self.policy.reset()
                 self._history.reset()
                 self._entry = entry
             self._mode = mode
@@ -191,14 +192,14 @@ class PolicyProcess:
         state = get_state(record)
         velocity, jump = self._commanded()
         now = time.monotonic()
-        command = self.runner.decide(state, (velocity, jump), now)
+        target = self.policy.step(measurement(state), velocity, jump)
         inferred = time.monotonic()
         self.decision.add(inferred - now)
-        self.network.add(self.runner.policy.network_s)
-        outputs = self.runner.policy.inference
+        self.network.add(self.policy.network_s)
+        outputs = self.policy.inference
         assert outputs is not None
         action, of = self._action, {"state_sequence": state.sequence, "state_time": state.time}
-        fill(action, **of, sequence=self._count, entry=self._entry, position=command.position)
+        fill(action, **of, sequence=self._count, entry=self._entry, position=target)
         fill(action, made=begun, valid_for=self.plan.action_valid_s)
         self.shared.actions.write(action)
         done = time.monotonic()
@@ -209,7 +210,7 @@ class PolicyProcess:
         step = self._step
         fill(step, **of, sequence=action["sequence"], observation=observation)
         fill(step, deadline=deadline, begun=begun, observed=now, inferred=inferred, done=done)
-        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, target=command.position)
+        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, target=target)
         for name in ("action", "contact", "linear_velocity"):
             step[name] = getattr(outputs, name)[0]
         self.shared.steps.put(step)

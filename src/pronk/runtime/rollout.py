@@ -70,46 +70,6 @@ def check_standing(robot: RobotSpec, state: State) -> None:
         )
 
 
-class PolicyRunner:
-    """A policy on one robot: a state in, a command out."""
-
-    def __init__(self, policy: Policy, robot: RobotSpec) -> None:
-        """Check that the policy is for this robot, and reset it.
-
-        Raises:
-            ArtefactError: Its contract does not fit.
-        """
-        check(policy.contract, robot)
-        self.policy = policy
-        self._stiffness = np.array([joint.stiffness for joint in robot.joints])
-        self._damping = np.array([joint.damping for joint in robot.joints])
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the history: the next state fills it."""
-        self.policy.reset()
-        self._sequence = 0
-
-    def decide(self, state: State, commanded: Commanded, now: float) -> Command:
-        """Run one policy step; call it at `policy.contract.policy_rate_hz`.
-
-        `now` is the machine's clock [s]; `policy.inference` has the outputs of the network.
-
-        Raises:
-            ArtefactError: Something is not finite, or a policy without jump is commanded to jump.
-        """
-        command = Command(
-            position=self.policy.step(measurement(state), *commanded),
-            stiffness=self._stiffness,
-            damping=self._damping,
-            sequence=self._sequence,
-            state_sequence=state.sequence,
-            made=now,
-        )
-        self._sequence += 1
-        return command
-
-
 def ticks(
     machine: Machine, policy: Policy, robot: RobotSpec, source: Source, *, seconds: float = math.inf
 ) -> Iterator[float]:
@@ -125,13 +85,25 @@ def ticks(
             finite.
         HardwareError: The robot does not stand.
     """
-    runner = PolicyRunner(policy, robot)
+    check(policy.contract, robot)
+    policy.reset()
+    stiffness = np.array([joint.stiffness for joint in robot.joints])
+    damping = np.array([joint.damping for joint in robot.joints])
     rate = policy.contract.policy_rate_hz
     check_standing(robot, machine.latest())
-    began, count = machine.now(), 0
+    began, count, sent = machine.now(), 0, 0
     while count < seconds * rate - 1e-9:
-        now = machine.now()
-        machine.send(runner.decide(machine.latest(), source(count / rate), now))
+        now, state = machine.now(), machine.latest()
+        command = Command(
+            position=policy.step(measurement(state), *source(count / rate)),
+            stiffness=stiffness,
+            damping=damping,
+            sequence=sent,
+            state_sequence=state.sequence,
+            made=now,
+        )
+        machine.send(command)
+        sent += 1
         yield now - began
         count = max(count + 1, math.ceil((machine.now() - began) * rate - 1e-6))
         machine.wait(began + count / rate)
