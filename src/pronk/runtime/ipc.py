@@ -299,7 +299,7 @@ def put_state(record: NDArray[Any], state: State) -> None:
 
 
 def get_state(record: np.void) -> State:
-    """Read the state in a record, on CLOCK_MONOTONIC."""
+    """Read the state in a record."""
     values: dict[str, Any] = {name: record[name] for name in _STATE}
     values |= {name: record[name].item() for name in ("time", "sequence", "robot_time")}
     for name in ("robot_time", "temperature"):
@@ -392,15 +392,13 @@ class Shared:
 
         HardwareError if there is too little memory to make it.
         """
-        mailboxes = {"state": state_dtype(joints), "actions": ACTIONS, "operator": OPERATOR}
-        mailboxes |= {"standby": STANDBY}
-        rings = {"ticks": (TICK, 2048), "samples": (sample_dtype(joints), 2048)}
-        rings |= {"steps": (STEP, 256)}
+        state, sample = state_dtype(joints), sample_dtype(joints)
+        mailboxes = {"state": state, "actions": ACTIONS, "operator": OPERATOR, "standby": STANDBY}
+        rings = {"ticks": (TICK, 2048), "samples": (sample, 2048), "steps": (STEP, 256)}
         rings |= dict.fromkeys(("events", "policy_events", "events_seen"), (EVENT, 256))
         # The writer of a mailbox is always two slots or more from the one that is read.
-        blocks = [(each, block(record, 4)) for each, record in mailboxes.items()]
-        blocks += [(each, block(*record_slots)) for each, record_slots in rings.items()]
-        layout = np.dtype(blocks, align=True)
+        slots = {each: (record, 4) for each, record in mailboxes.items()} | rings
+        layout = np.dtype([(each, block(*given)) for each, given in slots.items()], align=True)
         # A child shares its parent's resource tracker, so nothing is removed when it ends.
         self._memory = (
             _allocated(layout.itemsize) if name is None else shared_memory.SharedMemory(name=name)
@@ -411,10 +409,8 @@ class Shared:
         self.name = self._memory.name
         """Other processes attach by it."""
         memory: NDArray[Any] = np.ndarray((), dtype=layout, buffer=self._memory.buf)
-        for each in mailboxes:
-            setattr(self, each, Mailbox(memory[each]))
-        for each in rings:
-            setattr(self, each, Ring(memory[each]))
+        for each in slots:
+            setattr(self, each, (Mailbox if each in mailboxes else Ring)(memory[each]))
 
     @property
     def mode(self) -> Mode | None:

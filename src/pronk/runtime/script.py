@@ -27,14 +27,6 @@ _SLACK = 1e-9
 """Tolerance for rounding in sums of times [s]."""
 
 
-def check_velocity(command: Velocity, of: str) -> None:
-    """Raise PronkError for a command that is not three finite numbers."""
-    if len(command) != 3 or not all(map(math.isfinite, command)):
-        raise PronkError(
-            f"command {command} of {of}; expected three finite numbers: {', '.join(COMMANDS)}."
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Script:
     """The commands of one run."""
@@ -50,7 +42,11 @@ class Script:
     """Long enough to see whether the robot stays upright."""
 
     def __post_init__(self) -> None:
-        check_velocity(self.command, "the script")
+        if len(self.command) != 3 or not all(map(math.isfinite, self.command)):
+            raise PronkError(
+                f"command {self.command} of the script; expected three finite numbers: "
+                f"{', '.join(COMMANDS)}."
+            )
         for name in ("stand_s", "run_s", "jump_s", "keep_s", "stop_s"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:

@@ -25,7 +25,6 @@ from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
 from pronk.names import file_name
-from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dtype
 from pronk.runtime.safety import Limits, SafetyFilter
 from pronk.runtime.state_machine import VALID_S
@@ -114,13 +113,6 @@ class SweepTask:
         return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
 
 
-def logged_joints(robot: RobotSpec, excited: str) -> tuple[str, ...]:
-    """Joints that can move with the excited one or are clamped: their leg, file order."""
-    joint = robot.joint(excited)
-    chosen = {excited, *joint.chain, *joint.clamped}
-    return tuple(name for name in robot.joint_names if name in chosen)
-
-
 class SweepLogs:
     """Writes the logs of a task from its records (`sample_dtype`)."""
 
@@ -134,10 +126,10 @@ class SweepLogs:
     def drain(self, shared: Shared) -> None:
         """Write everything that waits; events are not logged."""
         for record in shared.samples.take():
-            self.replay(record)
+            self.write(record)
         shared.events.take()
 
-    def replay(self, record: Record) -> None:
+    def write(self, record: Record) -> None:
         """Write one record."""
         kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
         writer, columns = self._writer, self._columns
@@ -160,7 +152,10 @@ class SweepLogs:
     def _open(self, index: int, virtual: bool, torque_kind: str) -> None:
         plan, self._joint = self.task.plan, self.task.excited[index]
         self._torque = torque_kind != "absent"
-        names = logged_joints(plan.robot, self._joint)
+        # Joints that can move with the excited one or are clamped: its leg.
+        joint = plan.robot.joint(self._joint)
+        logged = {joint.name, *joint.chain, *joint.clamped}
+        names = tuple(name for name in plan.robot.joint_names if name in logged)
         self._columns = columns = [plan.robot.joint_names.index(name) for name in names]
         rate = f"{plan.rate_hz:g}"
         header = LogHeader(
@@ -464,7 +459,7 @@ def record(
             task,
             machine,
             safety,
-            SweepLogs(task).replay,
+            SweepLogs(task).write,
             state=states[0],
             start=states[0].time,
             real_time=False,
