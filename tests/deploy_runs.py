@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from pronk.links.link import Freshness
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.run import Deployment
 from pronk.runtime.state_machine import Timing
@@ -21,6 +22,8 @@ QUICK = Timing(
 )
 PATIENT = {"held_s": 100.0, "damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
 """A busy computer must not look like a fault."""
+FRESH = Freshness(share=0.02, longest_gap_s=10.0)
+"""Nor like a link that is slow to open."""
 DAMPED_S = 0.060
 """Longest time from a fault to damping on the wire."""
 

@@ -26,6 +26,8 @@ pytestmark = pytest.mark.train
 DT = 0.02
 LIMITS = np.array([3.0, 1.0, 2.0])  # C1 to C3
 ALL = torch.arange(N)
+Vector = tuple[float, ...]
+Patch = pytest.MonkeyPatch
 
 
 @pytest.fixture
@@ -177,11 +179,7 @@ def test_scripted_commands_are_set_by_the_caller_alone() -> None:
     ],
 )
 def test_target_velocity_in_jump_mode(
-    command: MotionCommand,
-    monkeypatch: pytest.MonkeyPatch,
-    velocity: tuple[float, ...],
-    overspeed: float,
-    target: tuple[float, float],
+    command: MotionCommand, monkeypatch: Patch, velocity: Vector, overspeed: float, target: Vector
 ) -> None:
     monkeypatch.setattr(command.cfg, "jump_speed_added", 0.35)
     command.velocity[:] = torch.tensor(velocity)
@@ -195,7 +193,7 @@ def test_target_velocity_in_jump_mode(
 
 
 def received(
-    env: Any, monkeypatch: pytest.MonkeyPatch, yaw: float, pitch: float, velocity: tuple[float, ...]
+    env: Any, monkeypatch: Patch, yaw: float, pitch: float, velocity: Vector
 ) -> dict[str, Tensor]:
     """What the jump state receives of robots with that attitude [deg] and velocity [m/s]."""
     command, given = motion_command(env), {}
@@ -220,12 +218,7 @@ def received(
     ],
 )
 def test_direction_of_a_jump_in_the_world(
-    env: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    yaw: float,
-    pitch: float,
-    velocity: tuple[float, ...],
-    direction: tuple[float, float],
+    env: Any, monkeypatch: Patch, yaw: float, pitch: float, velocity: Vector, direction: Vector
 ) -> None:
     motion_command(env).velocity[:] = torch.tensor(velocity)
     given = received(env, monkeypatch, yaw, pitch, (0.0, 0.0, 0.0))
@@ -234,34 +227,32 @@ def test_direction_of_a_jump_in_the_world(
 
 
 @pytest.mark.parametrize(
-    ("commanded", "moves", "pitch", "jumps", "along", "excess", "error"),
+    ("given", "moves", "pitch", "jumps", "expected"),
     [
         # With .25 added the target is 2.25 m/s, and `along` goes up to it.
-        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, True, 2.25, 1.0, math.hypot(0.75, 1.0)),
-        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, False, 2.0, 1.0, math.hypot(1.0, 1.0)),
-        ((0.0, -0.5), (1.0, -0.4, 0.0), 0.0, True, 0.4, -0.1, math.hypot(1.0, 0.225)),
-        ((-1.0, 0.0), (0.5, 0.0, 0.0), 0.0, True, -0.5, -1.5, 1.75),
-        ((0.0, 0.0), (1.0, 1.0, 0.0), 0.0, True, 0.0, 0.0, math.sqrt(2.0)),
+        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, True, (2.25, 1.0, math.hypot(0.75, 1.0))),
+        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, False, (2.0, 1.0, math.hypot(1.0, 1.0))),
+        ((0.0, -0.5), (1.0, -0.4, 0.0), 0.0, True, (0.4, -0.1, math.hypot(1.0, 0.225))),
+        ((-1.0, 0.0), (0.5, 0.0, 0.0), 0.0, True, (-0.5, -1.5, 1.75)),
+        ((0.0, 0.0), (1.0, 1.0, 0.0), 0.0, True, (0.0, 0.0, math.sqrt(2.0))),
         # Upward motion of a pitched trunk is no forward motion.
-        ((1.0, 0.0), (1.0, 0.0, 2.5), 17.0, False, 1.0, 0.0, 0.0),
-        ((-2.0, 0.0), (1.0, 0.0, 2.5), -17.0, False, -1.0, -3.0, 3.0),
+        ((1.0, 0.0), (1.0, 0.0, 2.5), 17.0, False, (1.0, 0.0, 0.0)),
+        ((-2.0, 0.0), (1.0, 0.0, 2.5), -17.0, False, (-1.0, -3.0, 3.0)),
     ],
 )
 def test_speed_along_the_command(
     env: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    commanded: tuple[float, float],
-    moves: tuple[float, ...],
+    monkeypatch: Patch,
+    given: Vector,
+    moves: Vector,
     pitch: float,
     jumps: bool,
-    along: float,
-    excess: float,
-    error: float,
+    expected: Vector,
 ) -> None:
     command = motion_command(env)
     monkeypatch.setattr(command.cfg, "jump_speed_added", 0.25)
     command.state.mode[:] = jumps
-    command.velocity[:] = torch.tensor((*commanded, 1.5))
-    given = received(env, monkeypatch, 0.0, pitch, moves)
-    found = [given[name].tolist() for name in ("along", "excess", "velocity_error")]
-    np.testing.assert_allclose(found, [[along] * N, [excess] * N, [error] * N], atol=1e-5)
+    command.velocity[:] = torch.tensor((*given, 1.5))
+    motion = received(env, monkeypatch, 0.0, pitch, moves)
+    found = [motion[name].tolist() for name in ("along", "excess", "velocity_error")]
+    np.testing.assert_allclose(np.transpose(found), [expected] * N, atol=1e-5)

@@ -45,7 +45,7 @@ def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
 
 
 def say(writer: DeployLogWriter, at: float, kind: str, text: str, **more: int) -> None:
-    writer.event(np.frombuffer(event(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
+    writer.write(np.frombuffer(event(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
 
 
 def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
@@ -57,13 +57,13 @@ def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
     for k in range(count):
         known = {"torque": KP * (desired[max(k - lag, 0)] - POSE)}
         known |= {"latency": 0.003} if k % 10 == 0 else {}
-        writer.tick(record(k, desired[k], **(known | changes)))
+        writer.write(record(k, desired[k], **(known | changes)))
         if k % 10 == 0:
             step = np.zeros((), dtype=STEP)
             step["sequence"], step["begun"], step["live"] = k // 10, k * TICK_S, 1
             step["deadline"], step["inferred"] = k * TICK_S, 1e-4
             step["jump"] = 100 <= k < 200
-            writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
+            writer.write(np.frombuffer(step.tobytes(), dtype=STEP)[0])
     writer.end(complete=True, figures={})
     return path
 
@@ -84,12 +84,12 @@ def faulted(path: Path, *, end: bool = True) -> Path:
         "orientation": rolled(1.0),
     }
     for k in range(100):
-        writer.tick(record(k, POSE + 0.01, mode=Mode.STAND))
+        writer.write(record(k, POSE + 0.01, mode=Mode.STAND))
     for k in range(100, 200):
-        writer.tick(record(k, moved, **limited))
+        writer.write(record(k, moved, **limited))
     say(writer, 0.4, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)
     for k in range(200, 300):
-        writer.tick(record(k, POSE, **damped))
+        writer.write(record(k, POSE, **damped))
     if end:
         writer.end(complete=True, figures={})
     else:
@@ -151,7 +151,7 @@ def test_measures_of_a_fault(tmp_path: Path) -> None:
 def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
     writer = DeployLogWriter(tmp_path / "run.mcap", HEADER)
     for k in (0, 1, 2, 5, 6, 10):
-        writer.tick(record(k, POSE))
+        writer.write(record(k, POSE))
     writer.end(complete=True, figures={})
     assert deploy_run.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
 
@@ -178,7 +178,7 @@ def test_the_page_of_a_refusal(tmp_path: Path) -> None:
     writer = DeployLogWriter(path, HEADER | {"robot": "unheard_of"})
     nothing = {"desired": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
     for k in range(3):
-        writer.tick(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
+        writer.write(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
     made = part(path)

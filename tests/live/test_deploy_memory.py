@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import subprocess
@@ -14,11 +13,6 @@ from typing import Any
 import pytest
 
 from hopper import write_hopper
-from pronk.errors import HardwareError
-from pronk.links.address import Address
-from pronk.runtime.ipc import Shared
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.servo import Servo
 
 pytestmark = pytest.mark.live
 
@@ -53,25 +47,6 @@ def test_a_log_that_ends_on_a_full_disk_is_a_failure(tmp_path: Path) -> None:
     assert f"{log} ends" in " ".join(done.stderr.split())
     assert "No space left" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_nothing_is_kept_of_a_virtual_robot_that_is_not_captured(tmp_path: Path) -> None:
-    link = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
-    for capture in (None, tmp_path / "seen.npz"):
-        shared = Shared()
-        plan = Plan(link=link, policy=Path("none"), capture=capture, real_time=False)
-        servo = Servo(plan, shared, (0.0, 1.0))
-        servo.stop()
-        servo.run()
-        shared.close()
-        gc.unfreeze()
-        gc.enable()
-        machine: Any = servo.machine
-        if capture is None:
-            with pytest.raises(HardwareError, match="nothing was captured"):
-                machine.inner.capture()
-        else:
-            assert capture.exists()
 
 
 def _alive(pid: int) -> bool:

@@ -38,21 +38,25 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def events() -> dict[str, Any]:
+def faults() -> dict[str, Any]:
     context = get_context("spawn")
     return {name: context.Event() for name in ("nan", "freeze", "stuck")}
 
 
-def walk(deployment: Deployment, seconds: float = 0.3, **more: Any) -> None:
-    """To where the policy decides, and on for a time.
+def recover(deployment: Deployment) -> None:
+    """Reset a fault: a computer that is busy for a moment looks like one."""
+    if deployment.mode is Mode.FAULT:
+        hold(deployment, 1.1)
+        hold(deployment, 5.0, Mode.DAMP, OperatorRequest.RESET)
 
-    A computer that is busy for a moment looks like a fault; then it begins again, as a person would
-    have to. What is tested comes afterwards.
+
+def walk(deployment: Deployment, seconds: float = 0.3, **more: Any) -> None:
+    """To where the policy decides, and on for a time; after a fault once more, as a person would.
+
+    What is tested comes afterwards.
     """
     for _ in range(5):
-        if deployment.mode is Mode.FAULT:
-            hold(deployment, 1.1)
-            hold(deployment, 5.0, Mode.DAMP, OperatorRequest.RESET)
+        recover(deployment)
         for mode, request in (
             (Mode.STAND, OperatorRequest.STAND),
             (Mode.POLICY, OperatorRequest.WALK),
@@ -74,13 +78,17 @@ def first_damping(wire: Path, after: float) -> float:
     return float(start - after)
 
 
+Running = tuple[Deployment, Path, Path]
+"""A deployment that runs, its wire and its log."""
+
+
 @pytest.fixture
 def running(
-    policy: Path, events: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
-) -> Iterator[tuple[Deployment, Path, Path]]:
+    policy: Path, faults: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[Running]:
     wire, log = tmp_path / "wire.txt", tmp_path / "run.mcap"
     plan = Plan(
-        link=FaultyLink(wire=wire, loss=request.param, **events),
+        link=FaultyLink(wire=wire, loss=request.param, faults=faults),
         policy=policy,
         log=log,
         timing=QUICK,
@@ -92,7 +100,7 @@ def running(
 
 
 @pytest.mark.parametrize("running", [0.3], indirect=True)
-def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> None:
+def test_loss_and_killed_processes(running: Running) -> None:
     deployment, wire, log = running
     # A third of the states lost: it walks.
     walk(deployment, 0.8, jump=True)
@@ -131,19 +139,17 @@ def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> No
 
 
 @pytest.mark.parametrize("running", [0.0], indirect=True)
-def test_states_that_cannot_be_believed(
-    running: tuple[Deployment, Path, Path], events: dict[str, Any]
-) -> None:
+def test_states_that_cannot_be_believed(running: Running, faults: dict[str, Any]) -> None:
     deployment, wire, log = running
     strikes: dict[str, float] = {}
     for name in ("nan", "stuck", "freeze"):
         walk(deployment)
         strikes[name] = struck = time.monotonic()
-        events[name].set()
+        faults[name].set()
         hold(deployment, 2.0, Mode.FAULT)
         hold(deployment, 0.2)
         assert first_damping(wire, struck) <= DAMPED_S, name
-        events[name].clear()
+        faults[name].clear()
         hold(deployment, 1.1)
         assert deployment.mode is Mode.FAULT, "a fault damps for a second at least"
         if name != "freeze":
@@ -152,10 +158,10 @@ def test_states_that_cannot_be_believed(
     # The log of a run that ended badly is whole.
     found = read_deploy_log(log)
     assert found.complete, (found.damage, found.figures["servo"]["dropped"], len(found.time))
-    faults = [event for event in found.events if event.kind == "fault"]
-    assert [event.text for event in faults] == deployment.summary.faults
+    events = [event for event in found.events if event.kind == "fault"]
+    assert [event.text for event in events] == deployment.summary.faults
     for name, struck in strikes.items():
-        first = next(event for event in faults if event.time > struck)
+        first = next(event for event in events if event.time > struck)
         old = {"NO_STATE", "STATE_LOST"}
         assert first.reason in ({"STATE_NOT_FINITE"} if name == "nan" else old), name
     # What the log says was sent is what was written: damping wherever no target was.
@@ -169,8 +175,6 @@ def test_states_that_cannot_be_believed(
     assert followed.any()
     k = int(np.flatnonzero(followed)[0])
     np.testing.assert_allclose(found.sent[k], found.target[int(found.action_number[k])])
-    # What the network read is what pronk's observation of the logged state is.
-    assert found.observation.shape[1] == 105
     assert np.isfinite(found.latency[found.mode == Mode.POLICY]).sum() > 10
     assert found.figures["servo"]["ticks"] >= len(found.tick)
 
@@ -178,7 +182,7 @@ def test_states_that_cannot_be_believed(
 def test_a_plan_that_cannot_run_is_refused_before_anything_starts(
     policy: Path, tmp_path: Path
 ) -> None:
-    link = FaultyLink(wire=tmp_path / "w", nan=None, freeze=None, stuck=None)
+    link = FaultyLink(wire=tmp_path / "w")
     names = tuple(f"joint_{i}" for i in range(12))
     other = write_hopper(tmp_path / "other.onnx", joint_names=names)
     with pytest.raises(ArtefactError, match="joint_names"):
@@ -188,31 +192,22 @@ def test_a_plan_that_cannot_run_is_refused_before_anything_starts(
 
 
 def test_an_operator_that_is_late_is_not_gone_and_one_that_is_stuck_is(
-    policy: Path, events: dict[str, Any], tmp_path: Path
+    policy: Path, tmp_path: Path
 ) -> None:
     plan = Plan(
-        link=FaultyLink(wire=tmp_path / "wire.txt", **events),
-        policy=policy,
-        timing=QUICK,
-        limits=PATIENT,
-        operator_timeout_s=0.3,
-        ignore_latency=True,
+        link=FaultyLink(wire=tmp_path / "wire.txt"), policy=policy, timing=QUICK, limits=PATIENT
     )
     with Deployment(plan) as deployment:
-        slept = 1.0
         # On a busy computer a sleep may last too long itself.
         for _ in range(5):
-            if deployment.mode is Mode.FAULT:
-                hold(deployment, 1.1)
-                hold(deployment, 5.0, Mode.DAMP, OperatorRequest.RESET)
+            recover(deployment)
             hold(deployment, 10.0, Mode.STAND, OperatorRequest.STAND)
             begun = time.monotonic()
             time.sleep(0.5)
             mode, slept = deployment.mode, time.monotonic() - begun
             if slept < 0.6:
                 break
-        assert slept < 0.6
-        assert mode is Mode.STAND
+        assert (slept < 0.6, mode) == (True, Mode.STAND)
         time.sleep(1.5)
         assert deployment.mode is Mode.FAULT
         found = [event for event in deployment.events_seen() if event.kind == "fault"]

@@ -6,158 +6,29 @@ the robot but the other writer is given time, so that a slow computer cannot pas
 
 from __future__ import annotations
 
-import math
 import os
 import signal
-import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deploy_runs import DAMPED_S, PATIENT, QUICK, free_port, hold, met, simulated
+from deploy_runs import DAMPED_S, FRESH, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
 from pronk.errors import HardwareError
 from pronk.links.address import Address
-from pronk.links.link import Freshness
-from pronk.links.machine import Command, Machine
-from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
-from pronk.virtual.robot import hold_of
+from wire import ROBOT, Wire, over_dds, over_lcm
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lcm")
 pytest.importorskip("cyclonedds")
-
-ROBOT = load_robot("mini_cheetah")
-OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
-"""What the other program commands; like the virtual robot's own rival, every 10 ms."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PatientLink(Link):
-    """Opens a link that a busy computer may be slow on."""
-
-    robot: str = ROBOT.name
-
-    def __call__(self, clamp_operator: object = None) -> Machine:
-        fresh = Freshness(share=0.02, longest_gap_s=10.0)
-        return self.address.machine(ROBOT, exclusive_s=0.5, fresh=fresh)
-
-
-class Wire:
-    """Records every command on a wire, and sends on it as another program would."""
-
-    def __init__(
-        self,
-        publish: Callable[[], None],
-        listen: Callable[[], list[tuple[float, bytes]]],
-        decode: Callable[[bytes], Command],
-    ) -> None:
-        self.began = math.nan
-        """When it spoke first [s]."""
-        self._publish, self._listen, self._decode = publish, listen, decode
-        self._met: list[tuple[float, bytes]] = []
-        self._over, self._speaking = threading.Event(), threading.Event()
-        self._threads = [threading.Thread(target=each) for each in (self._hear, self._speak)]
-
-    def __enter__(self) -> Wire:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._speaking.set()
-        for thread in self._threads:
-            thread.join()
-
-    def speak(self) -> None:
-        self.began = math.nan
-        self._speaking.set()
-
-    def hush(self) -> None:
-        self._speaking.clear()
-
-    def received(self) -> tuple[np.ndarray, np.ndarray]:
-        """When each command that is not its own came [s], and whether it damps."""
-        met = [(when, self._decode(data)) for when, data in self._met]
-        others = [
-            (when, not command.stiffness.any())
-            for when, command in met
-            if not np.allclose(command.position, OTHER.position, atol=1e-5)
-        ]
-        return np.array([when for when, _ in others]), np.array([damps for _, damps in others])
-
-    def _speak(self) -> None:
-        while not self._over.is_set():
-            self._speaking.wait()
-            if math.isnan(self.began):
-                self.began = time.monotonic()
-            self._publish()
-            time.sleep(0.01)
-
-    def _hear(self) -> None:
-        while not self._over.is_set():
-            self._met += self._listen()
-
-
-def over_lcm(port: int) -> Wire:
-    import lcm
-
-    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
-    from pronk.links.lcm.link import url_of
-
-    sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
-    met: list[tuple[float, bytes]] = []
-
-    def receive(_: str, data: bytes) -> None:
-        met.append((time.monotonic(), data))
-
-    def listen() -> list[tuple[float, bytes]]:
-        listener.handle_timeout(20)
-        found = met.copy()
-        met.clear()
-        return found
-
-    listener.subscribe(CHEETAH.command.channel, receive).set_queue_capacity(500)
-    data = encode_command(CHEETAH, OTHER)
-    return Wire(
-        lambda: sender.publish(CHEETAH.command.channel, data),
-        listen,
-        lambda data: decode_command(CHEETAH, data),
-    )
-
-
-def over_dds(domain: int) -> Wire:
-    from pronk.links.dds import codec as idl
-    from pronk.links.dds.codec import decode_command, encode_command, joint_map
-    from pronk.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
-
-    joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
-    sender = own.writer(COMMANDS, idl.LowCmd)
-    listener = own.reader(COMMANDS, idl.LowCmd, own=False)
-    counts: Counter[str] = Counter()
-    # Every sample says when it was written, by the wall clock.
-    wall = time.time() - time.monotonic()
-
-    def listen() -> list[tuple[float, bytes]]:
-        time.sleep(0.002)
-        return [
-            (m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(listener, counts)
-        ]
-
-    data = encode_command(joints, OTHER)
-    return Wire(
-        lambda: write(sender, data, counts), listen, lambda data: decode_command(joints, data)
-    )
 
 
 @pytest.fixture(scope="module", params=["lcm", "dds"])
@@ -175,7 +46,7 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
 def patient_plan(address: Address, folder: Path) -> Plan:
     """A plan whose filter takes nothing for a fault that a busy computer may cause."""
     return Plan(
-        link=PatientLink(address=address),
+        link=Link(robot=ROBOT.name, address=address, fresh=FRESH),
         policy=write_hopper(folder / "policy.onnx", strength=0.2),
         timing=QUICK,
         limits=PATIENT | {"hold_s": 1.0},

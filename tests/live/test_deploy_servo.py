@@ -42,9 +42,9 @@ class Unopened(Link):
 
 
 @pytest.fixture
-def faults(tmp_path: Path) -> FaultyLink:
-    names = ("nan", "freeze", "stuck", "broken")
-    return FaultyLink(wire=tmp_path / "wire.txt", **{name: threading.Event() for name in names})
+def link(tmp_path: Path) -> FaultyLink:
+    events = {name: threading.Event() for name in ("freeze", "broken")}
+    return FaultyLink(wire=tmp_path / "wire.txt", faults=events)
 
 
 class Run:
@@ -56,7 +56,6 @@ class Run:
         self.said: list[tuple[str, str]] = []
         self._record = np.zeros((), dtype=OPERATOR)
         self._thread = threading.Thread(target=self.servo.run)
-        self.begun = time.monotonic()
         self._thread.start()
 
     @property
@@ -64,31 +63,26 @@ class Run:
         return not self._thread.is_alive()
 
     def until(
-        self,
-        there: Callable[[], bool],
-        request: OperatorRequest = OperatorRequest.NONE,
-        seconds: float = 20.0,
+        self, there: Callable[[], bool], request: OperatorRequest = OperatorRequest.NONE
     ) -> None:
         """Hold the dead-man button until something is so."""
-        record, end = self._record, time.monotonic() + seconds
+        record, end = self._record, time.monotonic() + 20.0
         record["request"] = request
         record["requests"] += request is not OperatorRequest.NONE
         while not there():
             assert time.monotonic() < end, (self.servo.modes.mode, self.said)
             record["time"], record["held"] = time.monotonic(), 1
             self.shared.operator.write(record)
-            self.receive()
+            self._receive()
             time.sleep(0.005)
-        self.receive()
+        self._receive()
+
+    def spend(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > end)
 
     def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
         self.until(lambda: self.servo.modes.mode is mode, request)
-
-    def receive(self) -> None:
-        self.said += [
-            (each["kind"].decode(), each["text"].decode())
-            for each in self.shared.events_seen.take()
-        ]
 
     def texts(self, kind: str) -> list[str]:
         return [text for which, text in self.said if which == kind]
@@ -96,6 +90,12 @@ class Run:
     def leave(self) -> None:
         self.until(lambda: self.over, OperatorRequest.QUIT)
         self._thread.join()
+
+    def _receive(self) -> None:
+        self.said += [
+            (each["kind"].decode(), each["text"].decode())
+            for each in self.shared.events_seen.take()
+        ]
 
 
 @contextmanager
@@ -124,9 +124,9 @@ def test_a_link_that_cannot_be_opened_says_why() -> None:
         assert run.servo.figures()["virtual"] is None
 
 
-def test_without_any_state_requests_are_read(faults: FaultyLink) -> None:
-    faults.freeze.set()
-    with flown(faults) as run:
+def test_without_any_state_requests_are_read(link: FaultyLink) -> None:
+    link.faults["freeze"].set()
+    with flown(link) as run:
         # A process that waits for the servo's start gets the error.
         run.until(lambda: run.shared.state.written > 0)
         run.until(lambda: bool(run.texts("refused")))
@@ -140,33 +140,31 @@ def test_without_any_state_requests_are_read(faults: FaultyLink) -> None:
         run.leave()
         assert time.monotonic() - since < 5.0
     assert run.texts("mode") == ["IDLE", "ENDED"]
-    assert not faults.wire.read_text()
+    assert not link.wire.read_text()
 
 
-def test_a_link_that_breaks_does_not_make_time_run_ahead(faults: FaultyLink) -> None:
-    with flown(faults) as run:
+def test_a_link_that_breaks_does_not_make_time_run_ahead(link: FaultyLink) -> None:
+    with flown(link) as run:
         run.mode(Mode.DAMP)
         run.mode(Mode.STAND, OperatorRequest.STAND)
-        faults.broken.set()
+        link.faults["broken"].set()
         run.mode(Mode.FAULT)
-        end = time.monotonic() + 0.5
-        run.until(lambda: time.monotonic() > end)
+        run.spend(0.5)
         pace = run.servo.pace
         # Damped tick by tick, not thousands of times in between.
         ahead = pace.deadline - time.monotonic()
         assert ahead <= 1.1 / 500.0
-        faults.broken.clear()
+        link.faults["broken"].clear()
         ticks = run.servo.lateness.count
-        end = time.monotonic() + 0.2
-        run.until(lambda: time.monotonic() > end)
+        run.spend(0.2)
         assert run.servo.lateness.count > ticks
         assert run.texts("fault") == ["the cable was pulled out."]
     assert pace.tick <= 500.0 * (time.monotonic() - pace.start) + 1
 
 
 @pytest.mark.parametrize("log", [None, Path("run.mcap")])
-def test_nothing_is_lost_where_nothing_is_kept(faults: FaultyLink, log: Path | None) -> None:
-    with flown(faults, log=log) as run:
+def test_nothing_is_lost_where_nothing_is_kept(link: FaultyLink, log: Path | None) -> None:
+    with flown(link, log=log) as run:
         run.mode(Mode.DAMP)
         # No process empties the queue here; fill it.
         while run.shared.ticks.put(np.zeros((), TICK)):
@@ -179,20 +177,26 @@ def test_nothing_is_lost_where_nothing_is_kept(faults: FaultyLink, log: Path | N
 def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("no folder")
-    link = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
-    with flown(link, capture=folder / "seen.npz") as run:
+    ground = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
+    with flown(ground, capture=folder / "seen.npz") as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")
     assert "Not a directory" in why or "exists" in why
     assert run.texts("mode")[-1] == "ENDED"
-    assert run.servo.machine is not None
+    machine: Any = run.servo.machine
     with pytest.raises(HardwareError, match="connect"):
-        run.servo.machine.latest()
+        machine.latest()
+    # Without --capture nothing is kept in memory.
+    with flown(ground) as run:
+        run.mode(Mode.DAMP)
+    machine = run.servo.machine
+    with pytest.raises(HardwareError, match="nothing was captured"):
+        machine.inner.capture()
 
 
-def test_a_pause_of_the_servo_is_no_clock_that_disagrees(faults: FaultyLink) -> None:
+def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> None:
     number, paused = 0, False
-    with flown(faults, limits=PATIENT, ignore_latency=True) as run:
+    with flown(link, limits=PATIENT, ignore_latency=True) as run:
 
         def action() -> np.ndarray | None:
             """The policy acts during a pause of 15 ms, in the middle of the servo's tick."""

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,18 +35,8 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Flight:
     """A deployment by a script, leader of a terminal's processes."""
 
-    def __init__(self, policy: Path, log: Path) -> None:
-        words = [sys.executable, str(PROGRAM), str(policy), str(log)]
-        with log.with_name("said.txt").open("w") as said:
-            self.process = subprocess.Popen(
-                words,
-                stdout=subprocess.PIPE,
-                stderr=said,
-                text=True,
-                start_new_session=True,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )
-        self.log = log
+    def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
+        self.process, self.log = process, log
 
     def says(self, word: str) -> None:
         assert self.process.stdout is not None
@@ -67,17 +58,17 @@ class Flight:
 
 @contextmanager
 def flown(policy: Path, log: Path) -> Iterator[Flight]:
-    flight = Flight(policy, log)
-    try:
-        flight.says("POLICY")
-        time.sleep(0.3)
-        yield flight
-    finally:
-        if flight.process.poll() is None:
-            flight.process.kill()
-        flight.process.wait()
-        assert flight.process.stdout is not None
-        flight.process.stdout.close()
+    words = [sys.executable, str(PROGRAM), str(policy), str(log)]
+    one = {**os.environ, "OMP_NUM_THREADS": "1"}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen(words, **pipes, start_new_session=True, env=one) as process:
+        flight = Flight(process, log)
+        try:
+            flight.says("POLICY")
+            time.sleep(0.3)
+            yield flight
+        finally:
+            process.kill()
 
 
 def course(log: DeployLog) -> list[Mode]:

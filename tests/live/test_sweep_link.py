@@ -5,11 +5,9 @@ All limits on time are wide, so that a busy computer is not taken for a fault.
 
 from __future__ import annotations
 
-import io
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -21,32 +19,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy_runs import DAMPED_S, free_port, simulated
-from pronk.cli import main as cli
+from command_line import invoke
+from deploy_runs import DAMPED_S, FRESH, free_port, simulated
 from pronk.cli.console import Person
 from pronk.cli.sweep import record_wire
 from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.address import Address
-from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
-from pronk.links.lcm.link import url_of
-from pronk.links.link import Freshness
-from pronk.links.machine import Command
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.robots import load_robot
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.run import Recorded, run_sweep
-from pronk.runtime.sweep import SweepTask
-from pronk.virtual.robot import hold_of
+from pronk.runtime.plan import Link
+from wire import ROBOT, over_lcm
 
-lcm = pytest.importorskip("lcm")
+pytest.importorskip("lcm")
 
-ROBOT = load_robot("mini_cheetah")
-HOLD = hold_of(ROBOT)
 PATIENT = dict.fromkeys(("hold_s", "damp_s", "latch_s", "expiry_s"), 10.0) | {"lag": 10000.0}
-FRESH = Freshness(share=0.02, longest_gap_s=10.0)
 
 
 @cache
@@ -66,57 +55,10 @@ def port() -> Iterator[int]:
         yield number
 
 
-class Listener:
-    """Records the commands on the wire, each with the time at which it came [s]."""
-
-    def __init__(self, port: int) -> None:
-        self.received: list[tuple[float, Command]] = []
-        self._lcm = lcm.LCM(url_of(port=port))
-        self._lcm.subscribe(CHEETAH.command.channel, self._receive)
-        self._open = True
-        self._thread = threading.Thread(target=self._listen)
-
-    def __enter__(self) -> Listener:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open = False
-        self._thread.join()
-
-    @property
-    def commanded(self) -> float:
-        """When joints were last held, not damped [s]."""
-        return max(when for when, command in self.received if command.stiffness.any())
-
-    @property
-    def damped(self) -> bool:
-        """Whether the last command damps."""
-        return not self.received[-1][1].stiffness.any()
-
-    def _receive(self, _: str, data: bytes) -> None:
-        self.received.append((time.monotonic(), decode_command(CHEETAH, data)))
-
-    def _listen(self) -> None:
-        while self._open:
-            self._lcm.handle_timeout(50)
-
-
-def swept(plan: SweepPlan, out: Path, port: int, **more: Any) -> Recorded:
+def swept(plan: SweepPlan, out: Path, port: int, **more: Any) -> dict[str, Any]:
     link = Link(robot=plan.robot.name, address=Address.parse("lcm", port=port), fresh=FRESH)
     more = {"limits": PATIENT, "standby_s": 2.0, **more}
     return record_wire(plan, out, link, real_time=True, **more)
-
-
-def early(action: Callable[[], object]) -> Callable[[float], None]:
-    """A receiver of progress that does something once, while the joint is excited."""
-    left = [action]
-
-    def progress(share: float) -> None:
-        if share > 0.05 and left:
-            left.pop()()
-
-    return progress
 
 
 def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -134,32 +76,24 @@ def written(path: Path) -> JointLog | None:
         return None
 
 
-def cut(out: Path, reason: str) -> JointLog:
-    """The log of a sweep that was ended for a reason."""
-    log = read_mcap(out / "FR_hip_roll.mcap")
-    assert not log.complete
-    assert reason in log.notes[0]
-    return log
-
-
 def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
     plan = plan_of("gripper", "so101", 0.05)
     link = Link(robot="so101", address=Address.parse("sim://bench"))
     recorded = record_wire(plan, tmp_path, link, limits=PATIENT, real_time=False)
-    log = read_mcap(recorded.logs[0])
-    assert recorded.virtual
+    log = read_mcap(recorded["logs"][0])
+    assert recorded["virtual"]
     assert log.complete
     assert log.joints == plan.robot.joint_names
     assert np.ptp(log.cut(log.segments[0]).position[:, log.column("gripper")]) > 0.02
 
 
 def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
-    with Listener(port) as listener:
+    with over_lcm(port) as wire:
         recorded = swept(plan_of("FR_knee"), tmp_path, port)
-    assert recorded.virtual
-    assert recorded.servo["n"] > 100
-    assert [path.name for path in recorded.logs] == ["FR_knee.mcap"]
-    log = read_mcap(recorded.logs[0])
+    assert recorded["virtual"]
+    assert recorded["servo"]["n"] > 100
+    assert [path.name for path in recorded["logs"]] == ["FR_knee.mcap"]
+    log = read_mcap(recorded["logs"][0])
     assert log.complete
     assert log.virtual
     assert log.metadata["link"] == f"lcm://?port={port}"
@@ -174,28 +108,45 @@ def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     assert np.delete(travel, knee).max() < 0.05
     assert log.segments[0].clamped == ("FR_hip_roll", "FR_hip_pitch")
     assert np.unique(part.command[:, knee]).size > 20
-    assert listener.damped
+    assert wire.received()[1][-1], "damped at the end"
 
 
-def test_a_breach_damps_and_keeps_the_log(
-    port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("reason", ["rad/s", "was killed", "interrupted"])
+def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
+    port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], reason: str
 ) -> None:
-    slow = (replace(j, drive=replace(j.drive, no_load_speed=3.0)) for j in ROBOT.joints)
-    plan = replace(plan_of("FR_hip_roll"), robot=replace(ROBOT, joints=tuple(slow)))
-    with Listener(port) as listener, pytest.raises(HardwareError, match="rad/s"):
-        swept(plan, tmp_path, port)
-    cut(tmp_path, "rad/s")
+    plan, begun = plan_of("FR_hip_roll"), []
+    if reason == "rad/s":
+        slow = (replace(j, drive=replace(j.drive, no_load_speed=3.0)) for j in ROBOT.joints)
+        plan = replace(plan, robot=replace(ROBOT, joints=tuple(slow)))
+
+    def progress(share: float) -> None:
+        if share < 0.05 or begun:
+            return
+        # The joint is excited.
+        begun.append(time.monotonic())
+        if reason == "was killed":
+            (servo,) = (child for child in active_children() if child.name == "pronk servo")
+            servo.kill()
+        elif reason == "interrupted":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    ended = (HardwareError, KeyboardInterrupt)
+    with over_lcm(port) as wire, pytest.raises(ended) as caught:
+        swept(plan, tmp_path, port, progress=progress, operator_timeout_s=10.0)
+    assert reason in str(caught.value) or caught.type is KeyboardInterrupt
+    assert not active_children()
+    # A killed servo's joints are damped by the standby.
+    when, damps = wire.received()
+    assert damps[-1]
+    log = read_mcap(tmp_path / "FR_hip_roll.mcap")
+    assert not log.complete
+    assert reason in log.notes[0]
     assert "FR_hip_roll.mcap" in capsys.readouterr().err
-    assert listener.damped
-
-
-def test_another_program_that_commands_later_ends_the_sweep(port: int, tmp_path: Path) -> None:
-    other = lcm.LCM(url_of(port=port))
-    foreign = encode_command(CHEETAH, replace(HOLD, position=HOLD.position + 0.01))
-    progress = early(lambda: other.publish(CHEETAH.command.channel, foreign))
-    with pytest.raises(HardwareError, match="another program"):
-        swept(plan_of("FR_hip_roll"), tmp_path, port, progress=progress)
-    cut(tmp_path, "another program")
+    if reason == "was killed":  # the log holds the last of what it did
+        assert when[~damps][-1] - log.time[-1] < 0.1
+    if reason == "interrupted":  # it logs up to the tick in which it damps, by its own clock
+        assert abs(log.time[-1] - begun[0]) < DAMPED_S
 
 
 def test_without_a_robot_there_is_no_log(tmp_path: Path) -> None:
@@ -212,7 +163,7 @@ def owner(out: Path, port: int) -> None:
 def test_a_killed_program_leaves_the_joints_damped_and_a_log(port: int, tmp_path: Path) -> None:
     path = tmp_path / "FR_hip_roll.mcap"
     running = get_context("spawn").Process(target=owner, args=(tmp_path, port))
-    with Listener(port) as listener:
+    with over_lcm(port) as wire:
         running.start()
         await_(lambda: bool((log := written(path)) and log.segments))
         killed = time.monotonic()
@@ -221,50 +172,17 @@ def test_a_killed_program_leaves_the_joints_damped_and_a_log(port: int, tmp_path
         # The system frees its memory before the end is noticed: 15 ms if it is not busy.
         gone = time.monotonic()
         # The servo has no parent now; when it is silent it has ended.
-        await_(lambda: time.monotonic() - listener.received[-1][0] > 0.2)
-    first = min(when for when, c in listener.received if when > killed and not c.stiffness.any())
-    assert listener.commanded < first < gone + DAMPED_S
-    assert listener.received[-1][0] - first >= 0.95  # as far as this thread can tell
+        await_(lambda: time.monotonic() - wire.received()[0][-1] > 0.2)
+    when, damps = wire.received()
+    first = when[damps & (when > killed)][0]
+    assert when[~damps][-1] < first < gone + DAMPED_S
+    assert when[-1] - first >= 0.95  # as far as this thread can tell
     log = read_mcap(path)
     assert not log.complete
     # The logger outlives the program that started it.
     assert killed - log.time[-1] < 0.7
     (segment,) = log.segments
     assert np.ptp(log.cut(segment).command[:, 0]) > 0.0
-
-
-def test_a_killed_servo_is_reported_and_the_log_ends(
-    port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def kill() -> None:
-        (servo,) = (child for child in active_children() if child.name == "pronk servo")
-        servo.kill()
-
-    with Listener(port) as listener, pytest.raises(HardwareError, match="was killed"):
-        swept(plan_of("FR_hip_roll"), tmp_path, port, progress=early(kill))
-    log = cut(tmp_path, "was killed")
-    assert listener.damped  # by the standby
-    # To the last of what it did.
-    assert listener.commanded - log.time[-1] < 0.1
-    assert "FR_hip_roll.mcap" in capsys.readouterr().err
-
-
-def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) -> None:
-    pressed = []
-
-    def press() -> None:
-        pressed.append(time.monotonic())
-        os.kill(os.getpid(), signal.SIGINT)
-
-    link = Link(robot=ROBOT.name, address=Address.parse("lcm", port=port), fresh=FRESH)
-    task = SweepTask(plan=plan_of("FR_hip_roll"), out_dir=tmp_path)
-    plan = Plan(link=link, sweep=task, limits=PATIENT, operator_timeout_s=10.0)
-    with Listener(port) as listener, pytest.raises(KeyboardInterrupt):
-        run_sweep(plan, clamp_operator=Person(), progress=early(press))
-    # By the servo's own clock: it logs up to the tick in which it damps.
-    assert abs(cut(tmp_path, "interrupted").time[-1] - pressed[0]) < DAMPED_S
-    assert listener.damped
-    assert not active_children()
 
 
 def test_a_person_clamps_joints_when_requested(
@@ -292,13 +210,10 @@ def test_a_person_clamps_joints_when_requested(
             person(("FR_knee",))
 
 
-def test_real_hardware_must_be_confirmed_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
+def test_real_hardware_must_be_confirmed_by_its_name(tmp_path: Path) -> None:
     words = ["sweep", "mini_cheetah", "--link", "lcm", "--interface", "lo", "--joints", "FR_knee"]
-    assert cli.run([*words, "--out", str(tmp_path / "x")]) == 2
-    output = capsys.readouterr()
-    assert "A real mini_cheetah at lcm://lo is about to move" in output.out
-    assert "nothing was moved" in output.err
+    done = invoke([*words, "--out", tmp_path / "x"], given="yes\n")
+    assert done.exit_code == 2
+    assert "A real mini_cheetah at lcm://lo is about to move" in done.stdout
+    assert "nothing was moved" in done.stderr
     assert not (tmp_path / "x").exists()

@@ -46,9 +46,7 @@ def test_the_papers_sweep_of_all_joints_passes(plan: SweepPlan) -> None:
     assert [each.signal.amplitude for each in first] == [0.25] * 3 + [0.125] * 3
     assert [each.repeat for each in first] == [0, 1, 2, 0, 1, 2]
     assert plan.duration_s == pytest.approx(72 * 20.5 + 12 * 3.0)
-
-
-def test_the_thigh_is_clamped_for_the_knee_only(plan: SweepPlan) -> None:
+    # The thigh is clamped for the knee only.
     for each in plan.excitations:
         leg, joint = each.joint.split("_", 1)
         expected = (f"{leg}_hip_roll", f"{leg}_hip_pitch") if joint == "knee" else ()
@@ -96,9 +94,8 @@ def test_the_corners_enclose_the_model_itself() -> None:
     wide = forecasts("FR_hip_pitch", SHORT)["FR_hip_pitch"]
     narrow = forecasts("FR_hip_pitch", SHORT, uncertainty=EXACT)["FR_hip_pitch"]
     assert wide.lowest < narrow.lowest
-    assert wide.highest > narrow.highest
-    assert wide.speed > narrow.speed
-    assert wide.torque > narrow.torque
+    for value in ("highest", "speed", "torque"):
+        assert getattr(wide, value) > getattr(narrow, value)
 
 
 def test_the_step_of_the_forecast_has_converged() -> None:
@@ -117,31 +114,28 @@ def test_the_step_of_the_forecast_has_converged() -> None:
 def test_a_sweep_that_could_exceed_a_range_is_refused(
     joint: str, amplitude: float, words: str
 ) -> None:
-    plan = make_plan(ROBOT, [joint], SHORT, amplitudes=(amplitude, 0.1), repeats=1)
+    def check(*amplitudes: float) -> None:
+        make_plan(ROBOT, [joint], SHORT, amplitudes=amplitudes, repeats=1).check()
+
     with pytest.raises(PlanError, match=words) as caught:
-        plan.check()
+        check(amplitude, 0.1)
     message = str(caught.value)
     assert joint in message
     fits = float(message.split("an amplitude of ")[1].split(" rad fits")[0])
     assert 0.1 < fits < amplitude
-    make_plan(ROBOT, [joint], SHORT, amplitudes=(fits,), repeats=1).check()
+    check(fits)
     with pytest.raises(PlanError):
-        make_plan(ROBOT, [joint], SHORT, amplitudes=(1.2 * fits,), repeats=1).check()
+        check(1.2 * fits)
 
 
-def test_a_sweep_beyond_the_drives_torque_is_refused() -> None:
+def test_what_no_amplitude_fits_and_what_the_drives_cannot_give_are_refused() -> None:
+    joints = (replace(j, range=(-2.6, 1.0)) if j.name == "FR_knee" else j for j in ROBOT.joints)
+    bent = replace(ROBOT, joints=tuple(joints))
+    with pytest.raises(PlanError, match="no amplitude fits"):
+        make_plan(bent, ["FR_knee"], SHORT, repeats=1).check()
     strong = {"FR_hip_pitch": 150.0}
     plan = make_plan(ROBOT, ["FR_hip_pitch"], SHORT, stiffness=strong, amplitudes=(0.25,))
     with pytest.raises(PlanError, match="times the torque that its drive gives"):
-        plan.check()
-
-
-def test_a_pose_outside_the_range_fits_no_amplitude() -> None:
-    joints = tuple(
-        replace(j, range=(-2.6, 1.0)) if j.name == "FR_knee" else j for j in ROBOT.joints
-    )
-    plan = make_plan(replace(ROBOT, joints=joints), ["FR_knee"], SHORT, repeats=1)
-    with pytest.raises(PlanError, match="no amplitude fits"):
         plan.check()
 
 

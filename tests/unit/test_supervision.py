@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from pronk.links.machine import Command, State
-from pronk.runtime.safety import Decision, FilterAction, Limits, Reason, SafetyFilter
+from pronk.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
 from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
 DT = 0.002
 BEGINS = 0.5
+LIMITS = Limits.of(ROBOT)
 
 
 def moving(seconds: float, seed: int = 0) -> Iterator[State]:
@@ -40,20 +41,22 @@ def moving(seconds: float, seed: int = 0) -> Iterator[State]:
         )
 
 
+def wanted(position: np.ndarray, t: float) -> Command:
+    return Command(position=position, stiffness=KP, damping=KD, made=t, valid_for=0.05)
+
+
 def judged(
-    states: Iterator[State], *, limits: Limits | None = None, swing: float = 0.2
-) -> tuple[Decision, float] | None:
-    """The first damping of a filter whose command swings like the joints, and when."""
-    safety = SafetyFilter(limits=limits or Limits.of(ROBOT))
+    states: Iterator[State], *, limits: Limits = LIMITS, swing: float = 0.2
+) -> tuple[Reason, float]:
+    """Why a filter first damps whose command swings like the joints, and when [s]."""
+    safety = SafetyFilter(limits=limits)
     for state in states:
-        wanted = POSE + swing * math.sin(2.0 * math.pi * 2.5 * state.time)
-        command = Command(
-            position=wanted, stiffness=KP, damping=KD, made=state.time, valid_for=0.05
-        )
-        sent, decision = safety.judge([state], command, state.time)
+        target = POSE + swing * math.sin(2.0 * math.pi * 2.5 * state.time)
+        sent, decision = safety.judge([state], wanted(target, state.time), state.time)
         if sent is None:
-            return decision, state.time
-    return None
+            assert decision.reason.level >= FilterAction.DAMP
+            return decision.reason, state.time
+    return Reason.NONE, math.nan
 
 
 def spoil(change: Callable[[State, State], State]) -> Iterator[State]:
@@ -62,80 +65,96 @@ def spoil(change: Callable[[State, State], State]) -> Iterator[State]:
     for state in moving(2.0):
         if state.time < BEGINS or sound is None:
             sound = state
-            yield state
-        else:
-            yield change(sound, state)
+        yield state if sound is state else change(sound, state)
 
 
-def test_a_moving_robot_is_believed() -> None:
-    assert judged(moving(4.0)) is None
+def late(state: State, pause: float) -> State:
+    """Arrived at the end of a pause that comes every 0.3 s."""
+    begun = 0.3 * math.floor(state.time / 0.3)
+    passed = state.time - begun
+    time = begun + pause + 1e-3 * passed if passed < pause else state.time
+    return replace(state, time=time)
 
 
-def test_lost_states_and_bursts_are_believed() -> None:
+def slow(state: State) -> State:
+    """Ten states come 40 ms apart, as from a virtual robot on a busy computer."""
+    return replace(state, time=state.time + 20.0 * min(max(state.time - 1.0, 0.0), 0.02))
+
+
+def test_a_moving_robot_is_believed_with_lost_states_bursts_and_slow_ones() -> None:
     rng = np.random.default_rng(1)
-    assert judged(state for state in moving(4.0) if rng.random() >= 0.3) is None
-
-    def late(state: State, pause: float) -> State:
-        """Arrived at the end of a pause that comes every 0.3 s."""
-        begun = 0.3 * math.floor(state.time / 0.3)
-        passed = state.time - begun
-        time = begun + pause + 1e-3 * passed if passed < pause else state.time
-        return replace(state, time=time)
-
-    for pause in (0.02, 0.045):
-        assert judged(late(state, pause) for state in moving(4.0)) is None
-
-
-def test_a_robot_that_is_slow_for_a_while_is_believed() -> None:
-    def slow(state: State) -> State:
-        """Ten states come 40 ms apart, as from a virtual robot on a busy computer."""
-        passed = min(max(state.time - 1.0, 0.0), 0.02)
-        return replace(state, time=state.time + 20.0 * passed)
-
-    assert judged(slow(state) for state in moving(2.0)) is None
+    for states in (
+        moving(4.0),
+        (state for state in moving(4.0) if rng.random() >= 0.3),
+        (late(state, 0.02) for state in moving(4.0)),
+        (late(state, 0.045) for state in moving(4.0)),
+        map(slow, moving(2.0)),
+    ):
+        assert judged(states)[0] is Reason.NONE
 
 
 @pytest.mark.parametrize("fault", sorted(set(SENSOR_FAULTS) - set(SWAPPED)))
 def test_a_faulty_sensor_is_found(fault: str) -> None:
-    found = judged(spoil(lambda sound, state: spoiled(fault, sound, state)))
-    assert found is not None
-    decision, when = found
+    reason, when = judged(spoil(lambda sound, state: spoiled(fault, sound, state)))
     imu = fault.split("-")[0] in ("imu", "attitude", "gyro", "accelerometer")
     if fault == "attitude-stuck":
         expected = {Reason.ATTITUDE}
     else:
         expected = {Reason.REPEATED, Reason.ATTITUDE} if imu else {Reason.ENCODER}
-    assert decision.reason in expected
-    assert decision.level is FilterAction.LATCH
+    assert reason in expected
+    assert reason.level is FilterAction.LATCH
     assert when - BEGINS <= (0.05 if fault.endswith("repeats") else 0.1)
 
 
-def test_a_slow_joint_that_stops_is_found_by_the_others_motion() -> None:
-    def stopped(sound: State, state: State) -> State:
-        q, v = state.position.copy(), state.velocity.copy()
-        q[3], v[3] = sound.position[3], 0.01
-        return replace(state, position=q, velocity=v)
+def stopped(sound: State, state: State) -> State:
+    """A joint's encoder is constant, and its velocity nearly zero."""
+    q, v = state.position.copy(), state.velocity.copy()
+    q[3], v[3] = sound.position[3], 0.01
+    return replace(state, position=q, velocity=v)
 
-    found = judged(spoil(stopped), swing=0.0)
-    assert found is not None
-    assert found[0].reason is Reason.ENCODER
-    assert found[1] - BEGINS <= 0.1
-    # On a stand the other legs may be clamped while one is excited.
-    assert judged(spoil(stopped), swing=0.0, limits=Limits.of(ROBOT, tilt=math.inf)) is None
+
+def drifting(_: State, state: State) -> State:
+    return replace(state, gyro=state.gyro + 1.5)
+
+
+def lying(_: State, state: State) -> State:
+    x, y, z = state.accelerometer
+    return replace(state, accelerometer=np.array([x, z, y]))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "within"),
+    [
+        (stopped, Reason.ENCODER, 0.1),  # by the others' motion
+        (drifting, Reason.ATTITUDE, 0.1),
+        (lying, Reason.ATTITUDE, 1.0),
+    ],
+)
+def test_a_sensor_that_others_contradict_is_found(
+    change: Callable[[State, State], State], reason: Reason, within: float
+) -> None:
+    found, when = judged(spoil(change), swing=0.0)
+    assert found is reason
+    assert when - BEGINS <= within
+
+
+def test_on_a_stand_other_legs_may_be_clamped_and_no_inertial_unit_is_needed() -> None:
+    hung, still = Limits.of(ROBOT, tilt=math.inf), np.zeros(3)
+    assert judged(spoil(stopped), swing=0.0, limits=hung)[0] is Reason.NONE
+    states = (replace(state, gyro=still, accelerometer=still) for state in moving(1.0))
+    assert judged(states, limits=hung)[0] is Reason.NONE
 
 
 @pytest.mark.parametrize("speed", [0.0, 6.0])
 def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> None:
-    safety = SafetyFilter(limits=Limits.of(ROBOT))
-    sent = None
+    safety = SafetyFilter(limits=LIMITS)
     for state in moving(0.28):
         q, v = state.position.copy(), state.velocity.copy()
         q[4], v[4] = POSE[4] + speed * (state.time - 0.1), speed + 0.01 * state.gyro[1]
         far = POSE.copy()
         far[4] = q[4] + 2.0 * ROBOT.joints[4].drive.effort_limit / KP[4]
-        desired = Command(position=far, stiffness=KP, damping=KD, made=state.time, valid_for=0.05)
         state = replace(state, position=q, velocity=v)
-        sent, decision = safety.judge([state], desired, state.time)
+        sent, decision = safety.judge([state], wanted(far, state.time), state.time)
         if sent is None:
             break
     if speed == 0.0:
@@ -145,40 +164,14 @@ def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> 
         assert sent is not None, decision
 
 
-def test_a_gyro_that_is_off_and_a_trunk_that_lies_are_found() -> None:
-    def drifting(_: State, state: State) -> State:
-        return replace(state, gyro=state.gyro + 1.5)
-
-    def lying(_: State, state: State) -> State:
-        x, y, z = state.accelerometer
-        return replace(state, accelerometer=np.array([x, z, y]))
-
-    for change, within in ((drifting, 0.1), (lying, 1.0)):
-        found = judged(spoil(change))
-        assert found is not None
-        assert found[0].reason is Reason.ATTITUDE
-        assert found[1] - BEGINS <= within
-
-
-def test_a_hung_robot_needs_no_inertial_unit() -> None:
-    still = np.zeros(3)
-    states = (replace(state, gyro=still, accelerometer=still) for state in moving(1.0))
-    assert judged(states, limits=Limits.of(ROBOT, tilt=math.inf)) is None
-
-
 def test_old_states_are_held_for_a_tenth_of_any_second() -> None:
-    safety = SafetyFilter(limits=Limits.of(ROBOT))
-    states = list(moving(3.0))
+    safety, states = SafetyFilter(limits=LIMITS), list(moving(3.0))
     for k in range(20, len(states)):
         t = k * DT
         # 30 ms old for 60 ms in each half second, then for good.
         old = t % 0.5 < 0.06 if t < 1.6 else True
-        state = states[k - 15] if old else states[k]
-        desired = Command(position=POSE, stiffness=KP, damping=KD, made=t, valid_for=0.05)
-        _, decision = safety.judge([state], desired, t)
+        _, decision = safety.judge([states[k - 15] if old else states[k]], wanted(POSE, t), t)
         if decision.level >= FilterAction.DAMP:
-            assert decision.reason is Reason.HELD
             break
-    else:
-        pytest.fail("the last target was held for more than a second")
+    assert decision.reason is Reason.HELD
     assert 0.5 < t < 1.1

@@ -1,0 +1,124 @@
+"""Another program at the wire of a robot: receives every command, and sends its own."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from pronk.links.machine import Command
+from pronk.robots import load_robot
+from pronk.virtual.robot import hold_of
+
+ROBOT = load_robot("mini_cheetah")
+OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
+"""What it commands; like the virtual robot's own rival, every 10 ms."""
+
+
+class Wire:
+    """Records every command on a wire, and sends on it as another program would."""
+
+    def __init__(
+        self,
+        publish: Callable[[], None],
+        listen: Callable[[], list[tuple[float, bytes]]],
+        decode: Callable[[bytes], Command],
+    ) -> None:
+        self.began = math.nan
+        """When it spoke first [s]."""
+        self._publish, self._listen, self._decode = publish, listen, decode
+        self._met: list[tuple[float, bytes]] = []
+        self._over, self._speaking = threading.Event(), threading.Event()
+        self._threads = [threading.Thread(target=each) for each in (self._hear, self._speak)]
+
+    def __enter__(self) -> Wire:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+
+    def speak(self) -> None:
+        self.began = time.monotonic()
+        self._publish()
+        self._speaking.set()
+
+    def hush(self) -> None:
+        self._speaking.clear()
+
+    def received(self) -> tuple[np.ndarray, np.ndarray]:
+        """When each command that is not its own came [s], and whether it damps."""
+        met = [(when, self._decode(data)) for when, data in self._met]
+        others = [
+            (when, not command.stiffness.any())
+            for when, command in met
+            if not np.allclose(command.position, OTHER.position, atol=1e-5)
+        ]
+        return np.array([when for when, _ in others]), np.array([damps for _, damps in others])
+
+    def _speak(self) -> None:
+        while not self._over.wait(0.01):
+            if self._speaking.is_set():
+                self._publish()
+
+    def _hear(self) -> None:
+        while not self._over.is_set():
+            self._met += self._listen()
+
+
+def over_lcm(port: int) -> Wire:
+    import lcm
+
+    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
+    from pronk.links.lcm.link import url_of
+
+    sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
+    met: list[tuple[float, bytes]] = []
+
+    def listen() -> list[tuple[float, bytes]]:
+        listener.handle_timeout(20)
+        found = met.copy()
+        met.clear()
+        return found
+
+    listener.subscribe(
+        CHEETAH.command.channel, lambda _, data: met.append((time.monotonic(), data))
+    ).set_queue_capacity(500)
+    data = encode_command(CHEETAH, OTHER)
+    return Wire(
+        lambda: sender.publish(CHEETAH.command.channel, data),
+        listen,
+        lambda data: decode_command(CHEETAH, data),
+    )
+
+
+def over_dds(domain: int) -> Wire:
+    from pronk.links.dds import codec as idl
+    from pronk.links.dds.codec import decode_command, encode_command, joint_map
+    from pronk.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
+
+    joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
+    sender = own.writer(COMMANDS, idl.LowCmd)
+    listener = own.reader(COMMANDS, idl.LowCmd, own=False)
+    counts: Counter[str] = Counter()
+    # Every sample says when it was written, by the wall clock.
+    wall = time.time() - time.monotonic()
+
+    def listen() -> list[tuple[float, bytes]]:
+        time.sleep(0.002)
+        return [
+            (m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(listener, counts)
+        ]
+
+    data = encode_command(joints, OTHER)
+    return Wire(
+        lambda: write(sender, data, counts), listen, lambda data: decode_command(joints, data)
+    )
