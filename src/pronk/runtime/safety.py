@@ -494,7 +494,6 @@ class SafetyFilter:
     """Time for which targets have been limited by torque [s]."""
 
     def __post_init__(self) -> None:
-        """Begin without a state."""
         self.supervision = Supervision(len(self.limits.joints), self.state_rate_hz)
         self.blocked = self._anchor = np.zeros(len(self.limits.joints))
 
@@ -548,8 +547,7 @@ class SafetyFilter:
             found = wrong or self._persistent(found.reason, t, command, states[-1]) or found
         if self.faulted or found.level >= FilterAction.DAMP:
             detail = "" if self.faulted else found.detail
-            if found.level >= FilterAction.DAMP:
-                self.fault(found.reason, t)
+            self.fault(found.reason, t)
             return None, self.damped()._replace(detail=detail)
         self.last = result.target[-1]
         self.supervision.command(np.asarray(command.stiffness) * self.last)
