@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from deploy_faults import FaultyLink
 from deploy_runs import PATIENT
 from pronk.errors import HardwareError
 from pronk.links.address import Address
-from pronk.links.machine import Machine
 from pronk.runtime.ipc import ACTIONS, OPERATOR, TICK, Mode, OperatorRequest, Shared, fill
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.servo import Servo
@@ -29,16 +27,6 @@ from virtual_robot import POSE
 QUICK = Timing(damp_s=0.05, fold_s=0.1, check_s=0.0, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
 """The servo knows nothing of the policy but its actions."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Unopened(Link):
-    """A link that cannot even be made."""
-
-    robot: str = "mini_cheetah"
-
-    def __call__(self, clamp_operator: object = None) -> Machine:
-        raise HardwareError("the library of the link is not installed.")
 
 
 @pytest.fixture
@@ -118,9 +106,9 @@ def flown(link: Any, **more: Any) -> Iterator[Run]:
 
 
 def test_a_link_that_cannot_be_opened_says_why() -> None:
-    with flown(Unopened()) as run:
+    with flown(Link(robot="mini_cheetah", address=Address.parse("sim://moon"))) as run:
         run.until(lambda: run.over)
-        assert run.said == [("refused", "the library of the link is not installed.")]
+        assert run.said == [("refused", "base 'moon'; expected 'bench' or 'ground'.")]
         assert run.servo.figures()["virtual"] is None
 
 
