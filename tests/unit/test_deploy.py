@@ -38,7 +38,14 @@ from pronk.runtime.state_machine import (
     minimum_jerk,
     stand_up,
 )
-from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
+from pronk.runtime.teleop import (
+    Gamepad,
+    Keyboard,
+    Operator,
+    OperatorCommand,
+    ScriptedOperator,
+    TimeLimit,
+)
 from pronk.virtual.faults import SWAPPED, spoiled
 from virtual_robot import POSE, ROBOT, connected, rolled, still
 
@@ -456,8 +463,9 @@ def test_the_delay_must_be_within_the_training_range() -> None:
 
 def test_a_script_stands_walks_sits_and_leaves() -> None:
     script = Script(command=FORWARD, stand_s=1.0, run_s=1.0, jump_s=0.5, keep_s=0.5, stop_s=1.0)
-    operator = ScriptedOperator([script, replace(script, command=(0.0, -1.0, 0.0))], pause_s=1.0)
-    assert operator.seconds == 10.0
+    scripted = ScriptedOperator([script, replace(script, command=(0.0, -1.0, 0.0))])
+    assert scripted.seconds == 10.0
+    operator = TimeLimit(scripted, scripted.seconds)
 
     def requested(t: float, mode: Mode) -> OperatorRequest:
         return operator.command(t, mode).request
@@ -472,30 +480,31 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
     assert [t for t, each in given.items() if each.jump] == [2.2, 7.2]
     assert [t for t, each in given.items() if each.command == FORWARD] == [1.5, 2.2, 2.7]
     assert given[6.5].command == (0.0, -1.0, 0.0)
-    assert not operator.finished
-    assert requested(20.1, Mode.POLICY) is OperatorRequest.SIT
-    assert operator.finished
+    sit = OperatorCommand(held=True, request=OperatorRequest.SIT)
+    assert operator.command(20.1, Mode.POLICY) == sit
+    assert [requested(t, Mode.POLICY) for t in (20.2, 20.3)] == [none, none]
     assert requested(22.0, Mode.SIT) is none
     assert requested(23.0, Mode.DAMP) is OperatorRequest.QUIT
 
 
 @pytest.mark.parametrize("kind", ["fault", "refused", "notice"])
 def test_a_script_ends_at_the_first_fault(kind: str) -> None:
-    operator = ScriptedOperator([Script(command=FORWARD)])
+    operator = TimeLimit(ScriptedOperator([Script(command=FORWARD)]), 0.5)
     operator.notified("mode", "STAND")
     assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
     operator.notified(kind, "no.")
     assert operator.command(0.1, Mode.STAND).request is OperatorRequest.QUIT
 
 
-def test_a_time_limit_sits_down_and_ends() -> None:
+def test_after_its_time_a_run_still_ends_at_a_fault_and_damps_on_request() -> None:
     operator = TimeLimit(ScriptedOperator([Script(command=FORWARD, stand_s=0.0)]), 0.5)
-    assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
     assert operator.command(5.0, Mode.POLICY).command == FORWARD
-    sit = OperatorCommand(held=True, request=OperatorRequest.SIT)
-    assert operator.command(5.6, Mode.POLICY) == sit
-    assert operator.command(5.7, Mode.HALT).request is OperatorRequest.NONE
-    assert operator.command(6.7, Mode.DAMP).request is OperatorRequest.QUIT
+    assert operator.command(5.6, Mode.POLICY).request is OperatorRequest.SIT
+    operator.notified("fault", "tilted.")
+    assert operator.command(5.7, Mode.FAULT).request is OperatorRequest.QUIT
+    person, damp = Operator(), OperatorCommand(request=OperatorRequest.DAMP)
+    person.command = lambda now, mode: damp  # type: ignore[method-assign]
+    assert TimeLimit(person, 0.0).command(0.0, Mode.POLICY) is damp
 
 
 def test_keys_of_a_terminal() -> None:

@@ -81,6 +81,7 @@ def deploy(
     if scripts is not None:
         operator = scripted = ScriptedOperator(scripts)
         words = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
+        seconds = scripted.seconds if seconds is None else min(seconds, scripted.seconds)
     elif gamepad is not None:
         operator, words = Gamepad(gamepad, contract.command_ranges), PAD_HELP
     else:

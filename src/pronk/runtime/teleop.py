@@ -53,23 +53,23 @@ class Operator:
         """Release the device."""
 
 
-class ScriptedOperator(Operator):
-    """Stands up, runs scripts one after another, sits down, ends; ends at the first fault."""
+_PAUSE_S = 1.0
+"""With a zero command after each script [s]."""
 
-    def __init__(self, scripts: Sequence[Script], *, pause_s: float = 1.0) -> None:
-        """`pause_s` is the time with a zero command after each script [s]."""
+
+class ScriptedOperator(Operator):
+    """Stands up and runs scripts one after another; ends at the first fault.
+
+    `TimeLimit` of `seconds` sits down at their end.
+    """
+
+    def __init__(self, scripts: Sequence[Script]) -> None:
         self.scripts = tuple(scripts)
-        self.pause_s = pause_s
+        self.seconds = sum(script.seconds + _PAUSE_S for script in scripts)
+        """While the policy runs [s]."""
         self._began: float | None = None
         self._requested_in = Mode.ENDED
         self._over = False
-        self.finished = False
-        """True once all scripts have been run to their ends."""
-
-    @property
-    def seconds(self) -> float:
-        """While the policy runs [s]."""
-        return sum(script.seconds + self.pause_s for script in self.scripts)
 
     def notified(self, kind: str, text: str) -> None:
         """End at a fault or refusal."""
@@ -82,26 +82,21 @@ class ScriptedOperator(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The scripts' input."""
-        if self._over or (self.finished and mode is Mode.DAMP):
+        if self._over:
             return OperatorCommand(request=OperatorRequest.QUIT)
         if mode is Mode.DAMP:
             return OperatorCommand(request=self._once(OperatorRequest.STAND, mode))
         if mode is Mode.STAND:
             return OperatorCommand(held=True, request=self._once(OperatorRequest.WALK, mode))
-        if mode is not Mode.POLICY:
-            return OperatorCommand(held=True)
-        if self._began is None:
-            self._began = now
-        t = now - self._began
-        for script in self.scripts:
-            if t < script.seconds:
-                command, jump = script.commanded(t)
-                return OperatorCommand(command=command, jump=jump, held=True)
-            t -= script.seconds + self.pause_s
-            if t < 0.0:
-                return OperatorCommand(held=True)
-        self.finished = True
-        return OperatorCommand(held=True, request=self._once(OperatorRequest.SIT, mode))
+        if mode is Mode.POLICY:
+            self._began = now if self._began is None else self._began
+            t = now - self._began
+            for script in self.scripts:
+                if 0.0 <= t < script.seconds:
+                    command, jump = script.commanded(t)
+                    return OperatorCommand(command=command, jump=jump, held=True)
+                t -= script.seconds + _PAUSE_S
+        return OperatorCommand(held=True)
 
     def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
         """A request, once in each mode."""
@@ -156,11 +151,12 @@ class TimeLimit(Operator):
         self.close = operator.close  # type: ignore[method-assign]
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The other's input, until the time is over."""
+        """The other's input, until the time is over; then its requests to damp and to end."""
         given = self._operator.command(now, mode)
         if mode is Mode.POLICY and self._began is None:
             self._began = now
-        if self._began is None or now - self._began < self._seconds:
+        over = self._began is not None and now - self._began >= self._seconds
+        if not over or given.request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
             return given
         if mode is Mode.DAMP:
             return OperatorCommand(request=OperatorRequest.QUIT)
