@@ -68,6 +68,7 @@ class Windows(NetworkLink):
     """A link that gives states at the given times in each window."""
 
     torque_kind: TorqueKind = "absent"
+    state_rate_hz = 500.0
 
     def __init__(self, *windows: np.ndarray, **options: object) -> None:
         super().__init__(ROBOT, **options)  # type: ignore[arg-type]
@@ -105,10 +106,10 @@ def test_states_must_come_often_and_without_gaps(
 ) -> None:
     link = Windows(*windows, fresh=fresh)
     if isinstance(found, int):
-        assert len(link.fresh_states(500.0, until=until)) == found
+        assert len(link.fresh_states(until=until)) == found
         return
     with pytest.raises(HardwareError, match=found):
-        link.fresh_states(500.0, until=until)
+        link.fresh_states(until=until)
 
 
 def numbered(counts: tuple[int, ...], **options: int) -> tuple[list[int], dict[str, int]]:

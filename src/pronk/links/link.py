@@ -1,17 +1,8 @@
 """Connecting, states, commands, clamps and closing, common to all links.
 
-Before anything is written, states are fresh and no other program commands. A thread of its own
-writes damping when a command expires without another, for the commanding program may be stuck. A
-second writer stops the first. At the end the robot is damped until it is at rest.
-
-A robot whose state is one message and whose command is one message needs only a `Codec` and a
-`Transport`:
-
-    def my_link(robot, *, interface=None, speed: int = 115200, **common):
-        return StreamLink(robot, MyCodec(robot), lambda: MyTransport(interface, speed), **common)
-
-As an entry point of the group `pronk.links` it is reached at `my_link://ttyUSB0?speed=9600`.
-`pronk.testing.check_link` checks a codec and its transport.
+A thread of its own writes damping when a command expires without another, for the commanding
+program may be stuck. A robot whose state is one message and whose command is one message needs only
+a `Codec` and a `Transport` (`StreamLink`; docs/hardware.md has an example).
 """
 
 from __future__ import annotations
@@ -42,19 +33,15 @@ RESPONSE_S = 2.0
 _WINDOW_S = 0.2
 """How long states are watched before a robot is commanded [s]."""
 _POLL_S = 0.002
-_DAMP_PERIOD_S = 0.01
-"""Between two messages of damping [s]."""
+_DAMP_PERIOD_S = 0.01  # between two messages of damping
 _LEAST_DAMP_S, _MOST_DAMP_S = 1.0, 3.0
-_AT_REST = 0.5
-"""Joint speed below which a damped robot counts as at rest [rad/s]."""
+_AT_REST = 0.5  # joint speed below which a damped robot counts as at rest [rad/s]
 _KEPT_STATES = 10_000
+# Largest share of the robot's rate at which states may come, and the time over which it is counted,
+# in which a pause of this computer of 0.2 s with the burst after it passes [s].
 _MOST_RATE, _RATE_S = 1.2, 1.0
-"""Largest share of the robot's rate at which states may come, and the time over which it is
-counted, in which a pause of this computer of 0.2 s with the burst after it passes [s]."""
-_MOST_DROPPED = 0.2
-"""Share of the states that may be out of order before a robot is commanded."""
-_MEASURED = ("position", "velocity", "gyro", "accelerometer")
-"""Of a live sensor these never repeat to the last bit."""
+_MOST_DROPPED = 0.2  # share of the states that may be out of order before a robot is commanded
+_MEASURED = ("position", "velocity", "gyro", "accelerometer")  # never repeat to the last bit
 # A robot's count that went back by more than this belongs to a robot that was started again; one
 # that runs ahead of this computer's clock by more than this has jumped [s].
 _COUNT_BACK_S, _COUNT_AHEAD_S = 1.0, 0.5
@@ -82,13 +69,13 @@ def wait_for(done: Callable[[], bool], seconds: float = RESPONSE_S) -> bool:
 
 def await_rest(latest: Callable[[], State | None]) -> None:
     """Wait 1 to 3 s until the newest state is at rest; no state counts as at rest."""
-    begun = time.monotonic()
-    while (spent := time.monotonic() - begun) < _MOST_DAMP_S:
+
+    def at_rest() -> bool:
         state = latest()
-        speed = np.abs(state.velocity).max() if state is not None else 0.0
-        if spent >= _LEAST_DAMP_S and speed < _AT_REST:
-            break
-        time.sleep(_POLL_S)
+        return state is None or bool(np.abs(state.velocity).max() < _AT_REST)
+
+    time.sleep(_LEAST_DAMP_S)
+    wait_for(at_rest, _MOST_DAMP_S - _LEAST_DAMP_S)
 
 
 def unit_quaternion(name: str, values: Array) -> Array:
@@ -125,8 +112,8 @@ def port_or_domain(
 class StateNumbering:
     """Numbers the states of a live robot by the robot's own count, where it has one.
 
-    These make no state and are counted: a robot's count that stood still or went back (`out of
-    order`), and measurements that repeat to the last bit (`repeated`). `clock jumps` are counted.
+    A count that stood still or went back (`out of order`) and measurements that repeat to the last
+    bit (`repeated`) make no state and are counted; so are `clock jumps`, which make one.
     """
 
     def __init__(
@@ -178,12 +165,12 @@ class CommandWriter:
     ) -> None:
         """Start the thread that watches the expiry; nothing is written yet.
 
-        `encode` refuses impossible commands, and `publish` is called by one thread at a time. The
-        command in force is written again after `repeat_s` [s]; `damping` follows the expiry.
-        `counts` gets `commands`, `repeats`, `expired` and `not written`.
+        `publish` is called by one thread at a time. The command in force is written again after
+        `repeat_s` [s]. `counts` gets `commands`, `repeats`, `expired` and `not written`.
         """
-        self.counts, self.wrote = counts, False
-        """`wrote`: whether anything was written at all."""
+        self.counts = counts
+        self.wrote = False
+        """Whether anything was written at all."""
         self._encode, self._publish, self._repeat_s = encode, publish, repeat_s
         self._damping = encode(damping)
         self._data = b""
@@ -196,8 +183,7 @@ class CommandWriter:
     def send(self, command: Command) -> None:
         """Put a command into force; damping if it has already expired.
 
-        HardwareError: it is impossible, and was not sent; or writing failed, and damping follows
-        when it expires.
+        HardwareError if it is impossible, or if writing failed: then damping follows its expiry.
         """
         data = self._encode(command)
         expires = command.made + command.valid_for
@@ -273,14 +259,9 @@ class NetworkLink(ABC):
 
     torque_kind: TorqueKind
     state_rate_hz: float
-    _writer: CommandWriter | None = None
-    """None while the link is closed."""
-    _command_topic = _address = ""
-    """Where commands are written and states are expected, in error messages."""
-    _damping = 1.0
-    """With which the joints sink softly [N m s/rad]."""
-    _repeat_s: float | None = None
-    """Silence after which the command in force is written again [s]."""
+    _writer: CommandWriter | None = None  # None while the link is closed
+    _command_topic = _address = ""  # of commands and of states, in error messages
+    _repeat_s: float | None = None  # silence after which a command is written again [s]
 
     def __init__(
         self,
@@ -291,12 +272,13 @@ class NetworkLink(ABC):
         exclusive_s: float = 1.0,
         fresh: Freshness | None = None,
     ) -> None:
-        """Describe the link; nothing is opened yet.
+        """Describe the link.
 
         `release` switches the robot's own controller off first (a standing robot falls then);
         before pronk writes, no command of others may come for `exclusive_s` [s].
         """
         self.robot, self._robot = robot.name, robot
+        self._sinking = damping_command(len(robot.joints))
         self.virtual = False
         """Known once connected, when the virtual robot identifies itself."""
         self.counts: Counter[str] = Counter()
@@ -308,9 +290,9 @@ class NetworkLink(ABC):
         self._arrivals: deque[float] = deque()
 
     def connect(self) -> None:
-        """Open the link and check that states come and no other program commands. 1 or 2 s.
+        """Open the link; HardwareError unless fresh states come and no other program commands.
 
-        Nothing is written to the joints before; a check that fails raises HardwareError.
+        It takes 1 or 2 s, in which nothing is written to the joints.
         """
         self.close()
         self.virtual, self._latest, self._last_error = False, None, ""
@@ -320,7 +302,7 @@ class NetworkLink(ABC):
         self._arrivals = deque(maxlen=most)
         self._writer = CommandWriter(
             *self._open(),
-            damping=damping_command(len(self._robot.joints), self._damping),
+            damping=self._sinking,
             repeat_s=self._repeat_s,
             counts=self.counts,
         )
@@ -338,7 +320,7 @@ class NetworkLink(ABC):
         return time.monotonic()
 
     def latest(self) -> State:
-        """The newest state, without waiting."""
+        """The newest state."""
         self._opened()
         assert self._latest is not None
         return self._latest
@@ -380,9 +362,9 @@ class NetworkLink(ABC):
             self._writer.damp()
 
     def open_damper(self) -> Callable[[], None] | None:
-        """Open the wire for writing only, and return what writes damping, once a call.
+        """Open the wire to write damping beside the process that commands, once a call.
 
-        For a process beside the one that commands. None where the wire has one writer.
+        None where the wire has one writer.
         """
         return None
 
@@ -400,12 +382,9 @@ class NetworkLink(ABC):
         self._shut()
         self._writer = None
 
-    def fresh_states(self, rate_hz: float, *, until: float) -> list[State]:
-        """Watch windows of states until one is as fresh as required, and return that.
-
-        HardwareError: a window that ended after `until` [s] was not.
-        """
-        expected, fresh = rate_hz * _WINDOW_S, self._fresh
+    def fresh_states(self, *, until: float) -> list[State]:
+        """Return the first window of states that is fresh; HardwareError if none is by `until`."""
+        expected, fresh = self.state_rate_hz * _WINDOW_S, self._fresh
         while True:
             self.wait(0.0)  # drops earlier states
             states = self.wait(time.monotonic() + _WINDOW_S)
@@ -422,37 +401,35 @@ class NetworkLink(ABC):
                 )
 
     def check_exclusive(self) -> None:
-        """Raise HardwareError if another program commands, or another robot sends states.
-
-        That is judged from when the link was opened.
-        """
+        """Raise HardwareError if another program has commanded, or another robot sent states."""
         if foreign := self.foreign_commands:
             raise HardwareError(
                 f"another program commands the joints: {foreign} commands on "
                 f"{self._command_topic}; stop that program, or release the robot's own controller, "
                 "and connect again."
             )
-        sources, crowded = self.sources, self.counts["crowded"]
-        if sources > 1 or crowded:
-            found = (
-                f"{sources} robots or programs send states"
-                if sources > 1
-                else f"more than {_MOST_RATE * self.state_rate_hz:.0f} states a second come"
-            )
+        found = ""
+        if (sources := self.sources) > 1:
+            found = f"{sources} robots or programs send states"
+        elif self.counts["crowded"]:
+            found = f"more than {_MOST_RATE * self.state_rate_hz:.0f} states a second come"
+        if found:
             raise HardwareError(
                 f"{found} on {self._address}, expected one that sends "
                 f"{self.state_rate_hz:.0f} a second; switch the others off, or take another port "
                 "or domain, and connect again."
             )
 
+    # Both count from when the link was opened.
+
     @property
     def sources(self) -> int:
-        """Senders of states since the link was opened; 1 where the wire does not identify them."""
+        """Senders of states; 1 where the wire does not identify them."""
         return 1
 
     @property
     def foreign_commands(self) -> int:
-        """Commands of others since the link was opened."""
+        """Commands of others."""
         return self.counts["foreign"]
 
     def _opened(self) -> CommandWriter:
@@ -471,7 +448,7 @@ class NetworkLink(ABC):
             )
         self._prepare()
         self.counts["foreign"], silent_from = 0, time.monotonic()
-        self.fresh_states(self.state_rate_hz, until=begun + 2.0 * RESPONSE_S)
+        self.fresh_states(until=begun + 2.0 * RESPONSE_S)
         time.sleep(max(0.0, silent_from + self._exclusive_s - time.monotonic()))
         self.check_exclusive()
         if self.counts["out of order"] > max(10.0, _MOST_DROPPED * self.counts["states"]):
@@ -532,8 +509,7 @@ class NetworkLink(ABC):
 class Codec(Protocol):
     """Decodes states and encodes commands, without a socket."""
 
-    name: str
-    """Of the wire, in error messages."""
+    name: str  # of the wire, in error messages
     state_rate_hz: float
     torque_kind: TorqueKind
 
@@ -547,8 +523,7 @@ class Codec(Protocol):
 class Transport(Protocol):
     """Moves bytes; open from the beginning."""
 
-    local: bool
-    """True where nothing can leave this computer; required without an interface."""
+    local: bool  # nothing can leave this computer; required without an interface
 
     def receive(self, timeout_s: float) -> list[bytes]:
         """Messages that have come, oldest first; waits at most that long for the first."""
@@ -564,7 +539,7 @@ class Transport(Protocol):
 
 
 class StreamLink(NetworkLink):
-    """A robot behind a codec and a transport. Implements `Machine`."""
+    """A robot behind a codec and a transport; `pronk.testing.check_link` checks both."""
 
     def __init__(
         self,
@@ -583,7 +558,7 @@ class StreamLink(NetworkLink):
 
     @property
     def foreign_commands(self) -> int:
-        """Commands of others since the link was opened."""
+        """Commands of others."""
         return self._transport.foreign_commands()
 
     def _open(self) -> tuple[Encode, Publish]:

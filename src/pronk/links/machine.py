@@ -75,7 +75,7 @@ class Command:
 
 
 def damping_command(joints: int, damping: float = 1.0) -> Command:
-    """Make a command without stiffness. At 1 N m s/rad a Mini Cheetah sinks in about 1 s."""
+    """A command without stiffness. At 1 N m s/rad a Mini Cheetah sinks in about 1 s."""
     zeros = np.zeros(joints)
     return Command(position=zeros, stiffness=zeros, damping=zeros + damping)
 
@@ -106,7 +106,6 @@ class Machine(Protocol):
     torque_kind: TorqueKind
     """`State.torque` is measured, computed from the command, or absent (zeros)."""
     state_rate_hz: float
-    """States per second."""
 
     def now(self) -> float:
         """The machine's clock [s]."""

@@ -1,7 +1,5 @@
 r"""Real-time settings, pacing by absolute deadlines, and signals of a terminal.
 
-A real-time setting that is not granted is reported, and the loop runs without it.
-
 Ctrl-C, Ctrl-\, Ctrl-Z and the end of the terminal, as of an ssh connection, go to every process of
 the foreground program. A process that moves a robot must damp the joints before it ends, so it
 receives none of them: `terminal_blocked` while it starts, `leave` when it runs. The program that
@@ -26,13 +24,11 @@ from typing import Any, Self
 
 import numpy as np
 
-_LOCK_NOW_AND_LATER = 3
-"""MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
-_LEAST_CORES = 4
-"""Fewest cores of which one can be reserved."""
+_LOCK_NOW_AND_LATER = 3  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
+_LEAST_CORES = 4  # of which one can be reserved
 
 TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
-r"""Signals of a terminal: Ctrl-C, Ctrl-\, Ctrl-Z, and its end."""
+r"""Ctrl-C, Ctrl-\, Ctrl-Z, and the terminal's end."""
 ENDING = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
 """Signals that end a program."""
 
@@ -50,7 +46,7 @@ class Wanted:
 
 
 def enter(wanted: Wanted) -> tuple[str, ...]:
-    """Request settings for this process; return one line for each.
+    """Request settings for this process; return one line for each, granted or refused.
 
     Garbage collection stops for good: a collection in a loop takes milliseconds.
     """
@@ -68,7 +64,6 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
 
 
 def _granted(request: Callable[..., str], *values: int) -> str:
-    """What a request set, or why it was refused."""
     try:
         return request(*values)
     except (AttributeError, TypeError):
@@ -115,10 +110,8 @@ class Pace:
         """Begin with tick 0 due at `start` on CLOCK_MONOTONIC [s], by default now."""
         self.rate_hz = rate_hz
         self.start = time.monotonic() if start is None else start
-        self.tick = 0
-        """Number of the next tick."""
-        self.missed = 0
-        """Ticks that had passed before they could be run."""
+        self.tick = 0  # the next one
+        self.missed = 0  # ticks that had passed before they could be run
 
     @property
     def deadline(self) -> float:
@@ -142,8 +135,7 @@ class Histogram:
     def __init__(self) -> None:
         self.counts = np.zeros(8 * _PER_DECADE + 1, dtype=np.int64)
         self.count = 0
-        self.largest = 0.0
-        """[s]"""
+        self.largest = 0.0  # [s]
 
     def add(self, seconds: float) -> None:
         """Count a duration."""
@@ -191,8 +183,7 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.received = False
-        """Whether a signal has come since the last check."""
+        self.received = False  # since the last check
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:

@@ -42,10 +42,7 @@ def _builtin(value: Any) -> Any:
 
 
 def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -> T:
-    """Build a parameter class from a mapping of its fields, except those in `without`.
-
-    A RobotError names `where` and the wrong field.
-    """
+    """Build one from a mapping of its fields, except those in `without`; RobotError names both."""
     if not isinstance(entry, Mapping):
         raise RobotError(f"{where} is {entry!r}; expected a mapping of its fields.")
     known = {part.name: part for part in fields(kind) if part.name not in without}  # type: ignore[arg-type]

@@ -1,11 +1,12 @@
 """Motion capture and contacts of the virtual robot, without noise.
 
-Positions, orientations and contacts of a sample are of one instant: a foot is in contact if its
-sphere overlaps the ground, as in training. SI units; the world is z up; feet are FR, FL, HR, HL.
+A sample is of one instant; a foot is in contact if its sphere overlaps the ground, as in training.
+The world is z up; feet are FR, FL, HR, HL.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ class Capture:
     def dt(self) -> float:
         """Time between samples [s]; NaN for fewer than two."""
         if len(self.time) < 2:
-            return float("nan")
+            return math.nan
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
 
 
@@ -95,35 +96,31 @@ class Recorder:
         """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
         self._plant, self._period = plant, period_s
         self._step_s = float(plant.model.opt.timestep)
+        self._steps: list[int] = []
         self._blocks = [np.empty((0, plant.state_size))]
-        self._taken = 0
-        """Number of samples."""
 
     def due(self, last: int) -> list[int]:
         """Physics steps of the samples that are still to be taken, up to and with one step."""
-        # One more than there can be, for the rounding of steps.
-        most = math.floor((last + 0.5) * self._step_s / self._period) + 2
-        steps = self._steps(self._taken, max(self._taken, most))
-        return [step for step in steps.tolist() if step <= last]
+        steps: list[int] = []
+        for number in itertools.count(len(self._steps)):
+            if (step := round(number * self._period / self._step_s)) > last:
+                break
+            steps.append(step)
+        return steps
 
-    def keep(self, rows: Array) -> None:
-        """Keep the raw states (n, state_size) of the due steps."""
+    def keep(self, steps: list[int], rows: Array) -> None:
+        """Keep the raw states (n, state_size) of due steps."""
+        self._steps += steps
         self._blocks.append(rows)
-        self._taken += len(rows)
 
     def capture(self) -> Capture:
         """All samples."""
-        times = self._step_s * self._steps(0, self._taken).astype(np.float64)
+        times = self._step_s * np.array(self._steps, dtype=np.float64)
         return capture_of(self._plant, times, np.concatenate(self._blocks))
-
-    def _steps(self, first: int, end: int) -> NDArray[np.intp]:
-        """Physics steps of samples `first` to `end` - 1."""
-        steps = np.arange(first, end) * self._period / self._step_s
-        return np.asarray(np.rint(steps), dtype=np.intp)
 
 
 def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
-    """Turn times [s] (T,) and raw states (T, state_size) into a capture."""
+    """Make a capture of times [s] (T,) and raw states (T, state_size)."""
     raw = plant.unpack(rows)
     place, speed = raw.position, raw.velocity
     orientation = place[:, 3:7]

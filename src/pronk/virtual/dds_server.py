@@ -5,33 +5,15 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pronk.links.dds import codec
+from pronk.links.dds import codec, link
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
-from pronk.links.dds.link import (
-    BAD_PARAMETER,
-    BENCH,
-    CHECK_MODE,
-    CLAMP,
-    COMMANDS,
-    DONE,
-    RELEASE_MODE,
-    SELECT_MODE,
-    STATES,
-    SWITCHER,
-    UNKNOWN_API,
-    DdsNetwork,
-    Participant,
-    take,
-    write,
-)
+from pronk.links.dds.link import BAD_PARAMETER, DONE, UNKNOWN_API, take, write
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
-MODES = ("", "normal", "ai", "advanced", "mcf")
-"""Controllers of a Go2 that can hold its joints; the first is none."""
-_SERVICE_POLLS = 20
-"""Looks for commands to one for requests: 10 ms at the virtual robot's rate."""
+MODES = ("", "normal", "ai", "advanced", "mcf")  # that can hold the joints; the first is none
+_SERVICE_POLLS = 20  # polls of commands to one of requests: 10 ms at the virtual robot's rate
 
 
 class DdsServerTransport(ServerTransport):
@@ -39,12 +21,14 @@ class DdsServerTransport(ServerTransport):
 
     def __init__(self, robot: RobotSpec, *, domain: int | None = None, mode: str = "") -> None:
         """Join a domain, with the controller that holds the joints at first."""
-        network = DdsNetwork(domain=domain)
+        network = link.DdsNetwork(domain=domain)
         super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
-        own = Participant(network)
-        self._commands = own.reader(COMMANDS, codec.LowCmd)
-        self._states = own.writer(STATES, codec.LowState)
+        # Another writer is another participant.
+        own, other = link.Participant(network), link.Participant(network)
+        self._commands = own.reader(link.COMMANDS, codec.LowCmd)
+        self._states = own.writer(link.STATES, codec.LowState)
+        self._other = other.writer(link.COMMANDS, codec.LowCmd)
         # A handler takes a function's number and its parameter, and returns code and data.
         self._services = [
             (
@@ -52,10 +36,8 @@ class DdsServerTransport(ServerTransport):
                 own.writer(f"rt/api/{name}/response", codec.Response),
                 handler,
             )
-            for name, handler in ((SWITCHER, self._switch), (BENCH, self._bench))
+            for name, handler in ((link.SWITCHER, self._switch), (link.BENCH, self._bench))
         ]
-        # Another writer is another participant.
-        self._other = Participant(network).writer(COMMANDS, codec.LowCmd)
         self._polls = 0
 
     def poll(self) -> list[Command]:
@@ -84,7 +66,6 @@ class DdsServerTransport(ServerTransport):
         del self._commands, self._states, self._services, self._other
 
     def _respond(self) -> None:
-        """Respond to the requests that have come."""
         for requests, responses, handler in self._services:
             for request in take(requests, self.counts):
                 identity = request.header.identity
@@ -103,12 +84,12 @@ class DdsServerTransport(ServerTransport):
 
     def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
         """The service that reports and changes which controller holds the joints."""
-        if api_id == CHECK_MODE:
+        if api_id == link.CHECK_MODE:
             return DONE, {"form": "0", "name": self.mode}
-        if api_id not in (RELEASE_MODE, SELECT_MODE):
+        if api_id not in (link.RELEASE_MODE, link.SELECT_MODE):
             return UNKNOWN_API, None
         name = ""
-        if api_id == SELECT_MODE:
+        if api_id == link.SELECT_MODE:
             name = parameter.get("name", "") if isinstance(parameter, dict) else ""
             if name not in MODES[1:]:
                 return BAD_PARAMETER, None
@@ -118,7 +99,7 @@ class DdsServerTransport(ServerTransport):
 
     def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
         """The service that holds joints mechanically."""
-        if api_id != CLAMP:
+        if api_id != link.CLAMP:
             return UNKNOWN_API, None
         joints = parameter.get("joints") if isinstance(parameter, dict) else None
         if not isinstance(joints, list) or not all(name in self._names for name in joints):

@@ -24,10 +24,9 @@ T = TypeVar("T")
 _Span = Annotated[float, Meta(ge=0.0, le=1e9)]
 _Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 
-# Times in a specification may carry a unit; how many make a second.
-_UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0, "": 1.0}
+_UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0, "": 1.0}  # how many make a second
+# Of the gamma distribution of the jitter: few messages are on time, and some are very late.
 _JITTER_SHAPE = 2.0
-"""Of the gamma distribution of the jitter: few messages are on time, and some are very late."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,21 +47,21 @@ class ChannelFaults(Bounded):
     """That one bit of a message is inverted."""
 
 
-_JOINT = 3
-"""Joint of the faults of one encoder: the second leg's first, whose load changes least."""
-_DITHER = 1e-4
-"""Share of the live attitude in one that is stuck, so that it does not repeat."""
+_JOINT = 3  # of a faulty encoder: the second leg's first, whose load changes least
+_DITHER = 1e-4  # share of the live attitude in one that is stuck, so that it does not repeat
+_Changes = Callable[[State, State], dict[str, Any]]
 
 
-def _held(*names: str) -> Callable[[State, State], dict[str, Any]]:
+def _held(*names: str) -> _Changes:
     """Sources that repeat what they measured last."""
     return lambda last, state: {name: getattr(last, name) for name in names}
 
 
-def _encoder(last: State, state: State, *, position: float, velocity: float) -> dict[str, Any]:
-    q, v = state.position.copy(), state.velocity.copy()
-    q[_JOINT], v[_JOINT] = position, velocity
-    return {"position": q, "velocity": v}
+def _encoder(state: State, **readings: float) -> dict[str, Any]:
+    changed = {name: getattr(state, name).copy() for name in readings}
+    for name, value in readings.items():
+        changed[name][_JOINT] = value
+    return changed
 
 
 def _stuck(last: State, state: State) -> dict[str, Any]:
@@ -70,7 +69,7 @@ def _stuck(last: State, state: State) -> dict[str, Any]:
     return {"orientation": attitude / np.linalg.norm(attitude)}
 
 
-def _swapped(*joints: int) -> Callable[[State, State], dict[str, Any]]:
+def _swapped(*joints: int) -> _Changes:
     """The joints of these numbers, in place of those from 0 on."""
 
     def swapped(_last: State, state: State) -> dict[str, Any]:
@@ -80,7 +79,7 @@ def _swapped(*joints: int) -> Callable[[State, State], dict[str, Any]]:
     return swapped
 
 
-SENSOR_FAULTS: dict[str, Callable[[State, State], dict[str, Any]]] = {
+SENSOR_FAULTS: dict[str, _Changes] = {
     "imu-repeats": _held("orientation", "gyro", "accelerometer"),
     "attitude-repeats": _held("orientation"),
     "gyro-repeats": _held("gyro"),
@@ -91,14 +90,10 @@ SENSOR_FAULTS: dict[str, Callable[[State, State], dict[str, Any]]] = {
     "attitude-stuck": _stuck,
     "gyro-zero": lambda last, state: {"gyro": np.zeros(3)},
     "velocities-zero": lambda last, state: {"velocity": np.zeros_like(state.velocity)},
-    "encoder-jumps": lambda last, state: _encoder(
-        last, state, position=state.position[_JOINT] + 1.0, velocity=state.velocity[_JOINT]
-    ),
-    "encoder-zero": lambda last, state: _encoder(
-        last, state, position=0.0, velocity=state.velocity[_JOINT]
-    ),
+    "encoder-jumps": lambda last, state: _encoder(state, position=state.position[_JOINT] + 1.0),
+    "encoder-zero": lambda last, state: _encoder(state, position=0.0),
     "encoder-constant": lambda last, state: _encoder(
-        last, state, position=last.position[_JOINT], velocity=last.velocity[_JOINT]
+        state, position=last.position[_JOINT], velocity=last.velocity[_JOINT]
     ),
     "legs-swapped": _swapped(3, 4, 5, 0, 1, 2),
     "joints-swapped": _swapped(0, 2, 1),
@@ -182,8 +177,7 @@ class FaultChannel(Generic[T]):
 
     def __init__(self, faults: ChannelFaults, *, after: float, seed: int) -> None:
         """Begin empty; messages put in before `after` [s] pass unchanged."""
-        self.counts: Counter[str] = Counter()
-        """How many messages met each fault."""
+        self.counts: Counter[str] = Counter()  # messages that met each fault
         self._faults, self._after = faults, after
         self._rng, self._corrupting = (np.random.default_rng([seed, k]) for k in range(2))
         self._queue: list[tuple[float, int, T]] = []
@@ -198,21 +192,20 @@ class FaultChannel(Generic[T]):
         faults = self._faults
         lost, twice, swapped = self._rng.random(3) < (faults.loss, faults.duplicate, faults.reorder)
         late = self._rng.standard_gamma(_JITTER_SHAPE) / _JITTER_SHAPE * faults.jitter
+        due = now + faults.delay + late
         if lost:
             self.counts["lost"] += 1
-            return
-        due = now + faults.delay + late
-        if swapped and self._held is None:
+        elif swapped and self._held is None:
             self.counts["reordered"] += 1
             self._held = item
-            return
-        self._push(item, due)
-        if twice:
-            self.counts["duplicated"] += 1
+        else:
             self._push(item, due)
-        if self._held is not None:
-            self._push(self._held, due)
-            self._held = None
+            if twice:
+                self.counts["duplicated"] += 1
+                self._push(item, due)
+            if self._held is not None:
+                self._push(self._held, due)
+                self._held = None
 
     def due(self, now: float) -> list[T]:
         """Take out the messages due until `now` [s], in order."""

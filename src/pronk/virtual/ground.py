@@ -67,7 +67,7 @@ class Ground(Bounded):
     damping: Annotated[float, Meta(ge=0.0, le=1e5)] = 60.0
     """[N s/m]"""
     floor: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
-    """Height of the endless floor; below the blocks where there are gaps between them [m]."""
+    """Height of the endless floor, also between blocks [m]."""
     terrain: tuple[Box, ...] = ()
 
     def height(self, x: float, y: float) -> float:
@@ -84,29 +84,18 @@ class Ground(Bounded):
         """Put floor and blocks, which touch everything, into a mujoco.MjSpec."""
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = _IMPRATIO
-        solid = {"contype": 1, "conaffinity": 1, "condim": 3, "rgba": _COLOUR}
-        solid |= {"friction": (self.friction, 0.0, 0.0)}
-        spec.worldbody.add_geom(
-            name="floor",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=(0.0, 0.0, 1.0),
-            pos=(0.0, 0.0, self.floor),
-            **solid,
-        )
+        plane, block = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
+        solids = [("floor", plane, (0.0, 0.0, 1.0), (0.0, 0.0, self.floor))]
         for index, box in enumerate(self.terrain):
-            spec.worldbody.add_geom(
-                name=f"block_{index}",
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=box.half_size,
-                pos=box.center,
-                **solid,
-            )
+            solids.append((f"block_{index}", block, box.half_size, box.center))
+        friction = (self.friction, 0.0, 0.0)
+        for name, kind, size, place in solids:
+            geom = spec.worldbody.add_geom(name=name, type=kind, size=size, pos=place)
+            geom.contype, geom.conaffinity, geom.condim = 1, 1, 3
+            geom.rgba, geom.friction = _COLOUR, friction
 
     def set_down(self, model: Any, data: Any, feet: NDArray[np.intp], start: Start) -> None:
-        """Put a robot with a free trunk down, its lowest foot `start.drop` above the ground.
-
-        The joints are in their places in `data`; `feet` are geoms.
-        """
+        """Put a robot with a free trunk and its joints in place down; `feet` are geoms."""
         turn = 0.5 * start.yaw
         data.qpos[:3] = (*start.position, 0.0)
         data.qpos[3:7] = (math.cos(turn), 0.0, 0.0, math.sin(turn))
@@ -118,7 +107,7 @@ class Ground(Bounded):
         data.qpos[2] = start.drop - lowest
 
     def set_contact(self, model: Any, geoms: NDArray[np.intp]) -> None:
-        """Give the feet's geoms spring, damper and friction; refuse a spring too stiff to step."""
+        """Give the feet spring, damper and friction; refuse a spring too stiff to step."""
         d = _IMPEDANCE
         for geom in geoms:
             mobility = float(model.body_invweight0[model.geom_bodyid[geom], 0])
@@ -153,7 +142,7 @@ class Start(Bounded):
     """Time before the clock starts [s]."""
 
     def offset(self, joints: int) -> Array:
-        """The joint offset as an array [rad]; refuse another number of joints."""
+        """The joint offset as an array [rad]."""
         offset = np.zeros(joints) if self.joint_offset is None else np.array(self.joint_offset)
         if offset.shape != (joints,):
             raise RobotError(

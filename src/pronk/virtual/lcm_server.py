@@ -1,34 +1,20 @@
 """The robot's end of an LCM link, as of a Mini Cheetah or of the bridge on a Go1.
 
-Stricter than they are: a message that is not a possible command is refused and counted, where
-Cheetah-Software would pass it to the motors.
+A message that is not a possible command is refused and counted, where Cheetah-Software would pass
+it to the motors.
 """
 
 from __future__ import annotations
 
-from pronk.links.lcm.codec import (
-    BEACON_CHANNEL,
-    CONTROL_PARAMETER,
-    MODES,
-    RESPONSE_CHANNEL,
-    VIRTUAL_ROBOT,
-    clamp_message,
-    decode_command,
-    encode_command,
-    encode_state,
-    layout_of,
-    read_clamp_message,
-    read_mode_request,
-)
+from pronk.links.lcm import codec
+from pronk.links.lcm.codec import CONTROL_PARAMETER, VIRTUAL_ROBOT
 from pronk.links.lcm.link import open_lcm, url_of
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
-_BEACON_STATES = 50
-"""States between two beacons: 10 Hz."""
-_QUEUE = 1000
-"""Messages read in one poll; a sender of more cannot keep the robot from moving on."""
+_BEACON_STATES = 50  # states between two beacons: 10 Hz
+_QUEUE = 1000  # messages read in one poll; a sender of more cannot stop the robot's time
 
 
 class LcmServerTransport(ServerTransport):
@@ -47,8 +33,8 @@ class LcmServerTransport(ServerTransport):
 
         `mode` names the controller that holds the joints at first.
         """
-        super().__init__(robot, mode, MODES.values())
-        self._layout = known = layout_of(layout)
+        super().__init__(robot, mode, codec.MODES.values())
+        self._layout = known = codec.layout_of(layout)
         # Another writer is another sender.
         self._lcm, self._other = (open_lcm(url or url_of(port=port)) for _ in range(2))
         self._arrived: list[Command] = []
@@ -68,30 +54,31 @@ class LcmServerTransport(ServerTransport):
         """Take one message, whatever it is. Never raises."""
         with self.refusing():
             if channel == self._layout.command.channel:
-                self._arrived.append(decode_command(self._layout, self.corrupt_in(data)))
+                self._arrived.append(codec.decode_command(self._layout, self.corrupt_in(data)))
                 self.counts["commands"] += 1
             elif channel == CONTROL_PARAMETER.channel:
-                self.mode = read_mode_request(data)
+                self.mode = codec.read_mode_request(data)
                 self.counts["mode switches"] += 1
-                self._lcm.publish(RESPONSE_CHANNEL, data)
+                self._lcm.publish(codec.RESPONSE_CHANNEL, data)
             elif channel == VIRTUAL_ROBOT.channel:
-                self._bench_request, self.clamps = read_clamp_message(self._names, data)
+                self._bench_request, self.clamps = codec.read_clamp_message(self._names, data)
                 self._requested = True
 
     def publish(self, state: State) -> None:
         """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
         messages = (self._layout.attitude, self._layout.joints)
-        for message, data in zip(messages, encode_state(self._layout, state), strict=True):
+        for message, data in zip(messages, codec.encode_state(self._layout, state), strict=True):
             self._lcm.publish(message.channel, self.corrupt_out(data))
         if self._requested or self.counts["states"] % _BEACON_STATES == 0:
             self._requested = False
-            beacon = clamp_message(self._names, self.clamps, self._bench_request)
-            self._lcm.publish(BEACON_CHANNEL, beacon)
+            beacon = codec.clamp_message(self._names, self.clamps, self._bench_request)
+            self._lcm.publish(codec.BEACON_CHANNEL, beacon)
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
-        self._other.publish(self._layout.command.channel, encode_command(self._layout, command))
+        data = codec.encode_command(self._layout, command)
+        self._other.publish(self._layout.command.channel, data)
 
     def close(self) -> None:
         """Leave the wire."""

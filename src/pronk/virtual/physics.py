@@ -1,7 +1,6 @@
 """Simulation of a plant: commands arrive, the battery sags, samples of the capture are kept.
 
-Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks, which
-end where a state or a sample is due, or a command takes effect.
+Time is counted in physics steps from the clock's zero.
 """
 
 from __future__ import annotations
@@ -19,15 +18,13 @@ from pronk.virtual.capture import Capture, Recorder, capture_of
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import MachineParams
 
-_LEAST_SHARE = -0.5
-"""Bounds the bus voltage at twice the battery's, also where numbers run away."""
+_LEAST_SHARE = -0.5  # bounds the bus voltage at twice the battery's, also where numbers run away
 
 
 class Transport:
-    """Commands under way, in order of arrival. Time is counted in physics steps of `step_s`.
+    """Commands under way, in order of arrival; damping follows one that expires.
 
-    A command that expires, at `made + valid_for` and later by the delay, is followed by damping. A
-    newer command replaces an older one together with its expiry.
+    That is at `made + valid_for`, later by the delay, unless a newer command has replaced it.
     """
 
     def __init__(self, joints: int, delay_s: float, step_s: float) -> None:
@@ -61,18 +58,14 @@ class Transport:
 
 
 class Physics:
-    """One run of a plant."""
+    """One run of a plant; `recorder` keeps the samples of a capture."""
 
     recorder: Recorder | None = None
-    """Keeps the samples of a capture."""
 
     def __init__(
         self, plant: Plant, machine: MachineParams, *, pose: Array, first_step: int
     ) -> None:
-        """Begin with links and rotors in a pose of all joints [rad] and the drives off.
-
-        `first_step` is negative before the clock's zero.
-        """
+        """Begin with links and rotors in a pose of all joints [rad] and the drives off."""
         self.plant, self._machine = plant, machine
         self.data = mujoco.MjData(plant.model)
         self.step = self._first = first_step
@@ -118,7 +111,7 @@ class Physics:
                 "gains."
             )
         if self.recorder is not None:
-            self.recorder.keep(rows[np.searchsorted(stops, due)])
+            self.recorder.keep(due, rows[np.searchsorted(stops, due)])
         return rows if len(stops) == len(steps) else rows[[stop in wanted for stop in stops]]
 
     def snapshot(self) -> Capture:
@@ -129,7 +122,7 @@ class Physics:
 
     def _obey(self, before: int, transport: Transport) -> float:
         """Apply the commands due before a physics step; return when the next one is due."""
-        while (arrived := transport.take(before)) is not None:
+        while arrived := transport.take(before):
             self._step_to(arrived[0])
             self.apply(arrived[1])
         return transport.soonest

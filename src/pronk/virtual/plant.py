@@ -46,12 +46,11 @@ Indices = NDArray[np.intp]
 
 # Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
 _STABLE = 1.0
-# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass as well, and
-# 1e-9 kg on the joint's axis is nothing beside the lightest link.
+# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass as well [kg].
 _ROTOR_MASS = 1e-9
 # Time in which a joint that has run into its stop is pushed back, 8 physics steps [s].
 _STOP_S = 2e-3
-# Joints of a stand that gives a little, and their axes.
+# Joints of a compliant stand, and their axes.
 _STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
 # Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
 _KP, _KD, _VMAX = 4, 6, 7
@@ -78,10 +77,7 @@ class Plant:
         timestep_s: float,
         ground: Ground | None = None,
     ) -> None:
-        """Build it: on the bench, base on the stand and feet in the air, or on `ground`.
-
-        `legs` of `legs_of(robot)` remain in the plant.
-        """
+        """Build it with these of `legs_of(robot)`, on the bench (no contacts) or on `ground`."""
         if sim_params.robot != robot.name:
             raise RobotError(
                 f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a "
@@ -159,12 +155,11 @@ class Plant:
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, inertia)
         mobility = np.diag(np.linalg.inv(inertia))
-        for name, joint, rotor, link in zip(
-            self.joints, joints, mobility[self.rotor], mobility[self.link], strict=True
-        ):
-            springs = {"belt_stiffness": rotor + link, "presliding_stiffness": rotor}
+        rotors, links = mobility[self.rotor], mobility[self.link]
+        springs = {"belt_stiffness": rotors + links, "presliding_stiffness": rotors}
+        for k, (name, joint) in enumerate(zip(self.joints, joints, strict=True)):
             for field, mobile in springs.items():
-                most = (_STABLE / model.opt.timestep) ** 2 / mobile
+                most = (_STABLE / model.opt.timestep) ** 2 / mobile[k]
                 if (value := getattr(joint, field)) > most:
                     raise RobotError(
                         f"joints.{name}.{field} is {value:g}; at a physics step of "
@@ -205,10 +200,9 @@ class Plant:
     def set_clamps(
         self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
     ) -> None:
-        """Hold the links of `joints` where they are in `q` with a fixture; release all others.
+        """Hold the links of `joints` where they are in `q`; release all others.
 
-        The fixture is a spring and damper [N m/rad, N m s/rad] between link and body, not a
-        constraint: it costs no solver iterations.
+        A spring and damper [N m/rad, N m s/rad] between link and body cost no solver iterations.
         """
         for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
             held = name in joints
@@ -223,7 +217,7 @@ def legs_of(robot: RobotSpec) -> tuple[str, ...]:
 
 
 def leg_of(robot: RobotSpec, name: str) -> str:
-    """Name the limb of a joint: the first part that its joints' names share, or its first joint."""
+    """The limb of a joint: the first part that its joints' names share, or its first joint."""
     joint = robot.joint(name)
     limb = [n for n in robot.joint_names if n in (name, *joint.chain, *joint.clamped)]
     first = {each.split("_")[0] for each in limb}
@@ -240,7 +234,7 @@ def motor_of(drive: Drive) -> tuple[float, float]:
 
 
 def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
-    """Give a joint of a spec its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
+    """Give a joint its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
     link = spec.joint(name)
     if link is None:
         raise RobotError(f"the robot's model has no joint {name!r}.")

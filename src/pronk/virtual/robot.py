@@ -1,7 +1,5 @@
 """The virtual robot, on the bench or on the ground: a `Machine` with `virtual` True.
 
-Physics runs in blocks (`physics.py`), and `sensors.py` makes measured states of each block.
-
 The physics step is 0.25 ms, and that has converged. On the bench the Bode gains of hip_roll,
 hip_pitch and knee differ by 0.004, 0.003 and 0.002 dB at most from those at 25 us (40 kHz, the rate
 of the robot's own drives, S4) over 0.1 to 15 Hz, thanks to the second-order corrections that
@@ -31,10 +29,8 @@ from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.sensors import Sensors
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
-TIMESTEP_S = 0.25e-3
-"""Physics step; see the module's docstring for why it suffices."""
-_SETTLE_S = 2.0
-"""Time before the clock starts, on the bench: the legs settle into their drives' hold."""
+TIMESTEP_S = 0.25e-3  # of physics; see the module's docstring for why it suffices
+_SETTLE_S = 2.0  # before the clock starts, on the bench: the legs settle into their drives' hold
 
 
 def hold_of(robot: RobotSpec) -> Command:
@@ -51,7 +47,6 @@ class VirtualRobot:
 
     The clock starts at 0 when connected, with every drive holding the default pose at the robot's
     own gains. Same parameters, seed, calls: same numbers, however `wait` is cut into pieces.
-    A robot that has fallen goes on being simulated.
     """
 
     virtual = True
@@ -78,14 +73,14 @@ class VirtualRobot:
             sim_params: How the machine differs from `robot`.
             seed: Of all noise.
             base: `bench`: the body is fixed to its stand; `ground`: it moves freely.
-            ground: None is the parameters' own floor. On the ground only.
-            start: None is in the default pose at the origin. On the ground only.
-            log_rate_hz: States per second.
-            capture_rate_hz: Samples per second of `capture`, on the ground; None keeps none (a
-                second takes 0.7 MB at 1 kHz).
+            ground: By default the parameters' own floor.
+            start: By default in the default pose at the origin.
+            log_rate_hz: Of states.
+            capture_rate_hz: Of `capture`, on the ground; None keeps none (a second takes 0.7 MB at
+                1 kHz).
             legs: To simulate on the bench; None for all. Joints of absent legs report their
                 default position and no speed.
-            timestep_s: Physics step.
+            timestep_s: Of physics.
         """
         known = legs_of(robot)
         if base not in ("bench", "ground"):
@@ -110,8 +105,7 @@ class VirtualRobot:
         self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
         self.state_rate_hz, self._dt = log_rate_hz, timestep_s
-        self.capture_rate_hz = capture_rate_hz
-        """Has an effect until connected."""
+        self.capture_rate_hz = capture_rate_hz  # has an effect until connected
         self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
         self._recorder: Recorder | None = None
         self._open = False
@@ -130,12 +124,11 @@ class VirtualRobot:
         # Steps are counted from the clock's zero; settling happens before it.
         first_step = -round(settle / self._dt)
         self._physics = Physics(plant, machine, pose=pose, first_step=first_step)
-        self._recorder = self._physics.recorder = None
         if self._ground is not None:
             self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
             if self.capture_rate_hz is not None:
-                self._recorder = Recorder(plant, 1.0 / self.capture_rate_hz)
-                self._physics.recorder = self._recorder
+                self._physics.recorder = Recorder(plant, 1.0 / self.capture_rate_hz)
+        self._recorder = self._physics.recorder
         self._physics.apply(replace(hold_of(robot), position=pose))
         self._now = 0.0
         self._open = True
@@ -147,7 +140,7 @@ class VirtualRobot:
         return self._now
 
     def latest(self) -> State:
-        """The newest state, without waiting."""
+        """The newest state."""
         self._check_open()
         return self._latest
 
@@ -173,7 +166,7 @@ class VirtualRobot:
         self._transport.put(command, self._now)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
-        """Fix links where they are; () frees all. On the bench only."""
+        """Fix links where they are, on the bench; () frees all."""
         self._check_open()
         if self._ground is not None:
             raise HardwareError(
@@ -182,8 +175,8 @@ class VirtualRobot:
             )
         for name in joints:
             self._robot.joint(name)
-        fixture = self._sim_params.machine.clamp_stiffness, self._sim_params.machine.clamp_damping
-        self._plant.set_clamps(joints, self._physics.data.qpos, *fixture)
+        machine, q = self._sim_params.machine, self._physics.data.qpos
+        self._plant.set_clamps(joints, q, machine.clamp_stiffness, machine.clamp_damping)
 
     def damp(self) -> None:
         """Damp the joints without stiffness."""
@@ -191,10 +184,7 @@ class VirtualRobot:
         self._transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self) -> Capture:
-        """Motion capture up to the physics step reached; also after `close`.
-
-        The step reached is behind `now` by the measurement delay.
-        """
+        """Motion capture up to the step reached, `now` less the delay; also after `close`."""
         if self._recorder is None:
             raise HardwareError(
                 "nothing was captured; connect a virtual robot with base='ground' and a "
@@ -220,7 +210,6 @@ class VirtualRobot:
             raise HardwareError("the virtual robot is not connected; call connect() first.")
 
     def _run(self, count: int) -> list[State]:
-        """Advance over the next `count` ticks and return their states."""
         first = self._sensors.sequence
         ticks = np.arange(first, first + count) / self.state_rate_hz
         # A state was measured some time before its timestamp.

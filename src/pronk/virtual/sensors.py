@@ -6,9 +6,8 @@ current times the constant that the drive assumes. The accelerometer gives the m
 state, as a unit that integrates does. The attitude filter has a constant error, a slowly varying
 one, and an arbitrary heading. Timestamps jitter.
 
-A block of ticks is read at once; reading the same ticks in other blocks gives the same numbers.
-Quaternions are rows w, x, y, z. Their algebra is written out here, for a general library is slow on
-the few rows of a block.
+Reading the same ticks in other blocks gives the same numbers. Quaternions are rows w, x, y, z;
+their algebra is written out here, for a general library is slow on the few rows of a block.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from pronk.virtual.plant import Plant, RawStates
 from pronk.virtual.sim_params import SimParams
 
 _GRAVITY = 9.81
-_AHEAD = 512
-"""Ticks of noise that are computed at once."""
+_AHEAD = 512  # ticks of noise that are computed at once
 
 # Row k: what Hamilton's product makes of part k of its left factor.
 _FACTORS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
@@ -113,20 +111,17 @@ class NoiseSource:
         size = np.repeat([machine.position_noise, off.noise], each)
         self._fresh = size * np.sqrt(1.0 - self._keep**2)
         self._last = np.zeros(joints + 3)
-        self._drawn = self._next = 0
+        self._drawn = 0
         self._table = self._draw(_AHEAD)
 
     def take(self, count: int) -> Noise:
         """The noise of the next `count` ticks."""
-        left = len(self._table.jitter) - self._next
-        if count > left:
-            more = self._draw(max(count - left, _AHEAD))
-            pairs = zip(self._table, more, strict=True)
-            self._table = Noise(*(np.concatenate([old[self._next :], new]) for old, new in pairs))
-            self._next = 0
-        rows = slice(self._next, self._next + count)
-        self._next += count
-        return Noise(*(part[rows] for part in self._table))
+        if (lacking := count - len(self._table.jitter)) > 0:
+            more = self._draw(max(lacking, _AHEAD))
+            self._table = Noise(*map(np.concatenate, zip(self._table, more, strict=True)))
+        taken = Noise(*(part[:count] for part in self._table))
+        self._table = Noise(*(part[count:] for part in self._table))
+        return taken
 
     def _draw(self, n: int) -> Noise:
         machine, off, joints = self._machine, self._filter, self._joints
@@ -172,13 +167,11 @@ class Sensors:
         gears = np.array([robot.joint(name).drive.gear_ratio for name in plant.joints])
         self._count = 2.0 * math.pi / 2.0**self._machine.encoder_bits / gears
         self._noise = NoiseSource(sim_params, len(robot.joints), rate_hz=rate_hz, seed=seed)
-        self._trunk: Array | None = None
-        """Orientation and velocity of the trunk at the last state."""
-        self.sequence = 0
-        """Number of the next state."""
+        self._trunk: Array | None = None  # its orientation and velocity at the last state
+        self.sequence = 0  # of the next state
 
     def read(self, tick: Array, instant: Array, raw: RawStates) -> list[State]:
-        """Make the states of n ticks [s] on the machine's clock; absent joints rest in their pose.
+        """Make the states of n ticks [s]; absent joints rest in their pose.
 
         `instant` and `raw` are of the physics steps nearest to the measurements [s].
         """
@@ -199,8 +192,10 @@ class Sensors:
         velocity += noise.velocity[:, plant.columns]
         torque = raw.torque / self._scale + noise.torque[:, plant.columns]
         true_orientation, rate, force = self._motion(raw)
+        first, self.sequence = self.sequence, self.sequence + len(tick)
         columns: dict[str, Any] = {
             "time": stamp.tolist(),
+            "sequence": range(first, self.sequence),
             "position": self._spread(position, self._default),
             "velocity": self._spread(velocity, 0.0),
             "torque": self._spread(torque, 0.0),
@@ -210,11 +205,7 @@ class Sensors:
             "orientation": product(noise.heading, product(true_orientation, noise.tilt)),
         }
         rows = zip(*columns.values(), strict=True)
-        first, self.sequence = self.sequence, self.sequence + len(tick)
-        return [
-            State(sequence=first + k, **dict(zip(columns, row, strict=True)))
-            for k, row in enumerate(rows)
-        ]
+        return [State(**dict(zip(columns, row, strict=True))) for row in rows]
 
     def _motion(self, raw: RawStates) -> tuple[Array, Array, Array]:
         """Orientation (n, 4), rate (n, 3) and specific force (n, 3) of the trunk."""
@@ -225,9 +216,9 @@ class Sensors:
             self._trunk = now[-1:]
             force = moving_force(path[:, 4:], path[:, :4], self._period)
             return orientation, raw.velocity[:, 3:6], force
-        stand = self._plant.stand
-        tilt = raw.position[:, stand] if len(stand) else np.zeros((len(raw.position), 3))
-        rate = raw.velocity[:, stand] if len(stand) else tilt
+        tilt = rate = np.zeros((len(raw.position), 3))
+        if len(stand := self._plant.stand):
+            tilt, rate = raw.position[:, stand], raw.velocity[:, stand]
         roll, pitch, _ = tilt.T  # small
         force = _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)
         return of_vector(tilt), rate, force

@@ -1,7 +1,6 @@
 """The virtual robot as a machine of its own: real time, a wire, and its faults.
 
-`RobotServer` runs a virtual robot on the wall clock, passes it the commands of the wire, and puts
-its states on the wire. The drives' PD runs inside physics at 4 kHz.
+The drives' PD runs inside physics at 4 kHz.
 """
 
 from __future__ import annotations
@@ -21,19 +20,16 @@ from msgspec import Meta
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, Machine, RefusedError, State, damping_command
-from pronk.links.realtime import Histogram
+from pronk.links.realtime import Histogram, sleep_until
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.bounds import Bounded
 from pronk.virtual.faults import FaultChannel, Faults, flip_bit, spoiled
 
 Corrupt = Callable[[bytes], bytes]
 
-TICK_S = 0.5e-3
-"""Period of polling the wire: commands act on the machine at a multiple of this."""
-_CONTEND_S = 0.01
-"""Between two commands of the rival and of the robot's own controller."""
-_SLIP_S = 0.1
-"""Lateness beyond which the machine's clock is put back instead of catching up."""
+TICK_S = 0.5e-3  # period of polling the wire: commands act on the machine at a multiple of this
+_CONTEND_S = 0.01  # between two commands of the rival and of the robot's own controller
+_SLIP_S = 0.1  # lateness beyond which the machine's clock is put back instead of catching up
 _BROKEN_FIELDS = ("position", "velocity", "gyro", "accelerometer", "orientation")
 
 
@@ -51,21 +47,18 @@ class ServerTransport(ABC):
                 f"mode {mode!r}; expected one of {', '.join(filter(None, modes))}, or none for "
                 "released."
             )
+        # `commands`, `states`, and one `refused: REASON` for each reason to refuse.
         self.counts: Counter[str] = Counter()
-        """`commands`, `states`, and one `refused: REASON` for each reason to refuse."""
-        self.mode = mode
-        """Name of the robot's own controller that holds the drives; empty when it is released."""
-        self.clamps: tuple[str, ...] = ()
-        """Joints to hold mechanically, as requested over the wire."""
+        self.mode = mode  # the robot's own controller that holds the drives; "" when released
+        self.clamps: tuple[str, ...] = ()  # joints to hold mechanically, requested over the wire
+        # Applied to the bytes of commands before any check, and of states with their checksum.
         self.corrupt_in: Corrupt = bytes
-        """Applied to the bytes of every command that comes in, before anything is checked."""
         self.corrupt_out: Corrupt = bytes
-        """Applied to the bytes of every state that goes out, after its checksum is in."""
         self._names = robot.joint_names
 
     @abstractmethod
     def poll(self) -> list[Command]:
-        """Commands that arrived since the last poll, oldest first, in the robot's joint order."""
+        """Commands that arrived since the last poll, oldest first."""
 
     @abstractmethod
     def publish(self, state: State) -> None:
@@ -100,7 +93,7 @@ class Watchdog(Bounded):
 
 
 class RobotServer:
-    """A virtual robot behind a wire."""
+    """A connected virtual robot behind a wire."""
 
     def __init__(
         self,
@@ -112,12 +105,8 @@ class RobotServer:
         watchdog: Watchdog | None = None,
         seed: int = 0,
     ) -> None:
-        """Put a connected virtual robot behind a wire.
-
-        `hold` is the command of a rival and of the robot's own controller, `seed` of the faults.
-        """
-        self.counts: Counter[str] = Counter()
-        """Of the server: `commands applied`, `silences`, `slips`."""
+        """`hold` is commanded by a rival and the robot's own controller; `seed` is of faults."""
+        self.counts: Counter[str] = Counter()  # `commands applied`, `silences`, `slips` and others
         self._machine, self._wire, self._hold = machine, wire, hold
         self._faults = known = faults or Faults()
         self._watchdog = watchdog or Watchdog()
@@ -128,11 +117,10 @@ class RobotServer:
         self._contended = -math.inf
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
-        self._sound: State | None = None
-        """The last state before a sensor's fault."""
+        self._sound: State | None = None  # the last state before a sensor's fault
         self._sensor = known.sensor
+        # From the begin of a sensor's fault to the first damping; None before that [s].
         self.damped_s: float | None = None
-        """From the begin of a sensor's fault to the first damping; None before that [s]."""
         self._slipped, self._worked = 0.0, time.process_time()
         self._late = Histogram()
         wire.corrupt_in = partial(self._flip, self._commands)
@@ -150,10 +138,8 @@ class RobotServer:
             began = math.inf if self._sensor is None else self._sensor[1]
             if self.damped_s is None and until >= began and not command.stiffness.any():
                 self.damped_s = until - began
-        if (
-            until - self._last_command > self._watchdog.silence_after
-            and self._watchdog.silence != "hold"
-        ):
+        silent = until - self._last_command > self._watchdog.silence_after
+        if silent and self._watchdog.silence != "hold":
             self.counts["silences"] += 1
             self._last_command = math.inf
             damping = 1.0 if self._watchdog.silence == "damp" else 0.0
@@ -186,11 +172,9 @@ class RobotServer:
         ticks = round(self._machine.now() / TICK_S)
         while not stop():
             ticks += 1
+            sleep_until(start + ticks * TICK_S)
             late = time.monotonic() - start - ticks * TICK_S
-            if late < 0.0:
-                time.sleep(-late)
-                late = time.monotonic() - start - ticks * TICK_S
-            elif late > _SLIP_S:
+            if late > _SLIP_S:
                 self.counts["slips"] += 1
                 self._slipped += late
                 start += late
@@ -213,7 +197,6 @@ class RobotServer:
         }
 
     def _contend(self, now: float) -> None:
-        """Command as the robot's own controller and the rival, where there are any."""
         rival = self._faults.rival is not None and now >= self._faults.rival
         if (rival or self._wire.mode) and now - self._contended >= _CONTEND_S:
             self._contended = now

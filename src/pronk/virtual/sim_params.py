@@ -1,11 +1,7 @@
-"""The hidden parameters of a virtual robot.
+"""The hidden parameters of a virtual robot: how it differs from the model of match and training.
 
-They hold how the virtual robot differs from the model that is matched and trained in; `pronk.match`
-and `pronk.train` cannot import this module. `trunk`, `attitude` and `ground` have no effect on the
-bench and have defaults.
-
-Joint quantities are in joint coordinates (through the gear) unless the name contains motor.
-Vectors are in the trunk's frame: x forward, y left, z up.
+Joint quantities are in joint coordinates (through the gear) unless noted otherwise. Vectors are in
+the trunk's frame: x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -166,7 +162,6 @@ class SimParams:
     """All hidden parameters of a virtual robot."""
 
     robot: str
-    """Name of the robot whose structure it has."""
     machine: MachineParams
     joints: Mapping[str, JointParams]
     trunk: TrunkParams = field(default_factory=TrunkParams)
@@ -186,13 +181,12 @@ class SimParams:
 
 
 def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
-    """Copy parameters with a few numbers changed; refuse an unknown name or an impossible value.
+    """Copy parameters with other numbers; refuse an unknown name or an impossible value.
 
-    `changes` are `trunk_mass_offset` [kg], `friction` (of the ground), or numbers of
-    `MachineParams`, as `command_delay_s` or `bus_voltage`.
+    `changes` are `trunk_mass_offset` [kg], `friction` (of the ground), or of `MachineParams`.
     """
-    numbers = [f.name for f in fields(MachineParams) if not f.name.endswith("_bias")]
     places = {"trunk_mass_offset": ("trunk", "mass_offset"), "friction": ("ground", "friction")}
+    numbers = [f.name for f in fields(MachineParams) if not f.name.endswith("_bias")]
     places |= {name: ("machine", name) for name in numbers}
     for name, value in changes.items():
         if name not in places:
@@ -237,7 +231,7 @@ def parse_sim_params(body: Any, source: str) -> SimParams:
 def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = None) -> SimParams:
     """Read a parameter file, by default the shipped one, whose match is the paper's Table I.
 
-    Without a file, those of a `robot` other than the shipped one's are `default_sim_params`.
+    Without a file, those of another `robot` are `default_sim_params`.
     """
     if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
         return default_sim_params(robot)
@@ -246,21 +240,15 @@ def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = No
     return parse_sim_params(body, str(path))
 
 
-_RING_HZ = 100.0
-"""Frequency at which rotor and link ring against each other; above all excitation."""
-_PRESLIDING_RAD = 1e-3
-"""Deflection at which dry friction breaks away."""
+_RING_HZ = 100.0  # of rotor and link against each other; above all excitation
+_PRESLIDING_RAD = 1e-3  # deflection at which dry friction breaks away
 
 
 def default_sim_params(robot: RobotSpec) -> SimParams:
     """Derive the hidden parameters of a robot that has no file of its own, for the bench.
 
-    Tolerances are of the size that the virtual Mini Cheetah has: torque 10 % over and link inertia
-    3 % under the model's, rotor inertia 10 % under the drive's (a tenth of the link's where the
-    model has none), dry friction 20 % under (at least 0.2 % of the effort limit), break-away 25 %
-    above that, viscous friction 20 % over; belt at 100 Hz with 4 % of critical damping; encoders
-    off by 1 mrad. Timing and noise are those of the shipped file, the encoders as fine at the joint
-    as its hips'.
+    Tolerances are of the size that the virtual Mini Cheetah has. Timing and noise are those of the
+    shipped file, the encoders as fine at the joint as its hips'.
     """
     shipped = load_sim_params(SHIPPED).machine
     drives = [joint.drive for joint in robot.joints]
@@ -286,7 +274,7 @@ def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
     # Inertia of the link at the belt, the others of its chain free to move.
     link = 1.0 / float(np.linalg.inv(full)[dof, dof]) - float(model.dof_armature[dof])
     link = max(link, 0.1 * float(full[dof, dof] - model.dof_armature[dof]))
-    rotor = 0.9 * joint.drive.armature or 0.1 * link
+    rotor = 0.9 * joint.drive.armature or 0.1 * link  # where the model has none
     reduced = rotor * link / (rotor + link)
     belt = (2.0 * math.pi * _RING_HZ) ** 2 * reduced
     coulomb = max(0.8 * joint.drive.frictionloss, 0.002 * joint.drive.effort_limit)
@@ -297,7 +285,7 @@ def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
         link_inertia_scale=0.97,
         rotor_inertia=rotor / joint.drive.gear_ratio**2,
         belt_stiffness=belt,
-        belt_damping=0.08 * math.sqrt(belt * reduced),
+        belt_damping=0.08 * math.sqrt(belt * reduced),  # 4 % of critical
         coulomb=coulomb,
         breakaway=1.25 * coulomb,
         stribeck_speed=0.15,

@@ -194,14 +194,11 @@ def unpack(message: Any, data: bytes) -> NDArray[Any]:
 # --- States and commands ------------------------------------------------------------------------
 
 HEAD = (0xFE, 0xEF)
-LOW_LEVEL = 0xFF
-"""`level_flag` of a command to the motors."""
-SERVO = 0x01
-"""`mode` of a motor that is on."""
+LOW_LEVEL = 0xFF  # `level_flag` of a command to the motors
+SERVO = 0x01  # `mode` of a motor that is on
+# `q` and `dq` of a motor whose position or speed is not controlled (PosStopF, VelStopF).
 POS_STOP, VEL_STOP = 2.146e9, 16000.0
-"""`q` and `dq` of a motor whose position or speed is not controlled (PosStopF, VelStopF)."""
-VIRTUAL = (0x4E4F5250, 0x4D49534B)
-"""`sn` that identifies a virtual robot: `PRONKSIM`."""
+VIRTUAL = (0x4E4F5250, 0x4D49534B)  # `sn` that identifies a virtual robot: `PRONKSIM`
 TICKS_PER_S = 1000
 STATE_RATE_HZ = 500.0
 _JOINTS = 12
@@ -214,12 +211,9 @@ _MOST = {"position": 4.0 * math.pi, "stiffness": 1000.0, "damping": 100.0}
 class JointMap(NamedTuple):
     """How a robot's joints and the motors of a message correspond."""
 
-    sign: Array
-    """A motor's angle is sign times the joint's, shape (12,)."""
-    sink_damping: float
-    """Damping with which the joints sink softly [N m s/rad]."""
-    virtual_only: bool
-    """True where no real robot of this name uses these messages."""
+    sign: Array  # a motor's angle is sign times the joint's, shape (12,)
+    sink_damping: float  # with which the joints sink softly [N m s/rad]
+    virtual_only: bool  # no real robot of this name uses these messages
 
 
 _MAPS = {
@@ -318,8 +312,7 @@ class StateDecoder(StateNumbering):
     def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
         per_state = round(TICKS_PER_S / STATE_RATE_HZ)
         super().__init__(counts, STATE_RATE_HZ, per_state=per_state, bits=32)
-        self.virtual = False
-        """Whether the last message was a virtual robot's."""
+        self.virtual = False  # whether the last message was a virtual robot's
         self._joints = joints
 
     def take(self, data: bytes, arrived: float) -> State | None:

@@ -36,10 +36,8 @@ from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_d
 from pronk.links.machine import damping_command
 from pronk.robots.robot import RobotSpec
 
-COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
-"""Topics."""
-LOOPBACK_DOMAIN = 77
-"""pronk's own; Unitree's robots use 0, unitree_mujoco 1."""
+COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"  # topics
+LOOPBACK_DOMAIN = 77  # pronk's own; Unitree's robots use 0, unitree_mujoco 1
 ROBOT_DOMAIN = 0
 _DOMAINS = range(233)  # the ports of higher ones would exceed 65535
 _QUEUE = 64  # messages kept between two reads; at 500 Hz an eighth of a second
@@ -55,21 +53,17 @@ _LOCAL = """<CycloneDDS><Domain Id="any"><General>
 <MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
+# Domains that this process has opened; the library holds one configuration for each.
 _domains: dict[int, tuple[DdsNetwork, Any]] = {}
-"""Domains that this process has opened; the library holds one configuration for each."""
 
 SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
 OLDER, SERVICE_SWITCH = "robot_state", 1001
-BENCH, CLAMP = "pronk_bench", 1
-"""Of the virtual robot alone: requests for clamps."""
-DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204
-"""Codes of a response, the errors as in unitree_sdk2."""
+BENCH, CLAMP = "pronk_bench", 1  # of the virtual robot alone: requests for clamps
+DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204  # codes of a response, as in unitree_sdk2
 
 _POLL_S = 0.002
 _RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
-
-_LONGEST_BURST_S = 0.1
-_LONGEST_PAUSE_S = 0.05
+_LONGEST_BURST_S, _LONGEST_PAUSE_S = 0.1, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +71,9 @@ class DdsNetwork:
     """A domain on an interface."""
 
     interface: str | None = None
-    """Network interface by name, for instance `eth0`; None for loopback only."""
+    """By name, for instance `eth0`; None for loopback only."""
     domain: int | None = None
-    """DDS domain; None for 0 where an interface is named, else pronk's own, 77."""
+    """None for 0 where an interface is named, else pronk's own, 77."""
 
     def __post_init__(self) -> None:
         domain = port_or_domain(
@@ -202,12 +196,13 @@ class Client:
 
     def _data(self, api_id: int, response: Any) -> dict[str, Any]:
         code, data = response.header.status.code, None
+        got = f"code {code}"
         if code == DONE:
+            got = f"{response.data[:60]!r}"
             with contextlib.suppress(ValueError):
                 data = json.loads(response.data or "{}") or {}
             if isinstance(data, dict):
                 return data
-        got = f"code {code}" if code != DONE else f"{response.data[:60]!r}"
         raise HardwareError(
             f"the robot's service {self._service} returned {got} for function {api_id}, expected "
             "code 0 and a JSON object; switch by the robot's own remote or app instead."
@@ -215,10 +210,7 @@ class Client:
 
 
 def check_own_controller(participant: Participant, *, release: bool) -> None:
-    """Check that none of the robot's own controllers holds the joints; `release` one that does.
-
-    HardwareError: one may not be, or could not be, released; or the robot does not respond.
-    """
+    """Check that none of the robot's own controllers holds the joints; `release` one that does."""
     switcher = Client(participant, SWITCHER)
     response = switcher.call(CHECK_MODE, {})
     if response is None:
@@ -265,16 +257,14 @@ class DdsMachine(NetworkLink):
         """Describe the link on a `DdsNetwork`; `common` is as of `NetworkLink`."""
         super().__init__(robot, **common)
         self._joints = joint_map(robot)
-        self._damping = self._joints.sink_damping
+        self._sinking = damping_command(len(robot.joints), self._joints.sink_damping)
         self._network = DdsNetwork(interface=interface, domain=domain)
         self._command_topic, self._address = COMMANDS, f"{STATES} in {self._network}"
 
     def open_damper(self) -> Callable[[], None]:
         """Join the domain by itself, and return what writes damping."""
-        own = Participant(self._network)
-        out = own.writer(COMMANDS, codec.LowCmd)
-        damping = damping_command(len(self._robot.joints), self._damping)
-        data = encode_command(self._joints, damping)
+        out = Participant(self._network).writer(COMMANDS, codec.LowCmd)
+        data = encode_command(self._joints, self._sinking)
         return lambda: write(out, data, self.counts)
 
     def _open(self) -> tuple[Encode, Publish]:
@@ -306,7 +296,7 @@ class DdsMachine(NetworkLink):
 
     @property
     def sources(self) -> int:
-        """Senders of states since the link was opened."""
+        """Senders of states."""
         return len(self._senders)
 
     def _hold(self, joints: tuple[str, ...]) -> bool:

@@ -46,11 +46,11 @@ class Message:
     """A type of message: its fingerprint (8 bytes), then its fields, big-endian without padding.
 
     The fingerprint is a hash of the fields' names, types and lengths. Two stacks use the same names
-    and channels for different layouts, so the fingerprint alone identifies a message.
+    and channels for different layouts, so it alone identifies a message.
     """
 
     def __init__(self, name: str, channel: str, layout: str) -> None:
-        """Read a layout in LCM's own language, `float q[12]; int64_t id`; `name` is STACK.NAME."""
+        """Read a layout in LCM's own language, `float q[12]; int64_t id`."""
         self.name, self.channel, self.layout = name, channel, layout
         columns: list[Any] = [("_fingerprint", ">u8")]
         value = 0x12345678
@@ -63,10 +63,9 @@ class Message:
                 value = ((value << 8) ^ (signed >> 55)) + byte & _WORD
         self.fingerprint = (value << 1 | value >> 63) & _WORD
         self.dtype = np.dtype(columns)
-        """The whole message as a NumPy record."""
 
     def encode(self, **values: ArrayLike) -> bytes:
-        """Encode a message; fields that are not named are 0, scalars fill arrays."""
+        """Encode fields, by default 0; scalars fill arrays."""
         record = np.zeros((), self.dtype)
         record["_fingerprint"] = self.fingerprint
         for name, value in values.items():
@@ -158,14 +157,10 @@ class Layout:
     command: Message
     joints: Message
     attitude: Message
-    fields: Mapping[str, str]
-    """Names on the wire."""
-    numbered: bool
-    """Commands and states carry `timestamp_us` and `id`."""
-    signs: Array
-    """pronk's angles are signs times the wire's, shape (12,)."""
-    gains: Array
-    """The wire's stiffness and damping per the joint's own [1], shape (12,)."""
+    fields: dict[str, str]  # names on the wire
+    numbered: bool  # commands and states carry `timestamp_us` and `id`
+    signs: Array  # pronk's angles are signs times the wire's, shape (12,)
+    gains: Array  # the wire's stiffness and damping per the joint's own [1], shape (12,)
     torque_kind: TorqueKind
     state_rate_hz: float = 500.0
 
@@ -199,7 +194,6 @@ WTW = Layout(
     torque_kind="measured",
 )
 LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
-"""By name; `spi` is another name of `cheetah`."""
 
 
 def layout_of(name: str) -> Layout:
@@ -249,10 +243,8 @@ def decode_command(layout: Layout, data: bytes) -> Command:
     """
     message = layout.command
     fields = message.decode(data)
-    position = _in_range("position", fields["q_des"], message)
-    stiffness, damping = (
-        _in_range(name, fields[layout.fields[name]], message) for name in ("stiffness", "damping")
-    )
+    wire = layout.fields | {"position": "q_des"}
+    found = _decoded(message, fields, wire, "position", "stiffness", "damping")
     # Of Cheetah-Software's message the robot reads nothing else.
     if layout is WTW and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
         raise RefusedError(
@@ -261,9 +253,9 @@ def decode_command(layout: Layout, data: bytes) -> Command:
             "are understood.",
         )
     return Command(
-        position=position * layout.signs,
-        stiffness=stiffness / layout.gains,
-        damping=damping / layout.gains,
+        position=found["position"] * layout.signs,
+        stiffness=found["stiffness"] / layout.gains,
+        damping=found["damping"] / layout.gains,
         sequence=int(fields["id"]) if layout.numbered else 0,
         made=1e-6 * int(fields["timestamp_us"]) if layout.numbered else 0.0,
     )
@@ -279,16 +271,14 @@ def encode_state(layout: Layout, state: State) -> tuple[bytes, bytes]:
     )
     attitude: dict[str, Any] = {"quat": state.orientation, "rpy": rpy}
     attitude |= {layout.fields[name]: getattr(state, name) for name in ("gyro", "accelerometer")}
-    joints: dict[str, Any] = {
-        "q": state.position * layout.signs,
-        "qd": state.velocity * layout.signs,
-    }
+    joints: dict[str, Any]
+    joints = {"q": state.position * layout.signs, "qd": state.velocity * layout.signs}
     if layout.numbered:
         stamp = {"timestamp_us": round(1e6 * (state.robot_time or 0.0)), "id": state.sequence}
         attitude |= stamp
         joints |= {"tau_est": state.torque * layout.signs, **stamp}
     else:
-        attitude |= {"good_packets": state.sequence}
+        attitude["good_packets"] = state.sequence
         joints = {
             f"{kind}_{name}": values[k::3]
             for kind, values in joints.items()
@@ -298,10 +288,9 @@ def encode_state(layout: Layout, state: State) -> tuple[bytes, bytes]:
 
 
 class StateDecoder(StateNumbering):
-    """Makes states of the two messages, numbered by the robot's count where it is filled.
+    """Makes states of the two messages; neither carries the bus voltage (NaN).
 
-    `no attitude` counts joints without an attitude of the last 20 ms, which make no state. Neither
-    layout carries the bus voltage: NaN.
+    `no attitude` counts joints without an attitude of the last 20 ms, which make no state.
     """
 
     def __init__(self, layout: Layout, counts: Counter[str]) -> None:
@@ -315,19 +304,18 @@ class StateDecoder(StateNumbering):
 
         RefusedError as of `joints`, or `quaternion` (not of length 1).
         """
-        names = ("orientation", "gyro", "accelerometer")
-        found = self._decoded(self._layout.attitude, self._layout.attitude.decode(data), names)
-        where = f"{self._layout.attitude.name}.quat"
-        orientation = unit_quaternion(where, found["orientation"])
-        self._attitude = found | {"orientation": orientation}
-        self._attitude_came = now
+        message, wire = self._layout.attitude, self._layout.fields
+        fields = message.decode(data)
+        found = _decoded(message, fields, wire, "orientation", "gyro", "accelerometer")
+        found["orientation"] = unit_quaternion(f"{message.name}.quat", found["orientation"])
+        self._attitude, self._attitude_came = found, now
 
     def joints(self, data: bytes, now: float) -> State | None:
         """Take a message of the joints that arrived at `now` [s]: it completes a state.
 
         RefusedError as of `Message.decode`, or `not finite`, `out of range`.
         """
-        layout, names = self._layout, ("position", "velocity", "torque")
+        layout = self._layout
         fields: Any = layout.joints.decode(data)
         stamp = number = 0
         if layout.numbered:
@@ -338,34 +326,34 @@ class StateDecoder(StateNumbering):
                 kind: np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
                 for kind in ("q", "qd")
             }
-        found: dict[str, Any] = self._decoded(layout.joints, fields, names)
+        wire = layout.fields
+        found = _decoded(layout.joints, fields, wire, "position", "velocity", "torque")
         if now - self._attitude_came > _OLDEST_ATTITUDE_S:
             self.counts["no attitude"] += 1
             return None
         values = {name: value * layout.signs for name, value in found.items()}
-        values |= self._attitude | {"bus_voltage": math.nan}
-        # The bridge of walk-these-ways itself leaves both at 0.
-        values["robot_time"] = 1e-6 * stamp if stamp else None
-        return self.number(values, number or None, now)
-
-    def _decoded(self, message: Message, fields: Any, names: tuple[str, ...]) -> dict[str, Array]:
-        wire = self._layout.fields
-        return {name: _in_range(name, fields[wire[name]], message) for name in names}
+        # The bridge of walk-these-ways itself leaves stamp and number at 0.
+        other = {"bus_voltage": math.nan, "robot_time": 1e-6 * stamp if stamp else None}
+        return self.number(values | self._attitude | other, number or None, now)
 
 
-def _in_range(name: str, values: NDArray[Any], message: Message) -> Array:
-    """Convert to float64; refuse what is not finite or not in its range."""
-    low, high = _RANGES[name]
-    # Before the conversion, which warns of a signalling NaN; NaN is in no range.
-    if ((values >= low) & (values <= high)).all():
-        return np.asarray(values, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise RefusedError("not finite", f"a {name} of {message.name} is not a finite number.")
-    raise RefusedError(
-        "out of range",
-        f"{name} of {message.name} lies between {values.min():g} and {values.max():g}, expected "
-        f"{low:g} to {high:g}, which is all that the motors and sensors can do.",
-    )
+def _decoded(message: Message, fields: Any, wire: Mapping[str, str], *names: str) -> dict[str, Any]:
+    """Numbers of a message by name, as float64; refuse what is not finite or not in its range."""
+    out = {}
+    for name in names:
+        (low, high), values = _RANGES[name], fields[wire[name]]
+        # Before the conversion, which warns of a signalling NaN; NaN is in no range.
+        if ((values >= low) & (values <= high)).all():
+            out[name] = np.asarray(values, dtype=np.float64)
+        elif np.isfinite(values).all():
+            raise RefusedError(
+                "out of range",
+                f"{name} of {message.name} lies between {values.min():g} and {values.max():g}, "
+                f"expected {low:g} to {high:g}, which is all that the motors and sensors can do.",
+            )
+        else:
+            raise RefusedError("not finite", f"a {name} of {message.name} is not a finite number.")
+    return out
 
 
 # --- Requests -----------------------------------------------------------------------------------

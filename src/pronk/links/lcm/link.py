@@ -1,9 +1,8 @@
 """A robot behind LCM: the Mini Cheetah, a Go1 by the bridge of walk-these-ways, or a virtual robot.
 
-LCM is UDP multicast. With a time-to-live of 0 a packet never leaves the host; a private port keeps
-it from other users of LCM here. LCM itself cannot choose an interface: the system's routes do
-(a missing one is the commonest first failure on the Mini Cheetah, Cheetah-Software issue 8), so
-the route is looked up and must lead out of the interface that was named.
+LCM is UDP multicast. With a time-to-live of 0 a packet never leaves the host. LCM itself cannot
+choose an interface: the system's routes do (a missing one is the commonest first failure on the
+Mini Cheetah, Cheetah-Software issue 8), so the route must lead out of the interface that was named.
 
 One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
 yields data hundreds of milliseconds old; the other publishes. LCM does not tell who sent a message;
@@ -23,20 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.lcm.codec import (
-    BEACON_CHANNEL,
-    CONTROL_PARAMETER,
-    RESPONSE_CHANNEL,
-    VIRTUAL_ROBOT,
-    StateDecoder,
-    clamp_message,
-    encode_command,
-    layout_of,
-    mode_request,
-    read_clamp_message,
-)
+from pronk.links.lcm import codec
+from pronk.links.lcm.codec import BEACON_CHANNEL, RESPONSE_CHANNEL
 from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain, wait_for
-from pronk.links.machine import damping_command
 from pronk.robots.robot import RobotSpec
 
 # LCM's multicast group and port, those of every robot too.
@@ -46,14 +34,13 @@ VIRTUAL_PORT = 7768
 _ROUTES = Path("/proc/net/route")
 _PORTS = range(1024, 65536)
 _QUEUE = 100
-_REMEMBERED = 512
-"""Commands kept to recognize one's own."""
+_REMEMBERED = 512  # commands kept to recognize one's own
 
 
 def url_of(*, port: int | None = None, interface: str | None = None) -> str:
-    """Make LCM's address of an `interface` (`lo` on the robot itself), None for this computer only.
+    """LCM's address of an `interface` (`lo` on the robot itself), None for this computer only.
 
-    HardwareError: the UDP port is impossible, or multicast does not leave by that interface.
+    HardwareError for an impossible UDP port, or where multicast does not leave by that interface.
     """
     number = port_or_domain("LCM port", port, interface, ROBOT_PORT, VIRTUAL_PORT, _PORTS)
     if interface in (None, "lo"):
@@ -150,7 +137,7 @@ class LcmMachine(NetworkLink):
     ) -> None:
         """Describe the link; see `LAYOUTS`, `url_of` and, for `common`, `NetworkLink`."""
         super().__init__(robot, **common)
-        self._layout = known = layout_of(layout)
+        self._layout = known = codec.layout_of(layout)
         if len(robot.joints) != 12:
             raise HardwareError(
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
@@ -166,17 +153,18 @@ class LcmMachine(NetworkLink):
     def open_damper(self) -> Callable[[], None]:
         """Open a handle of its own, and return what writes damping."""
         out = open_lcm(self._url)
-        data = encode_command(self._layout, damping_command(len(self._robot.joints), self._damping))
+        data = codec.encode_command(self._layout, self._sinking)
         return lambda: out.publish(self._command_topic, data)
 
     def _open(self) -> tuple[Encode, Publish]:
         layout = self._layout
-        decoder = StateDecoder(layout, self.counts)
+        decoder = codec.StateDecoder(layout, self.counts)
         # Last request for clamps that the virtual robot received, and the joints it holds.
         self._held: tuple[int, tuple[str, ...]] | None = None
         self._responses: list[bytes] = []
         # Newest first: a message that comes back is nearly always the last one.
         self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
+        # A handle belongs to one thread at a time.
         self._publishing, self._remembering = threading.Lock(), threading.Lock()
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
         self._senders = Senders(self._port, (layout.joints.channel, layout.attitude.channel))
@@ -191,7 +179,7 @@ class LcmMachine(NetworkLink):
                 channel, lambda _, data, handler=handler: self._take(handler, data)
             )
             subscription.set_queue_capacity(_QUEUE)
-        return partial(encode_command, layout), self._command
+        return partial(codec.encode_command, layout), self._command
 
     def _shut(self) -> None:
         self._senders.close()
@@ -203,11 +191,10 @@ class LcmMachine(NetworkLink):
 
     @property
     def sources(self) -> int:
-        """Senders of states since the link was opened."""
+        """Senders of states."""
         return self._senders.most
 
     def _publish(self, channel: str, data: bytes) -> None:
-        # The handle belongs to one thread at a time.
         with self._publishing:
             self._out.publish(channel, data)
 
@@ -225,13 +212,13 @@ class LcmMachine(NetworkLink):
                 self.counts["foreign"] += 1
 
     def _met_beacon(self, data: bytes) -> None:
-        self._held = read_clamp_message(self._robot.joint_names, data)
+        self._held = codec.read_clamp_message(self._robot.joint_names, data)
 
     def _prepare(self) -> None:
         if not self._release:
             return
-        data = mode_request(0, time.monotonic_ns())
-        self._publish(CONTROL_PARAMETER.channel, data)
+        data = codec.mode_request(0, time.monotonic_ns())
+        self._publish(codec.CONTROL_PARAMETER.channel, data)
         if not wait_for(lambda: data in self._responses):
             raise HardwareError(
                 f"{self.robot} did not confirm control_mode 0 on {RESPONSE_CHANNEL} within "
@@ -246,11 +233,10 @@ class LcmMachine(NetworkLink):
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
         names, request = self._robot.joint_names, time.monotonic_ns()
-        data = clamp_message(names, joints, request)
+        data = codec.clamp_message(names, joints, request)
         held = (request, tuple(name for name in names if name in joints))
-        # Requested again, for messages may be lost.
-        for _ in range(4):
-            self._publish(VIRTUAL_ROBOT.channel, data)
+        for _ in range(4):  # for messages may be lost
+            self._publish(codec.VIRTUAL_ROBOT.channel, data)
             if wait_for(lambda: self._held == held, RESPONSE_S / 4):
                 return True
         return False
