@@ -59,6 +59,13 @@ def quiet(**machine: Any) -> SimParams:
     return replace(SIM_PARAMS, machine=changed, attitude=AttitudeParams())
 
 
+def with_joints(sim_params: SimParams, *names: str, **values: float) -> SimParams:
+    """Parameters with other numbers of these joints, or of all."""
+    known = sim_params.joints
+    changed = {name: replace(known[name], **values) for name in names or known}
+    return replace(sim_params, joints={**known, **changed})
+
+
 def connected(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
     machine = VirtualRobot(ROBOT, sim_params, **options)
     machine.connect()

@@ -7,8 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pronk.errors import PronkError
 from pronk.virtual.faults import ChannelFaults, FaultChannel, Faults, flip_bit, parse_faults
@@ -53,16 +51,15 @@ def test_reordering_swaps_neighbours() -> None:
     assert all(abs(place - item) <= 1 for place, item in enumerate(items))
 
 
-@pytest.mark.parametrize(
-    ("jitter", "mean", "within"), [(0.0, 5.5e-3, 0.51e-3), (4e-3, 9.5e-3, 0.3e-3)]
-)
-def test_delay_and_jitter(jitter: float, mean: float, within: float) -> None:
-    _, times, items = through(delay=5e-3, jitter=jitter)
-    late = np.array([t - item * 1e-3 for t, item in zip(times, items, strict=True) if t < math.inf])
-    assert late.min() >= 5e-3 - 1e-9
+def test_delay_and_jitter() -> None:
     # The mean of what comes on top, and half a poll of a millisecond.
-    assert abs(late.mean() - mean) < within
-    assert sorted(items) == list(range(COUNT))
+    for jitter, mean, within in ((0.0, 5.5e-3, 0.51e-3), (4e-3, 9.5e-3, 0.3e-3)):
+        _, times, items = through(delay=5e-3, jitter=jitter)
+        pairs = zip(times, items, strict=True)
+        late = np.array([time - item * 1e-3 for time, item in pairs if time < math.inf])
+        assert late.min() >= 5e-3 - 1e-9
+        assert abs(late.mean() - mean) < within
+        assert sorted(items) == list(range(COUNT))
 
 
 def test_seeds_repeat_and_faults_are_independent() -> None:
@@ -82,11 +79,11 @@ def test_corruption_strikes_as_often_as_specified() -> None:
     assert {channel.pick(3) for _ in range(100)} == {0, 1, 2}
 
 
-@given(st.binary(min_size=1), st.data())
-def test_one_bit_is_flipped(data: bytes, draw: st.DataObject) -> None:
-    bit = draw.draw(st.integers(0, 8 * len(data) - 1))
-    changed = flip_bit(data, bit)
-    assert int.from_bytes(data, "little") ^ int.from_bytes(changed, "little") == 1 << bit
+def test_one_bit_is_flipped() -> None:
+    data = bytes(range(7, 12))
+    for bit in range(8 * len(data)):
+        changed = flip_bit(data, bit)
+        assert int.from_bytes(data, "little") ^ int.from_bytes(changed, "little") == 1 << bit
 
 
 def test_specifications_are_parsed_or_refused() -> None:
@@ -104,11 +101,11 @@ def test_specifications_are_parsed_or_refused() -> None:
     )
     assert parse_faults("") == Faults()
     assert parse_faults("sensor=3s:gyro-zero") == Faults(sensor=("gyro-zero", 3.0))
-    for word in ("sensor=3s", "sensor=3s:nose", "sensor=gyro-zero:3s", "sensor=x:gyro-zero"):
-        with pytest.raises(PronkError, match="fault"):
-            parse_faults(word)
-    for word in ("los=0.3", "motor.loss=0.3", "loss=a", "loss", "delay=nan", "freeze=3"):
-        with pytest.raises(PronkError, match=word):
+    for word in (
+        "sensor=3s", "sensor=3s:nose", "sensor=gyro-zero:3s", "sensor=x:gyro-zero", "los=0.3",
+        "motor.loss=0.3", "loss=a", "loss", "delay=nan", "freeze=3",
+    ):  # fmt: skip
+        with pytest.raises(PronkError, match=f"fault '{word}'"):
             parse_faults(f"after=1,{word}")
     for name, value in (("loss", "1.5"), ("loss", "-0.1"), ("delay", "-1ms")):
         with pytest.raises(PronkError, match=name):
