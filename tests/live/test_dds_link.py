@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from threading import Event, Thread
-from typing import Any
+from threading import Event
 
 import numpy as np
 import pytest
@@ -33,15 +32,13 @@ from pronk.links.dds.link import (
 )
 from pronk.links.link import Freshness, wait_for
 from pronk.links.machine import Command
-from pronk.robots import load_robot
 from pronk.virtual.dds_server import DdsServerTransport
-from pronk.virtual.robot import VirtualRobot, hold_of
+from pronk.virtual.robot import hold_of
 from pronk.virtual.server import RobotServer
-from pronk.virtual.sim_params import load_sim_params
+from virtual_robot import ROBOT, connected, meanwhile
 
 pytestmark = pytest.mark.live
 
-ROBOT = load_robot("mini_cheetah")
 JOINTS = joint_map(ROBOT)
 # A computer that runs tests side by side is busy; what is tested here is not that.
 FRESH = Freshness(share=0.02, longest_gap_s=10.0)
@@ -56,8 +53,7 @@ def own_network(shift: int = 0) -> DdsNetwork:
 
 def live(domain: int, end: Connection) -> None:
     """Body of the server's process, until it receives stop; it sends its figures."""
-    robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
-    robot.connect()
+    robot = connected(legs=("FR",))
     wire = DdsServerTransport(ROBOT, domain=domain, mode="normal")
     server = RobotServer(robot, wire, hold=HOLD)
     end.send("ready")
@@ -65,29 +61,16 @@ def live(domain: int, end: Connection) -> None:
     end.send(server.figures())
 
 
-class Robot:
-    """A server in another process, whose own controller holds the joints at first."""
-
-    def __init__(self) -> None:
-        self.network = own_network()
-        context = multiprocessing.get_context("spawn")
-        self._end, other = context.Pipe()
-        self.process = context.Process(target=live, args=(self.network.domain, other), daemon=True)
-        self.process.start()
-        assert self._end.recv() == "ready"
-
-    def stop(self) -> Any:
-        self._end.send("stop")
-        figures = self._end.recv()
-        self.process.join()
-        return figures
-
-
 @pytest.fixture
-def double() -> Iterator[Robot]:
-    made = Robot()
-    yield made
-    made.process.kill()
+def server() -> Iterator[Connection]:
+    """A server in another process, whose own controller holds the joints at first."""
+    context = multiprocessing.get_context("spawn")
+    end, other = context.Pipe()
+    process = context.Process(target=live, args=(own_network().domain, other), daemon=True)
+    process.start()
+    assert end.recv() == "ready"
+    yield end
+    process.kill()
 
 
 def eventually(done: Callable[[], bool]) -> bool:
@@ -99,8 +82,8 @@ def turned(angle: float) -> Command:
     return replace(HOLD, position=HOLD.position + angle * (np.arange(12) == PITCH))
 
 
-def test_a_robot_behind_dds_from_preflight_to_close(double: Robot) -> None:
-    network = double.network
+def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
+    network = own_network()
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="normal"):
         DdsMachine(ROBOT, domain=network.domain).connect()
@@ -172,124 +155,68 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Robot) -> None:
     assert time.monotonic() - begun_closing >= 1.0
     with pytest.raises(HardwareError, match="call connect"):
         machine.latest()
-    figures = double.stop()
+    server.send("stop")
+    figures = server.recv()
     assert 0 < figures["wire"]["refused: checksum"] <= 20
     assert figures["wire"]["mode switches"] == 1
     assert figures["server"]["commands of others"] > 0
 
 
-def test_no_robot() -> None:
-    with pytest.raises(HardwareError, match="rt/lowstate"):
-        DdsMachine(ROBOT, domain=own_network(1).domain).connect()
-
-
 def test_mode_switcher_and_bench_services() -> None:
     network = own_network(1)
     wire = DdsServerTransport(ROBOT, domain=network.domain, mode="mcf")
-    client = Client(Participant(network), SWITCHER)
-    assert call(wire, client, 1001, {}) == {"form": "0", "name": "mcf"}
-    assert call(wire, client, 1003, {}) == {}
-    assert wire.mode == ""
-    assert call(wire, client, 1002, {"name": "ai"}) == {}
-    assert wire.mode == "ai"
-    for parameter in ({"name": "dance"}, None, [1], "x"):
+    client, bench = (Client(Participant(network), name) for name in (SWITCHER, "pronk_bench"))
+    with meanwhile(wire.poll, 0.0005):
+        assert client.call(1001, {}) == {"form": "0", "name": "mcf"}
+        assert client.call(1003, {}) == {}
+        assert wire.mode == ""
+        assert client.call(1002, {"name": "ai"}) == {}
+        for parameter in ({"name": "dance"}, None, [1], "x"):
+            with pytest.raises(HardwareError, match="3204"):
+                client.call(1002, parameter)
+        with pytest.raises(HardwareError, match="3203"):
+            client.call(9, {})
+        assert wire.mode == "ai"
+        held = {"joints": ["FR_knee", "FL_knee"]}
+        assert bench.call(1, {"joints": ["FL_knee", "FR_knee"]}) == held
         with pytest.raises(HardwareError, match="3204"):
-            call(wire, client, 1002, parameter)
-    with pytest.raises(HardwareError, match="3203"):
-        call(wire, client, 9, {})
-    assert wire.mode == "ai"
-    bench = Client(Participant(network), "pronk_bench")
-    assert call(wire, bench, 1, {"joints": ["FL_knee", "FR_knee"]}) == {
-        "joints": ["FR_knee", "FL_knee"]
-    }
-    assert wire.clamps == ("FR_knee", "FL_knee")
-    with pytest.raises(HardwareError, match="3204"):
-        call(wire, bench, 1, {"joints": ["tail"]})
-    assert wire.clamps == ("FR_knee", "FL_knee")
+            bench.call(1, {"joints": ["tail"]})
+        assert wire.clamps == ("FR_knee", "FL_knee")
 
 
-def call(wire: DdsServerTransport, client: Client, api_id: int, parameter: Any) -> Any:
-    """Call while the wire is polled, as the server does, from this very process."""
-
-    def poll() -> None:
-        wire.poll()
-        time.sleep(0.0005)
-
-    with meanwhile(poll):
-        return client.call(api_id, parameter)
-
-
-@contextmanager
-def meanwhile(repeat: Callable[[], None]) -> Iterator[None]:
-    """Repeat something in another thread."""
-    done = Event()
-
-    def loop() -> None:
-        while not done.is_set():
-            repeat()
-
-    thread = Thread(target=loop)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-
-
-def test_rival_is_received_and_damaged_commands_are_refused() -> None:
+def test_rival_is_received() -> None:
     wire = DdsServerTransport(ROBOT, domain=own_network(1).domain)
     wire.contend(turned(0.1))
     met: list[Command] = []
     assert eventually(lambda: bool(met.extend(wire.poll()) or met))
     np.testing.assert_allclose(met[0].position, turned(0.1).position, atol=1e-6)
-    wire.corrupt_in = lambda data: data[:-1] + bytes([data[-1] ^ 1])
-    wire.contend(turned(0.1))
-    assert eventually(lambda: not wire.poll() and wire.counts["refused: checksum"] == 1)
 
 
-def test_two_robots_on_one_domain_are_refused() -> None:
+def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
     network = own_network(1)
     wires = [DdsServerTransport(ROBOT, domain=network.domain) for _ in range(2)]
-    robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
-    robot.connect()
-    states = iter(robot.wait(8.0))
-
-    def speak() -> None:
-        for wire in wires:
-            wire.poll()
-            wire.publish(next(states))
-        time.sleep(0.002)
-
-    with meanwhile(speak), pytest.raises(HardwareError, match="2 robots"):
-        DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH).connect()
-
-
-def test_a_second_robot_that_begins_later_stops_the_commands() -> None:
-    network = own_network(1)
-    wires = [DdsServerTransport(ROBOT, domain=network.domain) for _ in range(2)]
-    robot, later = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",)), Event()
-    robot.connect()
-    states = iter(robot.wait(120.0))
+    states, later = itertools.cycle(connected(legs=("FR",)).wait(8.0)), Event()
 
     def speak() -> None:
         for wire in wires[: 2 if later.is_set() else 1]:
             wire.poll()
             wire.publish(next(states))
-        time.sleep(0.002)
 
     machine = DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH)
-    with meanwhile(speak):
+    with meanwhile(speak, 0.002):
         machine.connect()
         machine.send(HOLD)
         later.set()
         assert eventually(lambda: machine.sources == 2)
         with pytest.raises(HardwareError, match="2 robots"):
             machine.send(HOLD)
-        machine.close()
+        with pytest.raises(HardwareError, match="2 robots"):
+            machine.connect()
 
 
 def test_networks() -> None:
+    with pytest.raises(HardwareError, match="rt/lowstate"):
+        DdsMachine(ROBOT, domain=own_network(1).domain).connect()
     assert DdsNetwork().domain == 77
     assert DdsNetwork(interface="eth7").domain == 0
     for domain in (0, 233, -1):

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -27,12 +26,11 @@ from pronk.links.lcm.codec import (
     mode_request,
 )
 from pronk.links.lcm.link import LcmMachine, url_of
-from pronk.links.link import Freshness
+from pronk.links.link import Freshness, wait_for
 from pronk.links.machine import Command, State
-from pronk.robots import load_robot
 from pronk.virtual.lcm_server import LcmServerTransport
-from pronk.virtual.robot import VirtualRobot, hold_of
-from pronk.virtual.sim_params import load_sim_params
+from pronk.virtual.robot import hold_of
+from virtual_robot import ROBOT, connected, meanwhile
 
 pytestmark = pytest.mark.live
 
@@ -40,7 +38,6 @@ lcm = pytest.importorskip("lcm")
 
 LIMIT_S = 300.0
 """A busy computer may take long; nothing here is a measure of speed."""
-ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
 KNEE = ROBOT.joint_names.index("FL_knee")
 
@@ -51,13 +48,9 @@ class Process:
     def __init__(self, layout: str, json_file: Path) -> None:
         self.layout, self.json, self.port = layout, json_file, free_port()
         code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
-        words = ["simulate", "--layout", layout, "--port", self.port, "--json", json_file]
-        self.running = subprocess.Popen(
-            [sys.executable, "-c", code, *map(str, words)],
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
+        words = ["simulate", "--layout", layout, "--port", str(self.port), "--json", str(json_file)]
+        command, env = [sys.executable, "-c", code, *words], {**os.environ, "OMP_NUM_THREADS": "1"}
+        self.running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env)
 
     def machine(self, **options: object) -> LcmMachine:
         # A computer that runs tests side by side is busy; what is tested here is not that.
@@ -156,28 +149,18 @@ def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> 
     process = servers["cheetah"]
     machine = process.machine()
     other = lcm.LCM(url_of(port=process.port))
-    done = threading.Event()
-
-    def command() -> None:
-        while not done.wait(0.02):
-            other.publish(CHEETAH.command.channel, encode_command(CHEETAH, HOLD))
-
-    rival = threading.Thread(target=command)
-    rival.start()
-    try:
-        with pytest.raises(HardwareError, match="another program"):
-            machine.connect()
-    finally:
-        done.set()
-        rival.join()
+    data = encode_command(CHEETAH, HOLD)
+    with (
+        meanwhile(lambda: other.publish(CHEETAH.command.channel, data), 0.02),
+        pytest.raises(HardwareError, match="another program"),
+    ):
+        machine.connect()
     assert machine.counts["commands"] == 0
     machine.connect()
     machine.send(HOLD)
     foreign = replace(HOLD, position=HOLD.position + 0.01)
     other.publish(CHEETAH.command.channel, encode_command(CHEETAH, foreign))
-    until = time.monotonic() + LIMIT_S
-    while not machine.counts["foreign"] and time.monotonic() < until:
-        machine.wait(machine.now() + 0.01)
+    assert wait_for(lambda: machine.counts["foreign"] > 0, LIMIT_S)
     with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)
     machine.close()
@@ -185,36 +168,20 @@ def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> 
 
 def test_a_second_robot_on_the_port_is_refused(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
-    wire, done = LcmServerTransport(ROBOT, port=process.port), threading.Event()
-    robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
-    robot.connect()
-    states = itertools.cycle(robot.wait(1.0))
-
-    def speak() -> None:
-        begun, sent = time.monotonic(), 0
-        while not done.wait(0.002):
-            # At a mean of 400 Hz, however late this thread is.
-            while sent < 400.0 * (time.monotonic() - begun):
-                wire.publish(next(states))
-                sent += 1
-
-    other = threading.Thread(target=speak)
-    other.start()
-    machine = LcmMachine(ROBOT, port=process.port, fresh=Freshness(share=0.02, longest_gap_s=10.0))
-    try:
-        with pytest.raises(HardwareError, match="2 robots"):
-            machine.connect()
-    finally:
-        done.set()
-        other.join()
+    wire = LcmServerTransport(ROBOT, port=process.port)
+    states = itertools.cycle(connected(legs=("FR",)).wait(1.0))
+    machine = process.machine()
+    with (
+        meanwhile(lambda: wire.publish(next(states)), 0.002),
+        pytest.raises(HardwareError, match="2 robots"),
+    ):
+        machine.connect()
     assert machine.counts["commands"] == 0
     # One that begins later stops the commands with its first state.
     machine.connect()
     machine.send(HOLD)
     wire.publish(next(states))
-    until = time.monotonic() + LIMIT_S
-    while machine.sources == 1 and time.monotonic() < until:
-        time.sleep(0.002)
+    assert wait_for(lambda: machine.sources == 2, LIMIT_S)
     with pytest.raises(HardwareError, match="2 robots"):
         machine.send(HOLD)
     machine.close()
