@@ -23,13 +23,7 @@ from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sensors import about_z, moving_force, of_vector, product, turned_back
-from pronk.virtual.sim_params import (
-    AttitudeParams,
-    SimParams,
-    TrunkParams,
-    load_sim_params,
-    with_changes,
-)
+from pronk.virtual.sim_params import AttitudeParams, SimParams, TrunkParams, load_sim_params
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet, with_joints
 
 ARM = load_robot("so101")
@@ -179,12 +173,6 @@ def test_it_stands_on_blocks_over_a_gap() -> None:
     assert seen.other_contact.any()
     assert seen.foot_position[-1, 2:, 2].max() < 0.0
 
-
-def test_the_battery_never_gives_more_than_it_can() -> None:
-    machine = standing(with_changes(quiet(), bus_resistance=0.5))
-    machine.send(Command(position=0.3 * POSE, **gains(100.0)))
-    voltage = [state.bus_voltage for state in machine.wait(0.2)]
-    assert min(voltage) == 0.5 * SIM_PARAMS.machine.bus_voltage
 
 
 # --- Free flight --------------------------------------------------------------------------------

@@ -218,22 +218,20 @@ def test_damping_survives_a_failing_wire() -> None:
         wire.append(data)
 
     writer = writing(publish)
-    try:
+    writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
+    cut.set()
+    # It expires while the wire takes nothing; only the writer can damp.
+    assert wait_for(lambda: writer.counts["not written"] >= 5, 60.0)
+    assert (len(wire), writer.counts["expired"]) == (1, 1)
+    # The sender of a command gets the error; damping never raises.
+    with pytest.raises(HardwareError, match="101"):
         writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
-        cut.set()
-        # It expires while the wire takes nothing; only the writer can damp.
-        assert wait_for(lambda: writer.counts["not written"] >= 5, 60.0)
-        assert (len(wire), writer.counts["expired"]) == (1, 1)
-        # The sender of a command gets the error; damping never raises.
-        with pytest.raises(HardwareError, match="101"):
-            writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
-        writer.damp()
-        cut.clear()
-        assert wait_for(lambda: len(wire) >= 5, 60.0)
-        assert set(wire[1:]) == {b"\x00"}
-        assert writer.counts["commands"] == 1
-    finally:
-        writer.stop()
+    writer.damp()
+    cut.clear()
+    assert wait_for(lambda: len(wire) >= 5, 60.0)
+    assert set(wire[1:]) == {b"\x00"}
+    assert writer.counts["commands"] == 1
+    writer.stop()
 
 
 # --- Addresses ----------------------------------------------------------------------------------
@@ -343,12 +341,17 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
         Address.parse("serial://ttyUSB0")
 
 
-@pytest.mark.parametrize("wrong", ["decode", "encode", "local"])
-def test_defects_fail_the_check(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if wrong == "local":
-        monkeypatch.setattr(Loop, "local", False)
-    else:
-        careless = {"decode": lambda *_: state(), "encode": lambda *_: b""}
-        monkeypatch.setattr(Serial, wrong, careless[wrong])
+@pytest.mark.parametrize(
+    ("part", "wrong", "value"),
+    [
+        (Serial, "decode", lambda *_: state()),
+        (Serial, "encode", lambda *_: b""),
+        (Loop, "local", False),
+    ],
+)
+def test_defects_fail_the_check(
+    part: type, wrong: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(part, wrong, value)
     with pytest.raises(PronkError, match=wrong):
         check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)

@@ -70,6 +70,7 @@ class Physics:
         self.data = mujoco.MjData(plant.model)
         self.step = self._first = first_step
         self._dt = float(plant.model.opt.timestep)
+        self.transport = Transport(len(pose), machine.command_delay_s, self._dt)
         self._voltage = machine.bus_voltage
         self._gains = b""
         self._qvel, self._act = self.data.qvel, self.data.act  # views
@@ -88,17 +89,20 @@ class Physics:
             self._gains = packed
             plant.set_gains(*gains[:, plant.columns])
 
-    def run(self, steps: list[int], transport: Transport) -> Array:
+    def run(self, steps: list[int]) -> Array:
         """Advance over rising physics steps; return the raw states there, (n, state_size)."""
         plant, data, wanted = self.plant, self.data, set(steps)
         due = [] if self.recorder is None else self.recorder.due(steps[-1])
         # A sample and a state of the same step are read once.
         stops = sorted(steps + [step for step in due if step not in wanted])
         rows = np.empty((len(stops), plant.state_size))
-        next_due = transport.soonest
+        next_due = self.transport.soonest
         for stop, row in zip(stops, rows, strict=True):
             if next_due < stop:
-                next_due = self._obey(stop, transport)
+                while arrived := self.transport.take(stop):
+                    self._step_to(arrived[0])
+                    self.apply(arrived[1])
+                next_due = self.transport.soonest
             self._step_to(stop)
             plant.read(data, self._voltage, row)
             if stop in wanted:
@@ -119,13 +123,6 @@ class Physics:
         row = np.empty((1, self.plant.state_size))
         self.plant.read(self.data, self._voltage, row[0])
         return capture_of(self.plant, np.array([self.step * self._dt]), row)
-
-    def _obey(self, before: int, transport: Transport) -> float:
-        """Apply the commands due before a physics step; return when the next one is due."""
-        while arrived := transport.take(before):
-            self._step_to(arrived[0])
-            self.apply(arrived[1])
-        return transport.soonest
 
     def _step_to(self, step: int) -> None:
         if step > self.step:

@@ -24,7 +24,7 @@ from pronk.links.machine import Command, State, TorqueKind, check_command, dampi
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
-from pronk.virtual.physics import Physics, Transport
+from pronk.virtual.physics import Physics
 from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.sensors import Sensors
 from pronk.virtual.sim_params import SimParams, load_sim_params
@@ -120,7 +120,6 @@ class VirtualRobot:
         self._sensors = Sensors(
             robot, self._sim_params, plant, rate_hz=self.state_rate_hz, seed=self._seed
         )
-        self._transport = Transport(len(pose), machine.command_delay_s, self._dt)
         # Steps are counted from the clock's zero; settling happens before it.
         first_step = -round(settle / self._dt)
         self._physics = Physics(plant, machine, pose=pose, first_step=first_step)
@@ -163,7 +162,7 @@ class VirtualRobot:
         """Put a command into force, after the transport delay and until it expires."""
         self._check_open()
         check_command(command, len(self._robot.joints))
-        self._transport.put(command, self._now)
+        self._physics.transport.put(command, self._now)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
         """Fix links where they are, on the bench; () frees all."""
@@ -181,7 +180,7 @@ class VirtualRobot:
     def damp(self) -> None:
         """Damp the joints without stiffness."""
         self._check_open()
-        self._transport.put(damping_command(len(self._robot.joints)), self._now)
+        self._physics.transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self) -> Capture:
         """Motion capture up to the step reached, `now` less the delay; also after `close`."""
@@ -215,7 +214,7 @@ class VirtualRobot:
         # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
-        rows = self._physics.run(steps.tolist(), self._transport)
+        rows = self._physics.run(steps.tolist())
         return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
 
 
