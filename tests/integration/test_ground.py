@@ -174,7 +174,6 @@ def test_it_stands_on_blocks_over_a_gap() -> None:
     assert seen.foot_position[-1, 2:, 2].max() < 0.0
 
 
-
 # --- Free flight --------------------------------------------------------------------------------
 
 
