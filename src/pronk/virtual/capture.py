@@ -6,7 +6,6 @@ The world is z up; feet are FR, FL, HR, HL.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,36 +86,6 @@ def load(path: Path) -> Capture:
     """Read a capture; refuse a missing or damaged file and another schema."""
     with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, stored):
         return Capture(**{name: stored[name] for name in _SHAPES})
-
-
-class Recorder:
-    """Keeps raw states of a running plant, block after block."""
-
-    def __init__(self, plant: Plant, period_s: float) -> None:
-        """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
-        self._plant, self._period = plant, period_s
-        self._step_s = float(plant.model.opt.timestep)
-        self._steps: list[int] = []
-        self._blocks = [np.empty((0, plant.state_size))]
-
-    def due(self, last: int) -> list[int]:
-        """Physics steps of the samples that are still to be taken, up to and with one step."""
-        steps: list[int] = []
-        for number in itertools.count(len(self._steps)):
-            if (step := round(number * self._period / self._step_s)) > last:
-                break
-            steps.append(step)
-        return steps
-
-    def keep(self, steps: list[int], rows: Array) -> None:
-        """Keep the raw states (n, state_size) of due steps."""
-        self._steps += steps
-        self._blocks.append(rows)
-
-    def capture(self) -> Capture:
-        """All samples."""
-        times = self._step_s * np.array(self._steps, dtype=np.float64)
-        return capture_of(self._plant, times, np.concatenate(self._blocks))
 
 
 def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:

@@ -5,6 +5,7 @@ Time is counted in physics steps from the clock's zero.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 
@@ -14,7 +15,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, damping_command
-from pronk.virtual.capture import Capture, Recorder, capture_of
+from pronk.virtual.capture import Capture, capture_of
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import MachineParams
 
@@ -58,18 +59,25 @@ class Transport:
 
 
 class Physics:
-    """One run of a plant; `recorder` keeps the samples of a capture."""
-
-    recorder: Recorder | None = None
+    """One run of a plant, with a capture of it."""
 
     def __init__(
-        self, plant: Plant, machine: MachineParams, *, pose: Array, first_step: int
+        self,
+        plant: Plant,
+        machine: MachineParams,
+        *,
+        pose: Array,
+        first_step: int,
+        capture_rate_hz: float | None = None,
     ) -> None:
         """Begin with links and rotors in a pose of all joints [rad] and the drives off."""
         self.plant, self._machine = plant, machine
         self.data = mujoco.MjData(plant.model)
         self.step = self._first = first_step
         self._dt = float(plant.model.opt.timestep)
+        self.capture_rate_hz = capture_rate_hz
+        self._sampled: list[int] = []  # physics steps of the samples of the capture
+        self._samples = [np.empty((0, plant.state_size))]  # raw states, block after block
         self.transport = Transport(len(pose), machine.command_delay_s, self._dt)
         self._voltage = machine.bus_voltage
         self._gains = b""
@@ -92,7 +100,7 @@ class Physics:
     def run(self, steps: list[int]) -> Array:
         """Advance over rising physics steps; return the raw states there, (n, state_size)."""
         plant, data, wanted = self.plant, self.data, set(steps)
-        due = [] if self.recorder is None else self.recorder.due(steps[-1])
+        due = self._samples_due(steps[-1])
         # A sample and a state of the same step are read once.
         stops = sorted(steps + [step for step in due if step not in wanted])
         rows = np.empty((len(stops), plant.state_size))
@@ -114,9 +122,26 @@ class Physics:
                 f"of {self._dt:g} s; look for an extreme number in its parameters or a command's "
                 "gains."
             )
-        if self.recorder is not None:
-            self.recorder.keep(due, rows[np.searchsorted(stops, due)])
+        if due:
+            self._sampled += due
+            self._samples.append(rows[np.searchsorted(stops, due)])
         return rows if len(stops) == len(steps) else rows[[stop in wanted for stop in stops]]
+
+    def _samples_due(self, last: int) -> list[int]:
+        """Physics steps of the samples still to be taken, up to and with one step."""
+        due: list[int] = []
+        if self.capture_rate_hz is not None:
+            period = 1.0 / self.capture_rate_hz
+            for number in itertools.count(len(self._sampled)):
+                if (step := round(number * period / self._dt)) > last:
+                    break
+                due.append(step)
+        return due
+
+    def capture(self) -> Capture:
+        """All samples."""
+        times = self._dt * np.array(self._sampled, dtype=np.float64)
+        return capture_of(self.plant, times, np.concatenate(self._samples))
 
     def snapshot(self) -> Capture:
         """One sample of a capture, of now."""

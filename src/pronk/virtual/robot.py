@@ -22,7 +22,7 @@ import numpy as np
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, State, TorqueKind, check_command, damping_command
 from pronk.robots.robot import RobotSpec
-from pronk.virtual.capture import Capture, Recorder
+from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics
 from pronk.virtual.plant import Plant, legs_of
@@ -107,7 +107,7 @@ class VirtualRobot:
         self.state_rate_hz, self._dt = log_rate_hz, timestep_s
         self.capture_rate_hz = capture_rate_hz  # has an effect until connected
         self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
-        self._recorder: Recorder | None = None
+        self._physics: Physics | None = None
         self._open = False
 
     def connect(self) -> None:
@@ -122,30 +122,30 @@ class VirtualRobot:
         )
         # Steps are counted from the clock's zero; settling happens before it.
         first_step = -round(settle / self._dt)
-        self._physics = Physics(plant, machine, pose=pose, first_step=first_step)
+        rate = None if self._ground is None else self.capture_rate_hz
+        self._physics = physics = Physics(
+            plant, machine, pose=pose, first_step=first_step, capture_rate_hz=rate
+        )
         if self._ground is not None:
-            self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
-            if self.capture_rate_hz is not None:
-                self._physics.recorder = Recorder(plant, 1.0 / self.capture_rate_hz)
-        self._recorder = self._physics.recorder
-        self._physics.apply(replace(hold_of(robot), position=pose))
+            self._ground.set_down(plant.model, physics.data, plant.feet, self._start)
+        physics.apply(replace(hold_of(robot), position=pose))
         self._now = 0.0
         self._open = True
         self._latest = self._run(1)[0]
 
     def now(self) -> float:
         """The machine's clock [s]."""
-        self._check_open()
+        self._running()
         return self._now
 
     def latest(self) -> State:
         """The newest state."""
-        self._check_open()
+        self._running()
         return self._latest
 
     def wait(self, until: float) -> list[State]:
         """Let time pass to `until` [s] on the machine's clock; return the states met on the way."""
-        self._check_open()
+        self._running()
         if not math.isfinite(until):
             raise HardwareError(f"wait until {until}; expected a finite time [s].")
         if until <= self._now:
@@ -160,13 +160,13 @@ class VirtualRobot:
 
     def send(self, command: Command) -> None:
         """Put a command into force, after the transport delay and until it expires."""
-        self._check_open()
+        physics = self._running()
         check_command(command, len(self._robot.joints))
-        self._physics.transport.put(command, self._now)
+        physics.transport.put(command, self._now)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
         """Fix links where they are, on the bench; () frees all."""
-        self._check_open()
+        physics = self._running()
         if self._ground is not None:
             raise HardwareError(
                 "joints cannot be clamped on the ground, where nothing holds the body; use the "
@@ -174,29 +174,28 @@ class VirtualRobot:
             )
         for name in joints:
             self._robot.joint(name)
-        machine, q = self._sim_params.machine, self._physics.data.qpos
+        machine, q = self._sim_params.machine, physics.data.qpos
         self._plant.set_clamps(joints, q, machine.clamp_stiffness, machine.clamp_damping)
 
     def damp(self) -> None:
         """Damp the joints without stiffness."""
-        self._check_open()
-        self._physics.transport.put(damping_command(len(self._robot.joints)), self._now)
+        self._running().transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self) -> Capture:
         """Motion capture up to the step reached, `now` less the delay; also after `close`."""
-        if self._recorder is None:
+        if self._physics is None or self._physics.capture_rate_hz is None:
             raise HardwareError(
                 "nothing was captured; connect a virtual robot with base='ground' and a "
                 "capture_rate_hz."
             )
-        return self._recorder.capture()
+        return self._physics.capture()
 
     def snapshot(self) -> Capture:
         """One sample of the capture, at the physics step reached."""
-        self._check_open()
+        physics = self._running()
         if self._ground is None:
             raise HardwareError("nothing is captured on the bench; use base='ground'.")
-        return self._physics.snapshot()
+        return physics.snapshot()
 
     def close(self) -> None:
         """Damp and close; closing twice does no harm."""
@@ -204,9 +203,10 @@ class VirtualRobot:
             self.damp()
             self._open = False
 
-    def _check_open(self) -> None:
-        if not self._open:
+    def _running(self) -> Physics:
+        if self._physics is None or not self._open:
             raise HardwareError("the virtual robot is not connected; call connect() first.")
+        return self._physics
 
     def _run(self, count: int) -> list[State]:
         first = self._sensors.sequence
@@ -214,7 +214,7 @@ class VirtualRobot:
         # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
-        rows = self._physics.run(steps.tolist())
+        rows = self._running().run(steps.tolist())
         return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
 
 

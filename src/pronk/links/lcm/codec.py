@@ -332,9 +332,10 @@ class StateDecoder(StateNumbering):
             self.counts["no attitude"] += 1
             return None
         values = {name: value * layout.signs for name, value in found.items()}
+        values |= self._attitude
         # The bridge of walk-these-ways itself leaves stamp and number at 0.
-        other = {"bus_voltage": math.nan, "robot_time": 1e-6 * stamp if stamp else None}
-        return self.number(values | self._attitude | other, number or None, now)
+        values |= {"bus_voltage": math.nan, "robot_time": 1e-6 * stamp if stamp else None}
+        return self.number(values, number or None, now)
 
 
 def _decoded(message: Message, fields: Any, wire: Mapping[str, str], *names: str) -> dict[str, Any]:
