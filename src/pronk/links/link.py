@@ -52,8 +52,7 @@ _LEAST_STEP_S = 1e-6
 class Freshness:
     """How fresh states must be before anything moves."""
 
-    share: float = 0.9
-    """Of the expected number of states that must have come."""
+    share: float = 0.9  # of the expected number of states that must have come
     longest_gap_s: float = 0.02
 
 

@@ -29,49 +29,32 @@ class RefusedError(HardwareError):
 class State:
     """Measurement of all sensors at one instant. Arrays of joints have shape (joints,)."""
 
-    time: float
-    """Measured timestamp [s]."""
-    sequence: int
-    """Counts states from 0; a jump means states were lost."""
-    position: Array
-    """[rad]"""
-    velocity: Array
-    """[rad/s]"""
-    torque: Array
-    """As the drives report it [N m]."""
-    gyro: Array
-    """Angular velocity of the trunk in its own frame [rad/s], shape (3,)."""
-    accelerometer: Array
-    """Specific force of the trunk in its own frame [m/s^2], shape (3,)."""
-    bus_voltage: float
-    """[V]"""
+    time: float  # measured timestamp [s]
+    sequence: int  # counts states from 0; a jump means states were lost
+    position: Array  # [rad]
+    velocity: Array  # [rad/s]
+    torque: Array  # as the drives report it [N m]
+    gyro: Array  # angular velocity of the trunk in its own frame [rad/s], shape (3,)
+    accelerometer: Array  # specific force of the trunk in its own frame [m/s^2], shape (3,)
+    bus_voltage: float  # [V]
+    # Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z. Its yaw has
+    # an arbitrary zero.
     orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-    """Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z. Its yaw has
-    an arbitrary zero."""
-    robot_time: float | None = None
-    """The robot's own timestamp [s]; None where the wire carries none."""
-    temperature: Array | None = None
-    """Of the motors [deg C]; None where the wire carries none."""
+    robot_time: float | None = None  # the robot's own [s]; None where the wire carries none
+    temperature: Array | None = None  # of the motors [deg C]; None where the wire carries none
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """Targets of the drives until the next command or until it expires; arrays (joints,)."""
 
-    position: Array
-    """[rad]"""
-    stiffness: Array
-    """[N m/rad]"""
-    damping: Array
-    """[N m s/rad]; the target velocity is zero (reading A9)."""
-    sequence: int = 0
-    """Counts commands; the number on the wire, where there is one."""
-    state_sequence: int = -1
-    """`State.sequence` of the state it was computed from; -1 for none."""
-    made: float = 0.0
-    """When it was computed, on the machine's clock [s]."""
-    valid_for: float = math.inf
-    """Time after `made` at which it expires and damping follows [s]."""
+    position: Array  # [rad]
+    stiffness: Array  # [N m/rad]
+    damping: Array  # [N m s/rad]; the target velocity is zero (reading A9)
+    sequence: int = 0  # counts commands; the number on the wire, where there is one
+    state_sequence: int = -1  # `State.sequence` of the state it was computed from; -1 for none
+    made: float = 0.0  # when it was computed, on the machine's clock [s]
+    valid_for: float = math.inf  # time after `made` at which it expires and damping follows [s]
 
 
 def damping_command(joints: int, damping: float = 1.0) -> Command:

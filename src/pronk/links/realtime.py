@@ -37,12 +37,9 @@ ENDING = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
 class Wanted:
     """Settings that a process requests."""
 
-    priority: int | None = None
-    """Of SCHED_FIFO, 1 to 99; None for ordinary scheduling."""
-    core: int | None = None
-    """The only one to run on, counted from the last; None for any."""
-    lock: bool = True
-    """Keep its memory from being paged out."""
+    priority: int | None = None  # of SCHED_FIFO, 1 to 99; None for ordinary scheduling
+    core: int | None = None  # the only one to run on, counted from the last; None for any
+    lock: bool = True  # keep its memory from being paged out
 
 
 def enter(wanted: Wanted) -> tuple[str, ...]:

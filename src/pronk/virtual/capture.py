@@ -29,32 +29,19 @@ SCHEMA = "pronk/capture/1"
 class Capture:
     """T samples at a constant rate. Annotations hold the shapes after T."""
 
-    time: Annotated[Array, ()]
-    """On the machine's clock [s]."""
-    position: Annotated[Array, (3,)]
-    """Origin of the trunk's frame, in the world [m]."""
-    orientation: Annotated[Array, (4,)]
-    """Trunk to world, unit quaternions w, x, y, z."""
-    velocity: Annotated[Array, (3,)]
-    """Of the trunk's origin, in the world [m/s]."""
-    angular_velocity: Annotated[Array, (3,)]
-    """Of the trunk, in its own frame [rad/s]."""
-    foot_position: Annotated[Array, (4, 3)]
-    """Centres of the foot spheres, in the world [m]."""
-    contact: Annotated[Mask, (4,)]
-    """Feet on the ground."""
-    other_contact: Annotated[Mask, ()]
-    """Anything but a foot touches the ground."""
-    joint_position: Annotated[Array, (12,)]
-    """Of the links, in file order [rad]."""
-    joint_velocity: Annotated[Array, (12,)]
-    """Of the links [rad/s]."""
-    torque: Annotated[Array, (12,)]
-    """Of the motors through their gears, without friction [N m]."""
-    electrical_power: Annotated[Array, ()]
-    """From the battery into the motors; negative where they return it [W]."""
-    bus_voltage: Annotated[Array, ()]
-    """[V]"""
+    time: Annotated[Array, ()]  # on the machine's clock [s]
+    position: Annotated[Array, (3,)]  # origin of the trunk's frame, in the world [m]
+    orientation: Annotated[Array, (4,)]  # trunk to world, unit quaternions w, x, y, z
+    velocity: Annotated[Array, (3,)]  # of the trunk's origin, in the world [m/s]
+    angular_velocity: Annotated[Array, (3,)]  # of the trunk, in its own frame [rad/s]
+    foot_position: Annotated[Array, (4, 3)]  # centres of the foot spheres, in the world [m]
+    contact: Annotated[Mask, (4,)]  # feet on the ground
+    other_contact: Annotated[Mask, ()]  # anything but a foot touches the ground
+    joint_position: Annotated[Array, (12,)]  # of the links, in file order [rad]
+    joint_velocity: Annotated[Array, (12,)]  # of the links [rad/s]
+    torque: Annotated[Array, (12,)]  # of the motors through their gears, without friction [N m]
+    electrical_power: Annotated[Array, ()]  # battery to motors, negative where returned [W]
+    bus_voltage: Annotated[Array, ()]  # [V]
 
     def __post_init__(self) -> None:
         """Refuse arrays of wrong shapes."""

@@ -50,10 +50,8 @@ _COLOUR = (0.55, 0.58, 0.62, 1.0)
 class Box(Bounded):
     """A fixed block, its faces along the axes of the world."""
 
-    center: tuple[_Place, _Place, _Place]
-    """[m]"""
-    half_size: tuple[_Size, _Size, _Size]
-    """[m]"""
+    center: tuple[_Place, _Place, _Place]  # [m]
+    half_size: tuple[_Size, _Size, _Size]  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)

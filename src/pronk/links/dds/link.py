@@ -70,10 +70,8 @@ _LONGEST_BURST_S, _LONGEST_PAUSE_S = 0.1, 0.05
 class DdsNetwork:
     """A domain on an interface."""
 
-    interface: str | None = None
-    """By name, for instance `eth0`; None for loopback only."""
-    domain: int | None = None
-    """None for 0 where an interface is named, else pronk's own, 77."""
+    interface: str | None = None  # by name, for instance `eth0`; None for loopback only
+    domain: int | None = None  # None for 0 where an interface is named, else pronk's own, 77
 
     def __post_init__(self) -> None:
         domain = port_or_domain(
