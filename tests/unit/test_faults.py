@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pronk.errors import PronkError
-from pronk.virtual.faults import ChannelFaults, FaultChannel, Faults, flip_bit, parse_faults
+from pronk.virtual.faults import ChannelFaults, FaultChannel, Faults, parse_faults
 
 COUNT = 4000
 
@@ -78,12 +78,6 @@ def test_corruption_strikes_as_often_as_specified() -> None:
     assert not any(channel.strikes("nan", 1.5) for _ in range(100))
     assert {channel.pick(3) for _ in range(100)} == {0, 1, 2}
 
-
-def test_one_bit_is_flipped() -> None:
-    data = bytes(range(7, 12))
-    for bit in range(8 * len(data)):
-        changed = flip_bit(data, bit)
-        assert int.from_bytes(data, "little") ^ int.from_bytes(changed, "little") == 1 << bit
 
 
 def test_specifications_are_parsed_or_refused() -> None:

@@ -245,8 +245,9 @@ def decode_command(layout: Layout, data: bytes) -> Command:
     fields = message.decode(data)
     wire = layout.fields | {"position": "q_des"}
     found = _decoded(message, fields, wire, "position", "stiffness", "damping")
-    # Of Cheetah-Software's message the robot reads nothing else.
-    if layout is WTW and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
+    # Of Cheetah-Software's message the robot reads nothing else. The comparison is without the
+    # warning that a conversion of a signalling NaN to bool gives.
+    if layout is WTW and any((fields[name] != 0.0).any() for name in ("qd_des", "tau_ff")):
         raise RefusedError(
             "feed-forward",
             f"{message.name} commands a speed or a torque; only positions, stiffness and damping "
