@@ -79,7 +79,6 @@ def test_corruption_strikes_as_often_as_specified() -> None:
     assert {channel.pick(3) for _ in range(100)} == {0, 1, 2}
 
 
-
 def test_specifications_are_parsed_or_refused() -> None:
     text = (
         "loss=0.3, state.delay=5ms,command.jitter=200us,state.loss=0.5,nan=0.01,"
