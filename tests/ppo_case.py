@@ -41,33 +41,30 @@ def observe(rows: int = ROBOTS, *, jump: bool = True) -> TensorDict:
 def build(
     *,
     hidden: tuple[int, ...] = (32, 16),
+    read: tuple[str, ...] = ("measured", "jump"),
     observation: TensorDict | None = None,
     multi_gpu: dict[str, int] | None = None,
     **algorithm: Any,
 ) -> EstimatorPPO:
     """Build it as rsl_rl's runner does from mjlab's configuration."""
-    models = {
-        "actor": asdict(EstimatorActorCfg(hidden_dims=hidden)),
-        "critic": asdict(JumpCriticCfg(hidden_dims=hidden)),
-    }
-    for model in models.values():  # what mjlab's runner strips
-        for key in ("cnn_cfg", "distribution_cfg", "rnn_type"):
-            if model[key] is None:
-                del model[key]
-        del model["rnn_hidden_dim"], model["rnn_num_layers"]
+    models = {"actor": EstimatorActorCfg(), "critic": JumpCriticCfg()}
+    made = {name: {**asdict(model), "hidden_dims": hidden} for name, model in models.items()}
+    for model in made.values():  # what mjlab's runner strips
+        for key in ("cnn_cfg", "rnn_type", "rnn_hidden_dim", "rnn_num_layers"):
+            del model[key]
+    del made["critic"]["distribution_cfg"]
     cfg = {
-        **models,
+        **made,
         "algorithm": asdict(EstimatorPpoCfg(**algorithm)),
-        "obs_groups": {"actor": ["measured", "jump"], "critic": ["critic", "critic_jump"]},
+        "obs_groups": {"actor": [*read], "critic": ["critic", "critic_jump"]},
         "num_steps_per_env": STEPS,
         "multi_gpu": multi_gpu,
     }
     env: Any = SimpleNamespace(num_envs=ROBOTS, num_actions=12)
     start = observe() if observation is None else observation
-    made = EstimatorPPO.construct_algorithm(start, env, cfg, "cpu")
-    made.train_mode()
-    assert isinstance(made, EstimatorPPO)
-    return made
+    algorithm: Any = EstimatorPPO.construct_algorithm(start, env, cfg, "cpu")
+    algorithm.train_mode()
+    return algorithm
 
 
 def roll_out(algorithm: EstimatorPPO, observe: Any = observe) -> None:
@@ -82,12 +79,17 @@ def roll_out(algorithm: EstimatorPPO, observe: Any = observe) -> None:
         algorithm.compute_returns(observation)
 
 
+def learn(algorithm: EstimatorPPO, observe: Any = observe) -> None:
+    """One iteration."""
+    roll_out(algorithm, observe)
+    algorithm.update()
+
+
 def trained(updates: int = 2, *, jump: bool = True, **cfg: Any) -> EstimatorPPO:
     """An algorithm after some updates on observations with or without jump input."""
     algorithm = build(**cfg)
     for _ in range(updates):
-        roll_out(algorithm, lambda: observe(jump=jump))
-        algorithm.update()
+        learn(algorithm, lambda: observe(jump=jump))
     return algorithm
 
 

@@ -18,11 +18,11 @@ import pytest
 from hopper import DEFAULT, ROBOT, contract, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.policy.contract import METADATA_KEY, check, from_json, measured_layout, to_json
-from pronk.policy.observation import MEASURED, MEASURED_SIZE, History, Measurement, finite
+from pronk.policy.observation import MEASURED_SIZE, History, Measurement, finite
 from pronk.policy.runtime import Policy, load_policy
 
 SCALE = np.full(12, 0.5)
-WALK: dict[str, Any] = {"jump": False, "lift_off_velocity": None}
+WALK: dict[str, Any] = {"jump": False}
 
 
 def measurement(**changes: Any) -> Measurement:
@@ -38,29 +38,16 @@ def measurement(**changes: Any) -> Measurement:
 # --- Contract -----------------------------------------------------------------------------------
 
 
-def test_layout_by_hand() -> None:
-    layout = measured_layout(50.0)
-    three, two = (-0.04, -0.02, 0.0), (-0.04, -0.02)
-    assert [(part.name, part.size, part.times_s) for part in layout] == [
-        ("angular_velocity", 3, (0.0,)),
-        ("projected_gravity", 3, (0.0,)),
-        ("joint_position", 36, three),
-        ("joint_velocity", 36, three),
-        ("action", 24, two),
-        ("command", 3, (0.0,)),
-    ]
-    assert sum(part.size for part in layout) == MEASURED_SIZE == 105
-
-
 @pytest.mark.parametrize(
     "changes", [{}, WALK, {"gains": "naive", "gains_sha256": ""}, {"versions": {"torch": "2.13"}}]
 )
 def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
     before = contract(**changes)
-    text = to_json(before)
-    assert from_json(text, source="here") == before
-    old = json.loads(text) | {"waits_for_stride": False}
+    old = json.loads(to_json(before)) | {"waits_for_stride": False}
     assert from_json(json.dumps(old), source="here") == before
+
+
+BEYOND = {"vx": (-300.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 
 
 @pytest.mark.parametrize(
@@ -76,21 +63,25 @@ def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
         ({"policy_rate_hz": 100.0}, "policy_rate_hz"),
         ({"decimation": 0}, "policy_rate_hz"),
         ({"delay_range_s": (0.02, 0.01)}, "delay_range_s"),
+        ({"delay_range_s": (-0.1, 0.0)}, "delay_range_s"),
         ({"command_ranges": {"vx": (-1.0, 1.0)}}, "command_ranges"),
         ({"command_ranges": {"vx": (1, -1), "vy": (0, 0), "yaw_rate": (0, 0)}}, "of vx"),
         ({"jump": False}, "lift_off_velocity"),
         ({"lift_off_velocity": None}, "lift_off_velocity"),
+        # Beyond every robot.
+        ({"action_scale": (1e6,) * 12}, "action_scale"),
+        ({"delay_range_s": (0.0, 10.0)}, "delay_range_s"),
+        ({"stiffness": (1e9,) * 12}, "stiffness"),
+        ({"default_position": (1e3,) * 12}, "default_position"),
+        ({"lift_off_velocity": 1e3}, "lift_off_velocity"),
+        ({"command_ranges": BEYOND}, "command_ranges"),
+        ({"joint_names": ("..", *(f"j{i}" for i in range(11)))}, "name"),
         # Other types, fields and schemas.
         ({"schema": "pronk/policy/9"}, "pronk/policy/9"),
         ({"mass": 1.0}, "mass"),
-        ({"joint_names": "FR"}, "joint_names"),
-        ({"stiffness": ["a"] * 12}, "stiffness"),
         ({"stiffness": [True] * 12}, "stiffness"),
         ({"jump": 1}, "jump"),
-        ({"robot": None}, "robot"),
         ({"decimation": 4.5}, "decimation"),
-        ({"delay_range_s": [0.0]}, "delay_range_s"),
-        ({"versions": []}, "versions"),
         ({"observation": [{"name": "command"}]}, "observation"),
         ({"waits_for_stride": True}, "waits_for_stride"),
     ],
@@ -101,9 +92,10 @@ def test_a_contract_that_cannot_be_run_is_refused(changes: dict[str, Any], name:
         from_json(text, source="policy.onnx")
 
 
-def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ArtefactError, match="stiffness"):
-        contract(stiffness=(math.nan,) * 12)
+@pytest.mark.parametrize("name", ["stiffness", "damping"])
+def test_numbers_that_are_not_finite_are_refused(name: str) -> None:
+    with pytest.raises(ArtefactError, match=name):
+        contract(**{name: (math.nan,) * 12})
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}"])
@@ -141,31 +133,38 @@ def test_a_contract_for_another_robot_or_gains_is_refused(
 # --- The measured vector ------------------------------------------------------------------------
 
 
+def test_layout_by_hand() -> None:
+    three, two = (-0.04, -0.02, 0.0), (-0.04, -0.02)
+    assert [(part.name, part.size, part.times_s) for part in measured_layout(50.0)] == [
+        ("angular_velocity", 3, (0.0,)),
+        ("projected_gravity", 3, (0.0,)),
+        ("joint_position", 36, three),
+        ("joint_velocity", 36, three),
+        ("action", 24, two),
+        ("command", 3, (0.0,)),
+    ]
+
+
 def test_history_by_hand() -> None:
-    history = History(DEFAULT)
-    command = (1.0, -0.5, 0.25)
+    history, command = History(DEFAULT), (1.0, -0.5, 0.25)
+    # The first sample fills the history; no action came before it.
+    samples = [(1, 1, 1), (1, 1, 2), (1, 2, 3), (2, 3, 4)]
+    actions = [(0, 0), (0, 100), (100, 101), (101, 102)]
     for _ in range(2):  # the second time after a reset
-        vectors = []
-        for k in range(4):
+        for k, (positions, before) in enumerate(zip(samples, actions, strict=True)):
             velocity = np.full(12, -10.0 * (k + 1))
             now = measurement(position=DEFAULT + k + 1.0, velocity=velocity)
-            vectors.append(history.observe(now, command))
+            vector = history.observe(now, command)
             history.acted(np.full(12, 100.0 + k, np.float32))
-        # The first sample fills the history; no action came before it.
-        samples = [(1, 1, 1), (1, 1, 2), (1, 2, 3), (2, 3, 4)]
-        actions = [(0, 0), (0, 100), (100, 101), (101, 102)]
-        for vector, positions, before in zip(vectors, samples, actions, strict=True):
-            expected = {
-                "angular_velocity": np.zeros(3),
-                "projected_gravity": (0, 0, -1),
-                "joint_position": np.repeat(positions, 12),
-                "joint_velocity": -10.0 * np.repeat(positions, 12),
-                "action": np.repeat(before, 12),
-                "command": command,
-            }
-            for name, values in expected.items():
-                found = vector[list(MEASURED[name])]
-                np.testing.assert_allclose(found, values, atol=1e-6)
+            expected = [
+                *np.zeros(3),
+                *(0, 0, -1),
+                *np.repeat(positions, 12),
+                *-10.0 * np.repeat(positions, 12),
+                *np.repeat(before, 12),
+                *command,
+            ]
+            np.testing.assert_allclose(vector, expected, atol=1e-6)
             assert vector.dtype == np.float32
         history.reset()
 
@@ -202,22 +201,22 @@ def write_network(path: Path, metadata: dict[str, str], *, jump: bool, width: in
     """A linear network: action, contact and velocity are columns of (measured, jump) WEIGHTS."""
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    helper, tensor = onnx.helper, onnx.numpy_helper.from_array
     inputs = {"measured": width} | ({"jump": 1} if jump else {})
     outputs = {"action": 12, "contact": 4, "linear_velocity": 3}
+
+    def values(sizes: dict[str, int]) -> list[Any]:
+        kind = onnx.TensorProto.FLOAT
+        return [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in sizes.items()]
+
     weights = np.concatenate([WEIGHTS[:width], WEIGHTS[MEASURED_SIZE:]])[: width + jump]
-    tensor = onnx.numpy_helper.from_array
-    graph = helper.make_graph(
-        [
-            helper.make_node("Concat", list(inputs), ["x"], axis=1),
-            helper.make_node("MatMul", ["x", "weights"], ["y"]),
-            helper.make_node("Split", ["y", "sizes"], list(outputs), axis=1),
-        ],
-        "linear",
-        [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in inputs.items()],
-        [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in outputs.items()],
-        [tensor(weights, "weights"), tensor(np.array([12, 4, 3]), "sizes")],
-    )
+    nodes = [
+        helper.make_node("Concat", list(inputs), ["x"], axis=1),
+        helper.make_node("MatMul", ["x", "weights"], ["y"]),
+        helper.make_node("Split", ["y", "sizes"], list(outputs), axis=1),
+    ]
+    given = [tensor(weights, "weights"), tensor(np.array([12, 4, 3]), "sizes")]
+    graph = helper.make_graph(nodes, "linear", values(inputs), values(outputs), given)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     helper.set_model_props(model, metadata)
     path.write_bytes(model.SerializeToString())
@@ -233,11 +232,6 @@ def write_policy(folder: Path, **changes: Any) -> Path:
 @pytest.fixture
 def jumper(tmp_path: Path) -> Policy:
     return load_policy(write_policy(tmp_path))
-
-
-@pytest.fixture
-def walker(tmp_path: Path) -> Policy:
-    return load_policy(write_policy(tmp_path, **WALK))
 
 
 def test_the_contract_can_be_read_without_pronk(tmp_path: Path) -> None:
@@ -282,7 +276,8 @@ def test_a_batch_is_its_rows(jumper: Policy) -> None:
     np.testing.assert_array_equal(jumper.infer(measured).action, still.action)
 
 
-def test_a_refused_step_changes_nothing(walker: Policy) -> None:
+def test_a_refused_step_changes_nothing(tmp_path: Path) -> None:
+    walker = load_policy(write_policy(tmp_path, **WALK))
     first = walker.step(measurement(), np.ones(3))
     walker.reset()
     moved = measurement(position=DEFAULT + 1.0)
@@ -310,9 +305,10 @@ def test_inputs_and_outputs_that_are_not_finite_are_refused(jumper: Policy) -> N
 
 def test_files_that_hold_no_policy_are_refused(tmp_path: Path) -> None:
     whole = write_policy(tmp_path).read_bytes()
-    (tmp_path / "half.onnx").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "text.onnx").write_text("not a network")
-    (tmp_path / "empty.onnx").write_bytes(b"")
+    damaged = {"half": whole[: len(whole) // 2], "text": b"not a network", "empty": b""}
+    damaged["metadata"] = whole.replace(b"mini_cheetah", b"mini_cheeta\xff")
+    for name, content in damaged.items():
+        (tmp_path / f"{name}.onnx").write_bytes(content)
     write_network(tmp_path / "foreign.onnx", {"author": "someone"}, jump=False)
     write_network(tmp_path / "odd.onnx", {METADATA_KEY: "{}"}, jump=True)
     walks = to_json(contract(**WALK))
@@ -321,12 +317,12 @@ def test_files_that_hold_no_policy_are_refused(tmp_path: Path) -> None:
     mixed = msgspec.structs.replace(contract(), observation=measured_layout(50.0)[::-1])
     write_network(tmp_path / "mixed.onnx", {METADATA_KEY: to_json(mixed)}, jump=True)
     names = [path.name for path in tmp_path.iterdir() if path.name != "policy.onnx"]
+    assert len(names) == 9
     for name in (*names, "none.onnx", ""):
         with pytest.raises(ArtefactError) as refusal:
             load_policy(tmp_path / name)
         assert str(refusal.value).startswith(f"{tmp_path / name}: ")
         assert "\n" not in str(refusal.value)
-    assert len(names) == 8
 
 
 def test_without_onnx_runtime_its_extra_is_named(
@@ -338,22 +334,30 @@ def test_without_onnx_runtime_its_extra_is_named(
         load_policy(path)
 
 
-@pytest.mark.parametrize("kind", ["Loop", "ConstantOfShape", "Expand", "If", "domain", "function"])
-def test_a_network_with_other_operators_is_refused_unseen(tmp_path: Path, kind: str) -> None:
+KINDS = ("Loop", "ConstantOfShape", "Expand", "If", "domain", "function")
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "nodes", "weights of another file"])
+def test_a_network_beyond_a_plain_one_is_refused_unseen(tmp_path: Path, kind: str) -> None:
     onnx = pytest.importorskip("onnx")
     path = write_hopper(tmp_path / "policy.onnx")
     load_policy(path)
     model = onnx.load(path)
+    graph, node = model.graph, onnx.helper.make_node
     if kind == "function":
-        made = [onnx.helper.make_node("Add", ["x", "x"], ["y"])]
+        made = [node("Add", ["x", "x"], ["y"])]
         opset = [onnx.helper.make_opsetid("", 17)]
         model.functions.append(onnx.helper.make_function("", "Add", ["x"], ["y"], made, opset))
     elif kind == "domain":
-        model.graph.node[0].domain = "evil"
+        graph.node[0].domain = "evil"
+    elif kind == "nodes":
+        graph.node.extend(node("Identity", ["one"], [f"x{i}"]) for i in range(3000))
+    elif kind == "weights of another file":
+        onnx.external_data_helper.set_external_data(graph.initializer[0], "/dev/zero")
     else:
-        model.graph.node.append(onnx.helper.make_node(kind, ["one"], ["large"]))
-    onnx.save(model, path)
-    with pytest.raises(ArtefactError, match="may use"):
+        graph.node.append(node(kind, ["one"], ["large"]))
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(ArtefactError, match="may use" if kind in KINDS else kind):
         load_policy(path)
 
 
@@ -379,46 +383,3 @@ def test_a_network_that_doubles_a_tensor_is_refused_before_the_memory_is_taken(
     with pytest.raises(ArtefactError):
         load_policy(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - most < 300 << 10
-
-
-@pytest.mark.parametrize("kind", ["nodes", "weights of another file"])
-def test_a_network_of_many_nodes_or_other_files_is_refused_unseen(
-    tmp_path: Path, kind: str
-) -> None:
-    onnx = pytest.importorskip("onnx")
-    path = write_hopper(tmp_path / "policy.onnx")
-    model = onnx.load(path)
-    if kind == "nodes":
-        made = [onnx.helper.make_node("Identity", ["one"], [f"x{i}"]) for i in range(3000)]
-        model.graph.node.extend(made)
-    else:
-        onnx.external_data_helper.set_external_data(model.graph.initializer[0], "/dev/zero")
-    path.write_bytes(model.SerializeToString())
-    with pytest.raises(ArtefactError, match=kind):
-        load_policy(path)
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"action_scale": (1e6,) * 12},
-        {"delay_range_s": (0.0, 10.0)},
-        {"delay_range_s": (-0.1, 0.0)},
-        {"stiffness": (1e9,) * 12},
-        {"damping": (float("nan"),) * 12},
-        {"default_position": (1e3,) * 12},
-        {"lift_off_velocity": 1e3},
-        {"command_ranges": {"vx": (-300.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}},
-        {"joint_names": ("..", *(f"j{i}" for i in range(11)))},
-    ],
-)
-def test_a_contract_beyond_every_robot_is_refused(changed: dict[str, Any]) -> None:
-    with pytest.raises(ArtefactError):
-        contract(**changed)
-
-
-def test_metadata_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    path = write_hopper(tmp_path / "policy.onnx")
-    path.write_bytes(path.read_bytes().replace(b"mini_cheetah", b"mini_cheeta\xff"))
-    with pytest.raises(ArtefactError):
-        load_policy(path)

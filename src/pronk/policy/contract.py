@@ -127,14 +127,15 @@ class Contract(
             numbers = np.ravel(0.0 if value is None else value)
             met = bool((np.abs(numbers) <= most).all())
             _demand(met, name, value, f"finite and within {most:g} of 0")
-        _demand(self.delay_range_s[0] >= 0.0, "delay_range_s", self.delay_range_s, "not negative")
         for name in ("default_position", "action_scale", "stiffness", "damping"):
             values = getattr(self, name)
             _demand(len(values) == n, name, values, f"one number for each of the {n} joints")
-            _demand(all(map(math.isfinite, values)), name, values, "finite")
-            if name in ("action_scale", "stiffness"):
-                _demand(all(value > 0.0 for value in values), name, values, "positive")
-        _demand(min(self.damping, default=0.0) >= 0.0, "damping", self.damping, "not negative")
+        for name in ("action_scale", "stiffness"):
+            values = getattr(self, name)
+            _demand(all(value > 0.0 for value in values), name, values, "positive")
+        for name in ("delay_range_s", "damping"):
+            values = getattr(self, name)
+            _demand(min(values, default=0.0) >= 0.0, name, values, "not negative")
         _demand(self.gains in GAINS, "gains", self.gains, " or ".join(GAINS))
         _demand(
             re.fullmatch("[0-9a-f]{64}", self.gains_sha256) is not None
@@ -154,13 +155,11 @@ class Contract(
         _demand(commands == COMMANDS, "command_ranges", commands, f"of {', '.join(COMMANDS)}")
         ranges = {f"command_ranges of {k}": v for k, v in self.command_ranges.items()}
         for name, (low, high) in {**ranges, "delay_range_s": self.delay_range_s}.items():
-            rising = math.isfinite(low) and math.isfinite(high) and low <= high
-            _demand(rising, name, (low, high), "finite, the smaller number first")
-        velocity = self.lift_off_velocity
+            _demand(low <= high, name, (low, high), "finite, the smaller number first")
         _demand(
-            self.jump == (velocity is not None) and math.isfinite(velocity or 0.0),
+            self.jump == (self.lift_off_velocity is not None),
             "lift_off_velocity",
-            velocity,
+            self.lift_off_velocity,
             "a number for a policy that jumps and null for one that does not",
         )
 
@@ -205,34 +204,24 @@ def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = No
         _demand(got == want, field, got, f"{want!r}, as the robot has it")
     for joint, position in zip(robot.joints, contract.default_position, strict=True):
         low, high = joint.range
-        _demand(
-            low <= position <= high,
-            f"default_position of {joint.name}",
-            position,
-            f"within the joint's limits, {low} to {high} rad",
-        )
+        name, expected = f"default_position of {joint.name}", f"{low} to {high} rad"
+        met = low <= position <= high
+        _demand(met, name, position, f"within the joint's limits, {expected}")
     for name in ("stiffness", "damping"):
         gains = dict(zip(contract.joint_names, getattr(contract, name), strict=True))
         for joint in robot.joints:
             # Matched gains are per group; naive ones are those of the real drive.
-            if contract.gains == "naive":
-                expected, reason = getattr(joint, name), "that of the drive"
-            else:
+            expected, reason = getattr(joint, name), "that of the drive"
+            if contract.gains != "naive":
                 expected = gains[robot.group(joint.group)[0].name]
                 reason = f"as in all of {joint.group}"
-            _demand(
-                math.isclose(gains[joint.name], expected, rel_tol=1e-6),
-                f"{name} of {joint.name}",
-                gains[joint.name],
-                f"{expected:g}, {reason}",
-            )
+            got = gains[joint.name]
+            met = math.isclose(got, expected, rel_tol=1e-6)
+            _demand(met, f"{name} of {joint.name}", got, f"{expected:g}, {reason}")
     if gains_sha256 is not None:
-        _demand(
-            contract.gains_sha256 == gains_sha256,
-            "gains_sha256",
-            contract.gains_sha256,
-            f"{gains_sha256!r}, that of the given gains",
-        )
+        got = contract.gains_sha256
+        expected = f"{gains_sha256!r}, that of the given gains"
+        _demand(got == gains_sha256, "gains_sha256", got, expected)
 
 
 def _demand(met: bool, name: str, got: object, expected: str) -> None:

@@ -45,9 +45,8 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
     or `all`, the first alone if None. A PronkError if there is no such GPU.
     """
     words = [] if gpu_ids is None else [word.strip() for word in gpu_ids.split(",")]
-    if words != ["all"] and not (
-        all(word.isdigit() for word in words) and len(set(words)) == len(words)
-    ):
+    numbers = all(word.isdigit() for word in words)
+    if words != ["all"] and not (numbers and len(set(words)) == len(words)):
         raise PronkError(f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all.")
     if requested == "cpu":
         if words:
@@ -64,13 +63,13 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
         return ()
     if words == ["all"]:
         return found
-    numbers = [int(word) for word in words] or [0]
-    if max(numbers) >= len(found):
+    chosen = [int(word) for word in words] or [0]
+    if max(chosen) >= len(found):
         raise PronkError(
             f"--gpu-ids {gpu_ids}: this host has {len(found)} visible GPU(s), numbered 0 to "
             f"{len(found) - 1}."
         )
-    return tuple(found[i] for i in numbers)
+    return tuple(found[i] for i in chosen)
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -78,11 +77,10 @@ def visible_gpus() -> tuple[str, ...]:
     import torch
 
     count = torch.cuda.device_count()
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is None:
-        return tuple(str(i) for i in range(count))
+    every = ",".join(map(str, range(count)))
+    named = os.environ.get("CUDA_VISIBLE_DEVICES", every).split(",")
     # The variable may name more than there are.
-    return tuple(word.strip() for word in named.split(",") if word.strip())[:count]
+    return tuple(word.strip() for word in named if word.strip())[:count]
 
 
 def device_facts(device: str, count: int = 1) -> dict[str, Any]:
@@ -119,7 +117,7 @@ def compile_kernels(device: str) -> None:
 
 
 def check_cuda_graphs(simulation: Any) -> str | None:
-    """A warning if mjlab's simulation on a GPU runs without CUDA graphs; None if all is well."""
+    """A warning if mjlab's simulation on a GPU runs without CUDA graphs."""
     if simulation.use_cuda_graph:
         return None
     import warp as wp

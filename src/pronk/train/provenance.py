@@ -50,7 +50,7 @@ class RunFolder:
         return self.path / "gains.yaml"
 
     def checkpoint(self) -> Path:
-        """The last checkpoint; ArtefactError if there is none."""
+        """The last numbered checkpoint; ArtefactError if there is none."""
         found = checkpoint.latest(self.path)
         if found is None:
             raise ArtefactError(
@@ -64,13 +64,14 @@ class RunFolder:
         """Keep other processes from training in this folder inside the block."""
         handle = os.open(self.path, os.O_RDONLY)
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise PronkError(
-                    f"--out {self.path}: another process is training in it; wait for it, or give "
-                    "another folder."
-                ) from None
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(handle)
+            raise PronkError(
+                f"--out {self.path}: another process is training in it; wait for it, or give "
+                "another folder."
+            ) from None
+        try:
             yield
         finally:
             os.close(handle)
@@ -99,14 +100,14 @@ class RunFolder:
         except (OSError, ValueError, RecursionError) as error:
             text = f"{path}: cannot be read as JSON ({type(error).__name__})."
             raise ArtefactError(text) from error
-        if not isinstance(found, dict) or found.get("schema") != SCHEMA:
-            got = found.get("schema") if isinstance(found, dict) else type(found).__name__
-            raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")
+        schema = found.get("schema") if isinstance(found, dict) else type(found).__name__
+        if schema != SCHEMA:
+            raise ArtefactError(f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r}.")
         return found
 
     @contextmanager
     def changed(self) -> Iterator[dict[str, Any]]:
-        """Read the provenance, let the block change it, and write it whole or not at all."""
+        """Read the provenance, let the block change it, and write it."""
         found = self.read()
         yield found
         self.write(found)

@@ -64,24 +64,20 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
 
     task = load_task(str(settings.robot))
     gains = training_gains(settings.gains or NAIVE, task.robot, like=settings.ranges_from)
-    first = settings.init_checkpoint
+    first, file = settings.init_checkpoint, settings.gains_file
     start = None if first is None else initial_state(first, settings.iterations["walk"])
     task.env_cfg(task.robot, gains, **_options(settings))  # refuses impossible gains
     folder.path.mkdir(parents=True, exist_ok=True)
-    if settings.gains_file is not None:
+    if file is not None:
         with written_whole(folder.gains) as aside:
-            shutil.copyfile(settings.gains_file, aside)
+            shutil.copyfile(file, aside)
     if start is not None:
         checkpoint.write(folder.path / f"model_{start['iter']}.pt", start)
+    about = {"sha256": gains.sha256, "virtual": gains.virtual}
     found: dict[str, Any] = {
         "schema": provenance.SCHEMA,
         "settings": settings.stored_values(),
-        "gains": {
-            "name": gains.name,
-            "file": settings.gains_file and settings.gains_file.name,
-            "sha256": gains.sha256,
-            "virtual": gains.virtual,
-        },
+        "gains": {"name": gains.name, "file": file and file.name, **about},
         "start_sha256": "" if start is None else start["infos"]["start_sha256"],
         "phases": {},
         "finished": False,
@@ -103,7 +99,7 @@ def initial_state(path: Path, iterations: int) -> dict[str, Any]:
             f"--init-checkpoint {path}: no {'such file' if source == path else 'walk.pt'}; "
             "expected the folder of a run whose phase walk is over, or one of its checkpoints."
         )
-    state = checkpoint.widen_checkpoint(checkpoint.read(source))
+    state = checkpoint.read(source)
     infos = state["infos"] or {}
     if checkpoint.jumps(state) or {"jump_a", "jump_b"} & set(infos.get("phases", ())):
         raise ArtefactError(
@@ -255,10 +251,9 @@ def stop_signals(runner: Any) -> Iterator[None]:
     main = threading.current_thread() is threading.main_thread()
     before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM) if main}
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        name = signal.Signals(number)
-        signal.signal(name, before[name])
-        runner.stop_reason = name.name
+    def stop(number: int, _: FrameType | None) -> None:
+        signal.signal(number, before[signal.Signals(number)])
+        runner.stop_reason = signal.Signals(number).name
 
     for number in before:
         signal.signal(number, stop)

@@ -53,10 +53,10 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and options that do not go together."""
-        for name, least in (("envs", 2), ("seed", 0), ("save_interval", 1)):
-            value = getattr(self, name)
+        limits = {"envs": (self.envs, 2), "seed": (self.seed, 0)}
+        limits["save-interval"] = (self.save_interval, 1)
+        for option, (value, least) in limits.items():
             if value is not None and not least <= value < 2**31:
-                option = name.replace("_", "-")
                 raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
         if self.minutes is not None and not self.minutes > 0.0:
             raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
@@ -110,7 +110,7 @@ class TrainSettings:
                 "jump needs --init-checkpoint: the folder of a walking run, or one of its "
                 "checkpoints; `pronk train all` does both."
             )
-        defaults: dict[str, Any]
+        defaults: Mapping[str, Any]
         defaults = {"robot": "mini_cheetah", "envs": 4096, "seed": 1, "ellipsoid": False}
         return replace(self, **{n: v for n, v in defaults.items() if getattr(self, n) is None})
 

@@ -129,7 +129,7 @@ def load_subject(path: Path, device: str) -> Subject:
     if path.suffix == ".onnx":
         return _exported(path, device)
     found = RunFolder(path).checkpoint() if path.is_dir() else path
-    state = checkpoint.widen_checkpoint(checkpoint.read(found))
+    state = checkpoint.read(found)
     actor = blank_actor()
     try:
         actor.load_state_dict(state["actor_state_dict"])

@@ -1,8 +1,8 @@
 """The state of a jump, from the command to the ground: the quantities that jump rewards pay for.
 
-All quantities are one for each robot, shape (N,), sampled once in a policy step (20 ms). A robot is
-airborne when no foot touches the ground. It is in jump mode from the rising edge of the jump input
-until the input is off, a foot is on the ground, and `settle_s` have passed.
+All are (N,), one for each robot, sampled once in a policy step (20 ms). A robot is airborne when no
+foot touches the ground. It is in jump mode from the rising edge of the jump input until the input
+is off, a foot is on the ground, and `settle_s` have passed.
 
 Within one command only an improvement on the best so far is paid, so that many small hops earn no
 more than one good jump: the paper's exp(-(v - 2.5)^2 / 2), paid at every lift-off, still pays a
@@ -95,7 +95,7 @@ class JumpSettings:
 
 
 class JumpState:
-    """State of the jumps of N robots, and what changed in the last policy step."""
+    """State of the jumps of N robots; a `gain` is the increase of a best in the last step."""
 
     def __init__(self, count: int, device: torch.device | str, settings: JumpSettings) -> None:
         self.settings = settings
@@ -126,7 +126,6 @@ class JumpState:
         self.best_score = zeros()
         """Best lift-off score of this command."""
         self.score_gain = zeros()
-        """Improvement of the lift-off score in the last step."""
         self.liftoffs = zeros()
         """Number of lift-offs of this command that are no strides."""
         self.hop = zeros()
@@ -138,7 +137,6 @@ class JumpState:
         self.travel = zeros()
         """Height of the jump so far, `highest` minus `lowest`, at most `max_travel` [m]."""
         self.travel_gain = zeros()
-        """Increase of `travel` in the last step [m]."""
         self.flight = zeros()
         """Ground covered in the present flight, scaled, less the part due to overspeed [m]."""
         self.overspeed_distance = zeros()
@@ -146,13 +144,11 @@ class JumpState:
         self.best_flight = zeros()
         """`flight` of the best flight of this command [m]."""
         self.flight_gain = zeros()
-        """Increase of `best_flight` in the last step [m]."""
         self.stance = zeros(4, 2)
         """Last position of each foot on the ground, world frame [m]. (N, 4, 2)"""
         self.best_gap = zeros()
         """Widest gap that a flight of this command has cleared, scaled [m]."""
         self.gap_gain = zeros()
-        """Increase of `best_gap` in the last step [m]."""
         self.similarity = zeros()
         """Similarity of the legs' lengths to a countermovement's, 0 to 1; 0 from the first lift-off
         or `prompt_s` on."""
@@ -200,11 +196,9 @@ class JumpState:
         begins = jump & ~self.commanded
         keep = ~begins
         self.overspeed = torch.where(begins, excess.clamp_min(0.0), self.overspeed)
-        self.settling = torch.where(
-            jump,
-            s.settle_s,
-            torch.where(airborne, self.settling, (self.settling - dt).clamp_min(0.0)),
-        )
+        on_the_ground = (self.settling - dt).clamp_min(0.0)
+        self.settling = torch.where(airborne, self.settling, on_the_ground)
+        self.settling = torch.where(jump, s.settle_s, self.settling)
         self.mode = self.settling > 0.0
         self.since = (self.since * keep + dt) * self.mode
 

@@ -1,7 +1,6 @@
 """Motion of the robots in the last policy step: measured once, used by every reward.
 
-mjlab's derived quantities (feet, forces) lag positions by one physics step here, as in all its
-rewards.
+Derived quantities (feet, forces) lag positions by one physics step, as in all rewards of mjlab.
 """
 
 from __future__ import annotations
@@ -87,10 +86,7 @@ def standing_leg(body: Legged) -> float:
 def measure_motion(
     env: ManagerBasedRlEnv, body: Legged, feet: Tensor, before: Motion | None
 ) -> Motion:
-    """Measure the step just simulated, of an environment in which nothing but the robot moves.
-
-    `feet` has the foot sites' ids in the model, (L,); `before` is the step before, if any.
-    """
+    """Measure the step just simulated; `feet` are the foot sites' ids in the model, (L,)."""
     robot, physics = env.scene["robot"].data, env.sim.data
     ground = env.scene["feet"].data
     # Copies: a reset writes to the state before `Motion.reset` is called.

@@ -1,7 +1,7 @@
 """mjlab's reward manager with all terms weighed and summed together.
 
 mjlab's own takes seven operations a term. On a GPU a step is bound by the number of operations, and
-with thirty terms the difference is a fifth of a step. Values, weights and logs are the same.
+with thirty terms the difference is a fifth of a step.
 """
 
 from __future__ import annotations
@@ -32,21 +32,19 @@ class StackedRewardManager(RewardManager):
         self._sums = torch.zeros(len(self._term_names), self.num_envs, device=self.device)
         """Of each term and robot in this episode. (terms, N)"""
         self._zero = torch.zeros(self.num_envs, device=self.device)
-        self._weights: tuple[float, ...] = ()
-        self._weight_tensor = torch.zeros(0, 1, device=self.device)
+        self._weights: list[float] = []
 
     def compute(self, dt: float) -> Tensor:
         """Reward of the step. (N,)."""
         terms = self._term_cfgs
-        weights = tuple(term.weight for term in terms)
+        weights = [term.weight for term in terms]
         if weights != self._weights:
             self._weights = weights
             self._weight_tensor = torch.tensor(weights, device=self.device)[:, None]
-        values = torch.stack(
-            [t.func(self._env, **t.params) if t.weight else self._zero for t in terms]
-        )
+        values = [t.func(self._env, **t.params) if t.weight else self._zero for t in terms]
         # A robot whose state is not finite ends its episode; its last reward must be finite.
-        rates = torch.nan_to_num(values * self._weight_tensor, nan=0.0, posinf=0.0, neginf=0.0)
+        rates = torch.stack(values) * self._weight_tensor
+        rates = torch.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
         scale = dt if self._scale_by_dt else 1.0
         self._sums.add_(rates, alpha=scale)
         self._step_reward = rates.T

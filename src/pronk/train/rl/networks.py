@@ -67,7 +67,8 @@ class JumpLinear(nn.Linear):
 
     y = (x[:in] weight^T + bias) + x[in:] jump_weight^T. With a zero `jump_weight` y is bit for bit
     that of `nn.Linear` for x[:in]. One matrix product over all inputs would not be: with one column
-    more it is summed in another order.
+    more it is summed in another order. A state without `jump_weight` is loaded as one with zeros
+    (Net2Net, paper N3).
     """
 
     def __init__(self, layer: nn.Linear, jump_size: int) -> None:
@@ -83,6 +84,10 @@ class JumpLinear(nn.Linear):
         narrow = x[..., : self.in_features].contiguous()
         jump = x[..., self.in_features :]
         return super().forward(narrow) + nn.functional.linear(jump, self.jump_weight)
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state.setdefault(f"{prefix}{JUMP_WEIGHT}", torch.zeros_like(self.jump_weight))
+        super()._load_from_state_dict(state, prefix, *rest)
 
 
 class RolloutNormalization(EmpiricalNormalization):
@@ -120,9 +125,7 @@ class JumpModel(MLPModel):
     """An MLP over a normalized group and a raw jump group behind it."""
 
     group: ClassVar[str]
-    """The group that is normalized."""
     jump_group: ClassVar[str]
-    """The group that is not."""
     jump_size: int
 
     def __init__(self, *args: Any, **cfg: Any) -> None:
@@ -146,14 +149,14 @@ class JumpModel(MLPModel):
     def get_latent(
         self, obs: Observations, masks: Tensor | None = None, hidden_state: Any = None
     ) -> Tensor:
-        """The network's input: the normalized group, then the jump group as it is."""
+        """The network's input."""
         return torch.cat([self.obs_normalizer(obs[self.group]), obs[self.jump_group]], dim=-1)
 
     def update_normalization(self, obs: TensorDict) -> None:
         """No-op: rsl_rl calls it in every step; see `learn_normalization`."""
 
     def learn_normalization(self, obs: Observations, world_size: int = 1) -> None:
-        """Update the statistics with the observations of a rollout, in all processes."""
+        """Update the statistics with the observations of a rollout."""
         if self.obs_normalization:
             self.obs_normalizer.learn(obs[self.group], world_size)
 
@@ -181,10 +184,8 @@ class Estimator(nn.Module):
 
         `target` has contacts (0 or 1), then velocity, (N, 7).
         """
-        sizes = list(ESTIMATE.values())
-        (contact, velocity), (true_contact, true_velocity) = (
-            each.split(sizes, dim=-1) for each in (self.mlp(x), target)
-        )
+        contact, velocity = self.mlp(x).split(list(ESTIMATE.values()), dim=-1)
+        true_contact, true_velocity = target.split(list(ESTIMATE.values()), dim=-1)
         return (
             nn.functional.binary_cross_entropy_with_logits(contact, true_contact),
             nn.functional.mse_loss(velocity, true_velocity),
@@ -192,11 +193,7 @@ class Estimator(nn.Module):
 
 
 class EstimatorActor(JumpModel):
-    """The estimator and, behind it, the network that acts.
-
-    Its input is the estimate (4 contact probabilities, 3 velocities), the current part of the
-    normalized measurement (45), and the jump input. No gradient of PPO passes through the estimate.
-    """
+    """The estimator and, behind it, the network that acts, which gets no gradient through it."""
 
     group = "measured"
     jump_group = "jump"
@@ -220,7 +217,7 @@ class EstimatorActor(JumpModel):
     def get_latent(
         self, obs: Observations, masks: Tensor | None = None, hidden_state: Any = None
     ) -> Tensor:
-        """The acting network's input, (..., 52 + jump)."""
+        """The acting network's input: estimate 7, current measurement 45, jump input."""
         measured = self.obs_normalizer(obs[self.group])
         with torch.no_grad():
             estimate = self.estimator(self._estimator_input(measured, obs))

@@ -76,7 +76,7 @@ class EstimatorPPO(PPO):
         estimator_velocity_coef: float,
         **cfg: Any,
     ) -> None:
-        """Called by rsl_rl with the fields of `EstimatorPpoCfg`, which are checked."""
+        """Called by rsl_rl with the fields of `EstimatorPpoCfg`."""
         if TARGET_GROUP not in storage.observations.keys():  # noqa: SIM118 (a TensorDict)
             raise PronkError(
                 f"the environment gives the groups {', '.join(storage.observations.keys())};"
@@ -98,8 +98,8 @@ class EstimatorPPO(PPO):
         ).unbind()
         # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
         estimator = list(actor.estimator.parameters())
-        own = {id(parameter) for parameter in estimator}
-        others = [p for p in (*actor.parameters(), *critic.parameters()) if id(p) not in own]
+        own = set(estimator)
+        others = [p for p in (*actor.parameters(), *critic.parameters()) if p not in own]
         # On a GPU the fused kernel steps all parameters at once; PyTorch's default launches a dozen
         # kernels a step.
         fused: dict[str, Any] = {"fused": True} if estimator[0].is_cuda else {}
@@ -122,21 +122,17 @@ class EstimatorPPO(PPO):
         return losses
 
     def _update_estimator(self) -> dict[str, float]:
-        actor, optimizer = self._raw_actor, self.estimator_optimizer
-        parameters = list(actor.estimator.parameters())
+        estimator, optimizer = self._raw_actor.estimator, self.estimator_optimizer
+        parameters = list(estimator.parameters())
         observations = self.storage.observations
         with torch.no_grad():
-            inputs = actor.estimator_input(observations).flatten(0, 1)
+            inputs = self._raw_actor.estimator_input(observations).flatten(0, 1)
         targets = observations[TARGET_GROUP].flatten(0, 1)
         history: list[Tensor] = []
         for _ in range(self.estimator_epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
-            batches = (
-                whole[order].tensor_split(self.estimator_mini_batches)
-                for whole in (inputs, targets)
-            )
-            for batch, target in zip(*batches, strict=True):
-                losses = actor.estimator.losses(batch, target)
+            for rows in order.tensor_split(self.estimator_mini_batches):
+                losses = estimator.losses(inputs[rows], targets[rows])
                 optimizer.zero_grad()
                 torch.autograd.backward(losses, self._coefficients)
                 if self.gpu_world_size > 1:
@@ -163,11 +159,14 @@ class EstimatorPPO(PPO):
         With the step count of the other weights, zero moments would count as a long average, and
         the first step would be (1 - 0.9) / sqrt(1 - 0.999) = 3.2 learning rates long.
         """
-        for model in (self._raw_actor, self._raw_critic):
-            for name, parameter in model.named_parameters():
-                if name.endswith(JUMP_WEIGHT):
-                    self.optimizer.state.pop(parameter, None)
-                    self.estimator_optimizer.state.pop(parameter, None)
+        for parameter in self._jump_weights():
+            self.optimizer.state.pop(parameter, None)
+            self.estimator_optimizer.state.pop(parameter, None)
+
+    def _jump_weights(self) -> set[Tensor]:
+        models = (self._raw_actor, self._raw_critic)
+        named = (pair for model in models for pair in model.named_parameters())
+        return {parameter for name, parameter in named if name.endswith(JUMP_WEIGHT)}
 
     def save(self) -> dict[str, Any]:
         """State of the networks and both optimizers."""
@@ -181,7 +180,28 @@ class EstimatorPPO(PPO):
         load_cfg: Mapping[str, bool] | None = None,
         strict: bool = True,
     ) -> bool:
-        """Load what `save` gave; `load_cfg` as rsl_rl has it, its `optimizer` means both."""
+        """Load what `save` gave; `load_cfg` as rsl_rl has it, its `optimizer` means both.
+
+        A state of networks without jump inputs is widened: they get weights of zero, and Adam keeps
+        moments and step counts of every weight that was there.
+        """
+        state = dict(loaded_dict)
         if load_cfg is None or load_cfg.get("optimizer"):
-            self.estimator_optimizer.load_state_dict(loaded_dict["estimator_optimizer_state_dict"])
-        return bool(super().load(loaded_dict, load_cfg, strict))
+            for name in ("optimizer", "estimator_optimizer"):
+                key = f"{name}_state_dict"
+                state[key] = self._widened(state[key], getattr(self, name))
+            self.estimator_optimizer.load_state_dict(state[key])
+        return bool(super().load(state, load_cfg, strict))
+
+    def _widened(
+        self, narrow: Mapping[str, Any], optimizer: torch.optim.Optimizer
+    ) -> Mapping[str, Any]:
+        """Number the parameters of an optimizer's state as `optimizer` does."""
+        (group,) = narrow["param_groups"]
+        wide, jump = optimizer.param_groups[0]["params"], self._jump_weights()
+        kept = [i for i, parameter in enumerate(wide) if parameter not in jump]
+        if len(group["params"]) != len(kept):
+            return narrow  # of networks that have the inputs, or of others
+        places = dict(zip(group["params"], kept, strict=True))
+        moments = {places[i]: moment for i, moment in narrow["state"].items()}
+        return {"state": moments, "param_groups": [{**group, "params": list(range(len(wide)))}]}

@@ -46,16 +46,8 @@ class DeviceLogger(Logger):
     """
 
     def __init__(self, runner: PronkRunner) -> None:
-        super().__init__(
-            log_dir=runner.logger.log_dir,
-            cfg=runner.cfg,
-            env_cfg=runner.env.cfg,
-            num_envs=runner.env.num_envs,
-            is_distributed=runner.is_distributed,
-            gpu_world_size=runner.gpu_world_size,
-            gpu_global_rank=runner.gpu_global_rank,
-            device=runner.device,
-        )
+        """Take the place of the logger that rsl_rl has given the runner."""
+        vars(self).update(vars(runner.logger))
         self.device = "cpu"
         """rsl_rl averages the figures of an iteration here."""
         self._runner = runner
@@ -70,7 +62,7 @@ class DeviceLogger(Logger):
         extras: dict[str, Any],
         intrinsic_rewards: Tensor | None = None,
     ) -> None:
-        """Add the figures of one environment step, without waiting for the device."""
+        """Add the figures of one environment step."""
         self.ep_extras.append(extras["log"])
         self.cur_reward_sum += rewards
         self.cur_episode_length += 1.0
@@ -101,19 +93,13 @@ class DeviceLogger(Logger):
         self._runner.finish_iteration(it, loss_dict, seconds)
 
 
-def _means(logs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Mean of every figure over the steps that have it, with one copy from the device."""
-    pairs = [(name, value) for log in logs for name, value in log.items()]
-    tensors = [i for i, (_, value) in enumerate(pairs) if isinstance(value, Tensor)]
-    values = [value for _, value in pairs]
-    if tensors:
-        stacked = torch.stack([values[i].reshape(()).float() for i in tensors])
-        for i, value in zip(tensors, stacked.tolist(), strict=True):
-            values[i] = value
-    gathered: dict[str, list[float]] = {}
-    for (name, _), value in zip(pairs, values, strict=True):
-        gathered.setdefault(name, []).append(float(value))
-    return {name: sum(entries) / len(entries) for name, entries in gathered.items()}
+def _means(logs: list[dict[str, Any]]) -> dict[str, Tensor]:
+    """Mean of every figure over the steps that have it."""
+    gathered: dict[str, list[Tensor]] = {}
+    for log in logs:
+        for name, value in log.items():
+            gathered.setdefault(name, []).append(torch.as_tensor(value))
+    return {name: torch.stack(values).double().mean() for name, values in gathered.items()}
 
 
 class PronkRunner(MjlabOnPolicyRunner):
@@ -123,9 +109,8 @@ class PronkRunner(MjlabOnPolicyRunner):
         self, env: Any, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu"
     ) -> None:
         """As mjlab makes its runners; the curriculum's iterations must be as long as its own."""
-        env_ = env.unwrapped
-        StackedRewardManager.install(env_)
-        self.curriculum = curriculum(env_)
+        StackedRewardManager.install(env.unwrapped)
+        self.curriculum = curriculum(env.unwrapped)
         steps = train_cfg["num_steps_per_env"]
         if steps != self.curriculum.steps_per_iteration:
             raise PronkError(
@@ -158,7 +143,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         return int(self.env.unwrapped.common_step_counter) // self.curriculum.steps_per_iteration
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train on; `stop_reason` ends training after an iteration, with a checkpoint."""
+        """Train on, until all iterations are done or `stop_reason` is set."""
         self._begin_iteration()
         try:
             super().learn(num_learning_iterations, init_at_random_ep_len)
@@ -187,9 +172,9 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def finish_iteration(self, it: int, losses: Mapping[str, float], seconds: float) -> None:
         """Called after every iteration: checks, phase borders, progress, stop."""
-        bad = [name for name, value in losses.items() if not math.isfinite(value)]
-        if bad:
-            raise PronkError(self._diverged(f"the loss {bad[0]} is {losses[bad[0]]}"))
+        for name, value in losses.items():
+            if not math.isfinite(value):
+                raise self._diverged(f"the loss {name} is {value}")
         self._seconds += seconds
         before, _ = phase_at(self.curriculum.iterations, self.iteration - 1)
         after, done = phase_at(self.curriculum.iterations, self.iteration)
@@ -211,14 +196,17 @@ class PronkRunner(MjlabOnPolicyRunner):
         if now - self._shown < 10.0 and done < total:
             return
         self._shown = now
-        words = [f"{phase} {done}/{total}", f"{self._steps_per_iteration / seconds:,.0f} steps/s"]
+        episodes = ""
         if self.logger.rewbuffer:
-            words.append(f"reward {self.logger.rewbuffer[0]:.2f}")
-            words.append(f"episode {self.logger.lenbuffer[0]:.0f} steps")
+            reward, length = self.logger.rewbuffer[0], self.logger.lenbuffer[0]
+            episodes = f"reward {reward:.2f}  episode {length:.0f} steps  "
         fraction = float(motion_command(self.env.unwrapped).ranges.fraction)
-        words.append(f"speed range {fraction:.2f}")
-        words.append(f"{timedelta(seconds=round(seconds * (total - done)))} left")
-        note(self.gpu_global_rank, "  ".join(words))
+        note(
+            self.gpu_global_rank,
+            f"{phase} {done}/{total}  {self._steps_per_iteration / seconds:,.0f} steps/s  "
+            f"{episodes}speed range {fraction:.2f}  "
+            f"{timedelta(seconds=round(seconds * (total - done)))} left",
+        )
 
     # --- Phases ----------------------------------------------------------------------------------
 
@@ -227,8 +215,8 @@ class PronkRunner(MjlabOnPolicyRunner):
         if self.folder is None or self.gpu_global_rank != 0 or name in self.phases:
             return
         iterations = self.curriculum.iterations[name]
-        seconds = self._seconds - sum(entry["seconds"] for entry in self.phases.values())
         steps = iterations * self._steps_per_iteration
+        seconds = self._seconds - sum(phase["seconds"] for phase in self.phases.values())
         self.phases[name] = {
             "iterations": iterations,
             "env_steps": steps,
@@ -301,13 +289,13 @@ class PronkRunner(MjlabOnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict[str, Any]:
-        """Resume from a checkpoint, or load parts of it; one without jump inputs is widened.
+        """Resume from a checkpoint, or load parts of it.
 
         Robots start anew. `load_cfg` is rsl_rl's: `actor`, `critic`, `optimizer`, `iteration`.
         """
         state = checkpoint.read(Path(path), map_location or self.device)
         try:
-            resumed = self.alg.load(checkpoint.widen_checkpoint(state), load_cfg, strict)
+            resumed = self.alg.load(state, load_cfg, strict)
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).strip().splitlines()[-1].strip()
             raise ArtefactError(
@@ -331,14 +319,15 @@ class PronkRunner(MjlabOnPolicyRunner):
     def _check_finite(self, state: Any, cause: Exception | None = None) -> None:
         bad = checkpoint.not_finite(state)
         if bad is not None:
-            raise PronkError(self._diverged(f"{bad} is not finite")) from cause
+            raise self._diverged(f"{bad} is not finite") from cause
 
-    def _diverged(self, reason: str) -> str:
+    def _diverged(self, reason: str) -> PronkError:
         last = None if self.folder is None else checkpoint.latest(self.folder)
-        way_out = "train with another seed or a smaller learning rate"
-        if last is not None:
-            way_out += f"; {last} is the last good checkpoint"
-        return f"learning diverged in iteration {self.iteration}: {reason}; {way_out}."
+        good = "" if last is None else f"; {last} is the last good checkpoint"
+        return PronkError(
+            f"learning diverged in iteration {self.iteration}: {reason}; train with another seed "
+            f"or a smaller learning rate{good}."
+        )
 
 
 def note(rank: int, text: str) -> None:
