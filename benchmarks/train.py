@@ -12,8 +12,8 @@ import io
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -41,11 +41,7 @@ class BenchTask:
     """
 
     def __init__(self, task: str, *, envs: int, device: str, seed: int = 1) -> None:
-        """Build environment and runner as mjlab's `train` does, and step until warm.
-
-        Raises:
-            PronkError: mjlab has no such task.
-        """
+        """Build environment and runner as mjlab's `train` does; PronkError for an unknown task."""
         # mjlab reads this when it is imported first.
         os.environ.setdefault("MJLAB_WARP_QUIET", "1")
         import torch
@@ -76,10 +72,11 @@ class BenchTask:
         """Step the environments with small random actions; returns the wall time [s]."""
         import torch
 
-        with torch.no_grad(), self._timed() as seconds:
+        begin = self._now()
+        with torch.no_grad():
             for k in range(steps):
                 self.env.step(self._actions[k % ACTIONS])
-        return seconds()
+        return self._now() - begin
 
     def train(self, iterations: int) -> float:
         """Train on, logging included; returns the wall time [s]. The first iteration warms up."""
@@ -88,37 +85,30 @@ class BenchTask:
             self.train(1)
             # The writer stays open from one block of iterations to the next.
             self.runner.logger.init_logging_writer = lambda: None
-        with redirect_stdout(io.StringIO()), self._timed() as seconds:
+        begin = self._now()
+        with redirect_stdout(io.StringIO()):
             self.runner.learn(iterations)
-        return seconds()
+        return self._now() - begin
 
-    @contextmanager
-    def _timed(self) -> Iterator[Callable[[], float]]:
-        """Time the block, the device waited for; the result returns it afterwards [s]."""
-        self._wait()
-        times = [time.perf_counter()]
-        yield lambda: times[1] - times[0]
-        self._wait()
-        times.append(time.perf_counter())
-
-    def _wait(self) -> None:
+    def _now(self) -> float:
+        """The time when the device has done all that was launched [s]."""
         if self.device != "cpu":
             import torch
 
             torch.cuda.synchronize(self.device)
+        return time.perf_counter()
 
     def close(self) -> None:
         """Release environment, runner, memory and folder."""
+        import torch
+
         if self.runner.logger.writer is not None:
             self.runner.logger.writer.close()
         self.env.close()
         del self.env, self.runner, self._actions
         self._folder.cleanup()
         gc.collect()
-        if self.device != "cpu":
-            import torch
-
-            torch.cuda.empty_cache()
+        torch.cuda.empty_cache()  # no-op where CUDA was not used
 
 
 def _build(task: str, envs: int, device: str, seed: int, folder: str) -> tuple[Any, Any]:
@@ -154,26 +144,13 @@ def run(
     gpus: Sequence[str] = (),
     tasks: tuple[str, str] = TASKS,
 ) -> dict[str, Any]:
-    """Measure both tasks at every number of environments.
+    """Measure both tasks at every number of environments, in blocks of steps and of iterations.
 
-    Args:
-        report: Called with a line on what was done.
-        envs: Numbers of environments.
-        steps: Steps of every environment in a block of stepping.
-        iterations: Iterations in a block of training.
-        repeats: Blocks of each task and kind.
-        device: `cpu`, `cuda:0` and so on.
-        gpus: With several, as of `CUDA_VISIBLE_DEVICES`, the first task is also trained on one and
-            on all of them, with the first of `envs` on each.
-        tasks: pronk's task and its peer, as registered with mjlab.
-
-    Returns:
-        `pairs`: for each number of environments, figures of both tasks; `ratios` of their rates,
-        median, least and greatest; `scaling`: rates of training by number of GPUs. Rates are
-        environment steps per second of each block.
-
-    Raises:
-        PronkError: A number is impossible, or a task is unknown.
+    With several `gpus`, named as in `CUDA_VISIBLE_DEVICES`, the first task is also trained on one
+    and on all of them, with the first of `envs` on each. Returns `pairs`: for each number of
+    environments, figures of both tasks; `ratios` of their rates, median, least and greatest;
+    `scaling`: rates of training by number of GPUs. Rates are environment steps per second of each
+    block. PronkError for an impossible number or an unknown task.
     """
     if not envs or min(*envs, steps, iterations, repeats) < 1:
         raise PronkError(
@@ -181,7 +158,11 @@ def run(
             "repeats; expected 1 or more of each."
         )
     begin = time.perf_counter()
-    pairs = [_pair(tasks, count, steps, iterations, repeats, device, report) for count in envs]
+    blocks = {"steps": steps, "iterations": iterations, "repeats": repeats}
+    pairs = []
+    for count in envs:
+        pairs.append(_pair(tasks, count, device, report, **blocks))
+        report(f"{count:,} environments: measured")
     scaling = {}
     for count in (1, len(gpus)) if len(gpus) > 1 else ():
         seconds, horizon = _launch(gpus[:count], tasks[0], envs[0], iterations, repeats)
@@ -191,26 +172,28 @@ def run(
         {name: paired_ratio(ours[name], peer[name]) for name in ("stepping", "training")}
         for ours, peer in pairs
     ]
+    about = machine("mjlab", "mujoco-warp", "rsl-rl-lib", "torch")
     return {
         "schema": "pronk/bench-train/3",
         "pairs": pairs,
         "ratios": ratios,
         "scaling": scaling,
-        "blocks": {"steps": steps, "iterations": iterations, "repeats": repeats},
-        "machine": _machine(device),
+        "blocks": blocks,
+        "machine": {"device": _device_name(device), **about},
         "seconds": time.perf_counter() - begin,
     }
 
 
 def _pair(
-    names: tuple[str, str],
+    names: Sequence[str],
     envs: int,
+    device: str,
+    report: Callable[[str], None],
+    *,
     steps: int,
     iterations: int,
     repeats: int,
-    device: str,
-    report: Callable[[str], None],
-) -> tuple[dict[str, Any], ...]:
+) -> list[dict[str, Any]]:
     """Figures of both tasks at one number of environments."""
     with ExitStack() as stack:
         tasks: list[BenchTask] = []
@@ -222,8 +205,7 @@ def _pair(
         stepping = in_turn([partial(one.step, steps) for one in tasks], repeats)
         physics = [one.physics_steps - count for one, count in zip(tasks, before, strict=True)]
         training = in_turn([partial(one.train, iterations) for one in tasks], repeats)
-        report(f"{envs:,} environments: measured")
-        return tuple(
+        return [
             {
                 "task": one.task,
                 "envs": envs,
@@ -234,7 +216,7 @@ def _pair(
                 "cuda_graphs": one.cuda_graphs,
             }
             for k, one in enumerate(tasks)
-        )
+        ]
 
 
 def _train_blocks(task: str, envs: int, iterations: int, repeats: int) -> tuple[list[float], int]:
@@ -261,12 +243,10 @@ def _launch(gpus: Sequence[str], *arguments: Any) -> Any:
     return launcher.run(_train_blocks, *arguments).rank(0)
 
 
-def _machine(device: str) -> dict[str, str]:
+def _device_name(device: str) -> str:
     import torch
 
-    found = machine("mjlab", "mujoco-warp", "rsl-rl-lib", "torch")
-    name = found["processor"] if device == "cpu" else torch.cuda.get_device_name(device)
-    return {"device": name, **found}
+    return machine()["processor"] if device == "cpu" else torch.cuda.get_device_name(device)
 
 
 def rate_table(found: dict[str, Any]) -> Table:

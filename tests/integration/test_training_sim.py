@@ -240,9 +240,8 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     pytest.importorskip("onnxruntime")
 
     gains = training_gains("naive", ROBOT)
-    settings = {"action_scale": 0.35, "delay_steps": (0, 1), "command_limits": (3.0, 1.0, 2.0)}
-    settings |= {"lift_off_velocity": 2.5, "provenance": {}}
-    contract = contract_for(ROBOT, gains, **settings)  # type: ignore[arg-type]
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    contract = contract_for(cfg, jump=True, provenance={})
     path = tmp_path / "policy.onnx"
     export_policy(trained[1], contract, path)
     subject, original = load_subject(path, "cpu"), load_subject(trained[0], "cpu")

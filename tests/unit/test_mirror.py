@@ -59,16 +59,14 @@ def test_a_batch_and_its_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(symmetry, "motion_command", lambda env: SimpleNamespace(body=BODY))
     env = SimpleNamespace(unwrapped=None)
     groups = {name: torch.randn(4, sum(parts.values())) for name, parts in GROUPS.items()}
-    everything = {**groups, "action": (actions := groups.pop("action"))}
-    obs = TensorDict(groups, batch_size=[4])
-    both, doubled = with_mirror_image(env, obs, actions)
-    assert both is not None
-    assert both.batch_size == torch.Size([8])
-    for name, group in everything.items():
+    both, doubled = with_mirror_image(
+        env, TensorDict(groups, batch_size=[4]).exclude("action"), groups["action"]
+    )
+    found = {**both.to_dict(), "action": doubled}
+    for name, group in groups.items():
         image = mirrored(name, group, BODY)
         assert torch.equal(mirrored(name, image, BODY), group)
-        found = doubled if name == "action" else both[name]
-        assert torch.equal(found, torch.cat([group, image]))
+        assert torch.equal(found[name], torch.cat([group, image]))
     assert with_mirror_image(env, None, None) == (None, None)
     with pytest.raises(PronkError, match="odour"):
         with_mirror_image(env, TensorDict({"odour": torch.zeros(2, 1)}, batch_size=[2]), None)
@@ -77,7 +75,7 @@ def test_a_batch_and_its_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:
 def critic(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
     """The critic's vector, with the robot's own velocity as the command."""
     to_trunk = data.body("trunk").xmat.reshape(3, 3).T
-    force, wrench = np.zeros(len(BODY.legs)), np.zeros(6)
+    force, wrench = np.zeros(4), np.zeros(6)
     feet = [model.geom(f"{leg}_foot_collision").id for leg in BODY.legs]
     for i, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, i, wrench)
@@ -134,23 +132,13 @@ def test_mirrored_rollout_is_that_of_the_mirror_image(seed: int) -> None:
     actions = draw.normal(0.0, 0.7, (25, 12))
     joints, rates = draw.normal(0.0, 0.1, 12), draw.normal(0.0, 1.0, 12)
     tilt = np.array([1.0, *draw.normal(0.0, 0.1, 3)])
-    quaternion = tilt / np.linalg.norm(tilt)
-    position, velocity = np.array([0.1, 0.2, 0.33]), draw.normal(0.0, 0.5, 3)
-    angular = draw.normal(0.0, 1.0, 3)
-    vector, axial = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
-    seen = rollout(
-        model,
-        np.concatenate([position, quaternion, DEFAULT + joints]),
-        np.concatenate([velocity, angular, rates]),
-        actions,
-    )
-    turned = quaternion * np.array([1.0, *axial])
-    image = rollout(
-        model,
-        np.concatenate([vector * position, turned, DEFAULT + reflected("action", joints)]),
-        np.concatenate([vector * velocity, axial * angular, reflected("action", rates)]),
-        reflected("action", actions),
-    )
+    pose = np.array([0.1, 0.2, 0.33, *tilt / np.linalg.norm(tilt)])
+    twist = np.concatenate([draw.normal(0.0, 0.5, 3), draw.normal(0.0, 1.0, 3)])
+    seen = rollout(model, np.append(pose, DEFAULT + joints), np.append(twist, rates), actions)
+    pose *= (1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
+    twist *= (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+    joints, rates, actions = (reflected("action", x) for x in (joints, rates, actions))
+    image = rollout(model, np.append(pose, DEFAULT + joints), np.append(twist, rates), actions)
     np.testing.assert_allclose(image, reflected("critic", seen), rtol=0.0, atol=1e-9)
     # The half second had contacts, and was not symmetric by itself.
     assert 0.1 < seen[:, where(CRITIC, "foot_contact")].mean() < 0.99

@@ -264,18 +264,6 @@ def test_targets_are_default_plus_scaled_action_of_the_history(jumper: Policy) -
         np.testing.assert_allclose(jumper.inference.linear_velocity, output[None, 16:], atol=1e-5)
 
 
-def test_a_batch_is_its_rows(jumper: Policy) -> None:
-    random = np.random.default_rng(2)
-    measured = random.normal(size=(9, 105)).astype(np.float32)
-    jump = (random.random((9, 1)) < 0.5).astype(np.float32)
-    together = jumper.infer(measured, jump)
-    for i in range(9):
-        alone = jumper.infer(measured[i : i + 1], jump[i : i + 1])
-        np.testing.assert_allclose(alone.action[0], together.action[i], atol=1e-5)
-    still = jumper.infer(measured, np.zeros((9, 1)))
-    np.testing.assert_array_equal(jumper.infer(measured).action, still.action)
-
-
 def test_a_refused_step_changes_nothing(tmp_path: Path) -> None:
     walker = load_policy(write_policy(tmp_path, **WALK))
     first = walker.step(measurement(), np.ones(3))

@@ -13,19 +13,14 @@ Histories run from old to new: t-0.04, t-0.02, t (positions and velocities); t-0
 A19); the actor reads the estimate (7), then the current samples (45): 52, with the jump input 53
 (paper N2, reading A19 of one previous action).
 
-Frames and units: angular velocity [rad/s] and gravity (unit vector) in the trunk's frame (x
-forward, y left, z up), position [rad] relative to the default pose, velocity [rad/s], actions as
-the network gave them, command (vx, vy [m/s], yaw rate [rad/s]) in the trunk's frame.
-
-At a reset the first sample fills the whole history, and the actions before it are zero, as at the
-beginning of an episode in training.
+Vectors are in the trunk's frame (x forward, y left, z up); gravity is a unit vector, positions are
+relative to the default pose, actions as the network gave them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,20 +35,16 @@ HISTORY = 3
 ACTIONS = 2
 """Samples of previous actions."""
 
-_LENGTHS = {
-    "angular_velocity": 3,
-    "projected_gravity": 3,
-    "joint_position": HISTORY * JOINTS,
-    "joint_velocity": HISTORY * JOINTS,
-    "action": ACTIONS * JOINTS,
-    "command": 3,
-}
-MEASURED_SIZE = sum(_LENGTHS.values())
 MEASURED = {
-    name: range(stop - _LENGTHS[name], stop)
-    for name, stop in zip(_LENGTHS, accumulate(_LENGTHS.values()), strict=True)
+    "angular_velocity": range(3),
+    "projected_gravity": range(3, 6),
+    "joint_position": range(6, 42),
+    "joint_velocity": range(42, 78),
+    "action": range(78, 102),
+    "command": range(102, 105),
 }
 """The parts of the measured vector, in order: their positions in it."""
+MEASURED_SIZE = MEASURED["command"].stop
 
 ACTOR_INDICES: tuple[int, ...] = (
     *MEASURED["angular_velocity"],
@@ -73,8 +64,6 @@ ESTIMATE = {"contact": 4, "linear_velocity": 3}
 trunk's frame [m/s]. The actor reads it in this order, in front of its own part."""
 
 ESTIMATE_SIZE = sum(ESTIMATE.values())
-ACTOR_SIZE = ESTIMATE_SIZE + len(ACTOR_INDICES)
-ESTIMATOR_SIZE = len(ESTIMATOR_INDICES)
 
 _SIZES = {"angular_velocity": 3, "projected_gravity": 3, "position": JOINTS, "velocity": JOINTS}
 
@@ -84,7 +73,7 @@ class Measurement:
     """One sample of the robot's sensors. Joints in the order of the contract."""
 
     angular_velocity: ArrayLike
-    """Of the trunk, in its frame (x forward, y left, z up) [rad/s]. (3,)"""
+    """Of the trunk, in its frame [rad/s]. (3,)"""
     projected_gravity: ArrayLike
     """Unit vector of gravity in the trunk's frame: (0, 0, -1) when level. (3,)"""
     position: ArrayLike
@@ -102,12 +91,11 @@ class History:
     """The last samples of one robot, oldest first, and the measured vector made of them."""
 
     def __init__(self, default_position: ArrayLike) -> None:
-        """Begin as after `reset`; positions are relative to `default_position` [rad]. (12,)."""
         self._default = np.asarray(default_position, np.float32)
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: the next sample fills the history."""
+        """Begin anew: the next sample fills the history, past actions are zero."""
         self._position: Floats | None = None
         self._velocity: Floats | None = None
         self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
@@ -115,22 +103,23 @@ class History:
     def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
         """Add a sample; returns the measured vector, laid out as `MEASURED`. (105,).
 
-        The command is forward and left [m/s], yaw rate [rad/s], in the trunk's frame (3,). One that
-        is not finite is refused by an ArtefactError, and nothing is added.
+        The command is forward and left [m/s], yaw rate [rad/s] (3,). One that is not finite is
+        refused by an ArtefactError, and nothing is added.
         """
         commanded = finite("the command", command, (3,))
         position = np.asarray(measurement.position, np.float32) - self._default
         self._position = _pushed(self._position, position)
         self._velocity = _pushed(self._velocity, np.asarray(measurement.velocity, np.float32))
-        parts = {
-            "angular_velocity": measurement.angular_velocity,
-            "projected_gravity": measurement.projected_gravity,
-            "joint_position": self._position,
-            "joint_velocity": self._velocity,
-            "action": self._actions,
-            "command": commanded,
-        }
-        return np.concatenate([np.asarray(parts[name], np.float32).ravel() for name in MEASURED])
+        # In the order of `MEASURED`.
+        parts = (
+            measurement.angular_velocity,
+            measurement.projected_gravity,
+            self._position,
+            self._velocity,
+            self._actions,
+            commanded,
+        )
+        return np.concatenate([np.asarray(part, np.float32).ravel() for part in parts])
 
     def acted(self, action: Floats) -> None:
         """Add the network's action for the last observation. (12,)."""

@@ -59,7 +59,7 @@ class Policy:
     """A network, its contract, and the history of the one robot that `step` runs."""
 
     def __init__(self, session: Any, contract: Contract, *, sha256: str = "") -> None:
-        """Wrap an ONNX Runtime session that `load_policy` has checked; `sha256` is of the file."""
+        """Wrap an ONNX Runtime session that `load_policy` has checked."""
         self.contract = contract
         self.sha256 = sha256
         self.inference: Inference | None = None
@@ -84,18 +84,11 @@ class Policy:
     def step(
         self, measurement: Measurement, command: ArrayLike, jump: bool = False
     ) -> NDArray[np.float64]:
-        """One policy step; call it at `contract.policy_rate_hz`.
+        """One policy step, at `contract.policy_rate_hz`: joint position targets [rad]. (12,).
 
-        Args:
-            measurement: The present one.
-            command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
-            jump: The jump input; refused by a policy without one.
-
-        Returns:
-            Joint position targets in the order of the contract, absolute [rad]. (12,)
-
-        Raises:
-            ArtefactError: A number is not finite, or jump is refused.
+        The command is forward and left [m/s], yaw rate [rad/s], in the trunk's frame (3,). Targets
+        are absolute, in the order of the contract. ArtefactError for a number that is not finite,
+        and for `jump` of a policy without jump input.
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
@@ -108,18 +101,13 @@ class Policy:
     def infer(self, measured: ArrayLike, jump: ArrayLike | None = None) -> Inference:
         """The network alone, for N observations.
 
-        Args:
-            measured: Laid out as `contract.observation`. (N, 105)
-            jump: The jump input, 0 or 1; None is 0 for all. (N, 1)
-
-        Raises:
-            ArtefactError: A shape is wrong, a number is not finite, or jump is refused.
+        `measured` is laid out as `contract.observation`, (N, 105); `jump` is 0 or 1, (N, 1), None 0
+        for all. ArtefactError for a wrong shape, a number that is not finite, and a refused jump.
         """
         count = len(np.atleast_1d(measured))
         read = finite('the input "measured"', measured, (count, MEASURED_SIZE))
-        jumps = finite(
-            'the input "jump"', np.zeros((count, 1)) if jump is None else jump, (count, 1)
-        )
+        jumps = np.zeros((count, 1)) if jump is None else jump
+        jumps = finite('the input "jump"', jumps, (count, 1))
         self._refuse_jump(bool(jumps.any()))
         return self._run(read, jumps)
 
@@ -147,10 +135,8 @@ class Policy:
 def load_policy(path: Path | str) -> Policy:
     """Open a `policy.onnx`; `pronk.policy.contract.check` checks that it fits a robot.
 
-    Raises:
-        ArtefactError: Missing, damaged, without a contract, or laid out in another way than this
-            pronk builds observations.
-        PronkError: ONNX Runtime is not installed.
+    ArtefactError for a file that is missing, damaged, without a contract, or laid out in another
+    way than this pronk builds observations; PronkError without ONNX Runtime.
     """
     path = Path(path)
     try:

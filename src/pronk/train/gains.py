@@ -25,7 +25,6 @@ NAIVE_STIFFNESS_RANGE = 2.0
 NAIVE_DAMPING_RANGE = 0.05
 """Half-width of the randomization of naive damping [N m s/rad] (paper D4)."""
 
-
 GainsName = Literal["naive", "matched"]
 
 
@@ -35,7 +34,6 @@ class TrainingGains:
 
     name: GainsName
     robot: str
-    """Name of the robot."""
     groups: Mapping[str, GroupGains]
     """In the robot's order of groups."""
     delay_s: float = 0.0

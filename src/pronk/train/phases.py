@@ -117,27 +117,24 @@ def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]
 
     Beyond the last iteration the last phase is over. PronkError without any phase.
     """
-    left = iteration
-    present = [(name, count) for name, count in iterations.items() if count > 0]
+    present = {name: count for name, count in iterations.items() if count > 0}
     if not present:
         raise PronkError("all phases have 0 iterations; expected 1 or more for one of them.")
-    for name, count in present:
-        if left < count:
-            return name, left / count
-        left -= count
-    return present[-1][0], 1.0
+    for name, count in present.items():
+        if iteration < count:
+            return name, iteration / count
+        iteration -= count
+    return name, 1.0
 
 
 class Curriculum:
     """Curriculum term: sets the rewards and the command term to the phase of the iteration.
 
-    The iteration follows from mjlab's step counter. mjlab calls the term whenever a robot resets,
-    the runner at the beginning of every iteration.
+    mjlab calls it whenever a robot resets, the runner at the beginning of every iteration.
     """
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
         self.iterations = {name: cfg.params[name] for name in PHASES}
-        """Of each phase."""
         self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
         self._set = -1
         self._initial = {

@@ -148,16 +148,13 @@ def git_state() -> dict[str, Any] | None:
     """
 
     def git(*words: str) -> str:
-        folder = str(Path(pronk.__file__).parent)
-        return subprocess.run(
-            ["git", "-C", folder, *words], capture_output=True, text=True, timeout=20, check=True
-        ).stdout.strip()
+        command = ["git", "-C", str(Path(pronk.__file__).parent), *words]
+        found = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+        return found.stdout.strip()
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")
-        return {
-            "commit": git("rev-parse", "HEAD"),
-            "changed": bool(git("status", "--porcelain", "--", ".")),
-        }
+        commit, changed = git("rev-parse", "HEAD"), git("status", "--porcelain", "--", ".")
+        return {"commit": commit, "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import tyro
 
 from pronk.errors import PronkError
-from pronk.train.phases import PHASES, TASKS
+from pronk.train.phases import TASKS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,11 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and options that do not go together."""
-        limits = {"envs": (self.envs, 2), "seed": (self.seed, 0)}
-        limits["save-interval"] = (self.save_interval, 1)
-        for option, (value, least) in limits.items():
+        for option, value, least in (
+            ("envs", self.envs, 2),
+            ("seed", self.seed, 0),
+            ("save-interval", self.save_interval, 1),
+        ):
             if value is not None and not least <= value < 2**31:
                 raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
         if self.minutes is not None and not self.minutes > 0.0:
@@ -75,23 +77,24 @@ class TrainSettings:
     @property
     def iterations(self) -> Mapping[str, int]:
         """PPO iterations of each phase; `walk` of the task jump is those of the walking policy."""
-        found = dict(TASKS[self.task])
-        known = [n for n in PHASES if found[n] > 0 and (n, self.task) != ("walk", "jump")]
-        names = [entry.partition("=")[0] for entry in self.phase]
-        for entry, name in zip(self.phase, names, strict=True):
-            count = entry.removeprefix(f"{name}=")
+        known = {n: count for n, count in TASKS[self.task].items() if count > 0}
+        if self.task == "jump":
+            del known["walk"]
+        given: dict[str, int] = {}
+        for entry in self.phase:
+            name, _, count = entry.partition("=")
             if not (name and count.isdigit()):
                 raise PronkError(f"--phase {entry!r}: expected PHASE=ITERATIONS, as in walk=300.")
             if name not in known:
                 raise PronkError(
                     f"{self.task} has no phase {name!r}; its phases are {', '.join(known)}."
                 )
-            if names.count(name) > 1:
+            if name in given:
                 raise PronkError(f"--phase {name} is given twice; once is enough.")
             if int(count) < 1:
                 raise PronkError(f"phase {name} has {count} iterations; expected 1 or more.")
-            found[name] = int(count)
-        return found
+            given[name] = int(count)
+        return {**TASKS[self.task], **given}
 
     @property
     def gains_file(self) -> Path | None:
@@ -132,7 +135,5 @@ class TrainSettings:
         """What decides the result of a run, as JSON holds it."""
         names = ("task", "robot", "gains", "ranges_from", "init_checkpoint", "envs", "seed")
         values = {name: getattr(self, name) for name in (*names, "ellipsoid")}
-        return {
-            **{n: str(v) if isinstance(v, Path) else v for n, v in values.items()},
-            "phase": list(self.phase),
-        }
+        stored = {n: str(v) if isinstance(v, Path) else v for n, v in values.items()}
+        return {**stored, "phase": list(self.phase)}

@@ -1,9 +1,8 @@
 """The policy's action: joint position targets, which reach the drives after a delay.
 
 A target takes effect a number of physics steps after the policy issued it, one number for each
-robot and episode, the same for all its joints, as on one bus. It is a transport delay, exact also
-where it is longer than a policy step: ages of targets are counted in physics steps, however many
-of them a policy step has.
+robot and episode, the same for all its joints, as on one bus. The delay may be longer than a policy
+step: ages of targets are counted in physics steps.
 
 mjlab's actuators can delay too, with a buffer that is read and written in every physics step. A
 target changes once in a policy step, so it is enough to choose between the last targets in the
@@ -62,7 +61,7 @@ class DelayedJointPositionAction(JointPositionAction):
         """Delay in this episode [physics steps]. (N, 1)"""
         self.battery = Battery(self._entity)
         self.guidance: Tensor | None = None
-        """Added to the coming targets [rad], (N, joints); None: nothing."""
+        """Added to the coming targets, if not None [rad]. (N, joints)"""
         everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
         # A slice costs a view where a list of indices costs a kernel.
         self._joints: slice | Tensor = slice(None) if everything else self._target_ids
@@ -70,14 +69,13 @@ class DelayedJointPositionAction(JointPositionAction):
         # With a policy step of at least one physics step no older target can be in force.
         count = high + 1
         self._targets = self._default.repeat(count, 1, 1)
-        """The last targets, as a ring [rad]. (count, N, joints)"""
+        """The last targets, as a ring that begins at `_newest` [rad]. (count, N, joints)"""
         self._newest = 0
-        """Where in the ring the newest target is."""
         self._ages = [high] * count
         """Physics steps since each target was issued, newest first."""
 
     def process_actions(self, actions: Tensor) -> None:
-        """Issue the targets of a policy step; actions (N, joints) are the network's."""
+        """Issue the targets of a policy step, of the network's actions (N, joints)."""
         super().process_actions(actions)
         if self.guidance is not None:
             self._processed_actions += self.guidance

@@ -52,16 +52,12 @@ class PositionDriveCfg(DcMotorActuatorCfg):
 
 
 class PositionDrive(DcMotorActuator[PositionDriveCfg]):
-    """The law of mjlab's DC motor in 9 operations instead of 21.
-
-    It runs in every physics step, and on a GPU the host launches operations more slowly than the
-    device completes them.
-    """
+    """The law of mjlab's DC motor in 9 operations instead of 21, for every physics step."""
 
     param_names = ("stiffness", "damping", "force_limit", "saturation_effort", "back_emf")
 
     def initialize(self, *args: Any) -> None:
-        """Set up the parameters, called by mjlab."""
+        """Set up the parameters."""
         super().initialize(*args)
         self.back_emf = self.saturation_effort / self.velocity_limit_motor
         """Torque lost to speed [N m s/rad]. (N, joints)"""
@@ -80,17 +76,13 @@ class PositionDrive(DcMotorActuator[PositionDriveCfg]):
 
 
 def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
-    """One actuator for each joint group, in the robot's order of groups.
-
-    Commands are delayed before they reach the actuators (`pronk.train.mdp.actions`). Gains of
-    another robot, and different drives in a group, are refused.
-    """
+    """One actuator for each joint group, in the robot's order of groups."""
     if gains.robot != robot.name:
         raise PronkError(f"gains of {gains.robot} were given for the drives of {robot.name}.")
     cfgs = []
     for group in robot.groups:
-        joints = robot.group(group)
-        drive, fitted = joints[0].drive, gains.groups[group].frictionloss
+        joints, own = robot.group(group), gains.groups[group]
+        drive, fitted = joints[0].drive, own.frictionloss
         if any(joint.drive != drive for joint in joints):
             raise RobotError(
                 f"the joints of {robot.name}'s group {group} have different drives; expected one "
@@ -99,8 +91,8 @@ def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg,
         cfgs.append(
             PositionDriveCfg(
                 target_names_expr=tuple(joint.name for joint in joints),
-                stiffness=gains.groups[group].stiffness,
-                damping=gains.groups[group].damping,
+                stiffness=own.stiffness,
+                damping=own.damping,
                 armature=drive.armature,
                 frictionloss=drive.frictionloss if math.isnan(fitted) else fitted,
                 viscous_damping=drive.viscous_damping,
@@ -120,27 +112,21 @@ class Battery:
         self._entity = entity
         drives = [drive for drive in entity.actuators if isinstance(drive, PositionDrive)]
         self._drives = [(drive, drive.saturation_effort.clone()) for drive in drives]
-        speed = entity.data.joint_vel
-        count, device = len(speed), speed.device
-        self._heat = torch.zeros_like(speed)
-        """Heat in the windings per torque squared [rad/s per N m]. (N, joints)"""
+        # Heat in the windings per torque squared [rad/s per N m]. (N, joints)
+        self._heat = torch.zeros_like(entity.data.joint_vel)
         for drive in drives:
             self._heat[:, drive.target_ids] = 1.0 / drive.back_emf
-        self.no_load = torch.ones(count, 1, device=device)
+        self.no_load = torch.ones_like(self._heat[:, :1])
         """U over the rated voltage. (N, 1)"""
-        self.drop = torch.zeros(count, 1, device=device)
+        self.drop = torch.zeros_like(self.no_load)
         """4 R over the square of the rated voltage [1/W]. (N, 1)"""
-        self.voltage = torch.ones(count, 1, device=device)
+        self.voltage = torch.ones_like(self.no_load)
         """V over the rated voltage. (N, 1)"""
         self.ideal = True
         """All batteries hold the rated voltage, so that nothing is computed."""
 
     def set(self, voltage: Tensor, resistance: Tensor, rated: float) -> None:
-        """Give every robot its battery.
-
-        `voltage` at no load [V] and `resistance` with the wires [ohm] are (N, 1); `rated` is the
-        voltage of the drives' stall torque [V].
-        """
+        """Give every robot its U [V] and R [ohm], (N, 1); `rated` is that of the drives [V]."""
         self.no_load.copy_(voltage / rated)
         self.drop.copy_(4.0 * resistance / rated**2)
         self.voltage.copy_(self.no_load)

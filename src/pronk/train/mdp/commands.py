@@ -1,8 +1,7 @@
 """Commands: velocities, redrawn at intervals, and the jump input (paper C1 to C4).
 
 The command term also holds what depends on the commands: the state of the jumps, the motion of the
-last step, and the ranges of the velocities. Everything is computed for all robots with masks, so
-that no step waits for the device.
+last step, and the ranges of the velocities. Masks are used, so that no step waits for the device.
 """
 
 from __future__ import annotations
@@ -87,15 +86,10 @@ class MotionCommand(CommandTerm):
         """[rad]. (N, 12)"""
         self.position_limits: Tensor = entity.data.joint_pos_limits
         """[rad]. (N, 12, 2)"""
-        nominal = [cfg.gains.groups[joint.group] for joint in self.robot.joints]
-        self.stiffness = torch.tensor([gains.stiffness for gains in nominal], device=device)
-        """Nominal [N m/rad]. (12,)"""
-        self.damping = torch.tensor([gains.damping for gains in nominal], device=device)
-        """Nominal [N m s/rad]. (12,)"""
-        self.effort_limit = torch.tensor(
-            [joint.drive.effort_limit for joint in self.robot.joints], device=device
-        )
-        """[N m]. (12,)"""
+        pairs = [(joint.drive, cfg.gains.groups[joint.group]) for joint in self.robot.joints]
+        numbers = [(own.stiffness, own.damping, drive.effort_limit) for drive, own in pairs]
+        self.stiffness, self.damping, self.effort_limit = torch.tensor(numbers).T.to(device)
+        """Nominal [N m/rad, N m s/rad], and of the drives [N m]. (12,)"""
         self.scripted = False
         """True: `velocity` and `jump` are set by the caller alone."""
         self.guidance_scale = 0.0
@@ -267,13 +261,11 @@ class MotionCommand(CommandTerm):
         return velocity, time, on, off
 
     def _update_metrics(self) -> None:
-        """No-op: the rewards are logged."""
+        """No-op, as the next two, which mjlab requires: see `compute` and `reset`."""
 
-    def _resample_command(self, env_ids: Tensor) -> None:
-        """No-op: `compute` and `reset` draw with masks."""
+    def _resample_command(self, env_ids: Tensor) -> None: ...
 
-    def _update_command(self, env_ids: Tensor | None) -> None:
-        """No-op: see `compute`."""
+    def _update_command(self, env_ids: Tensor | None) -> None: ...
 
 
 def motion_command(env: ManagerBasedRlEnv) -> MotionCommand:

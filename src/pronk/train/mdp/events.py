@@ -54,14 +54,13 @@ def randomize_gains(
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:
     """Draws of (stiffness, damping), (n, 2).
 
-    Box: uniform in nominal +- range. Ellipsoid: uniform in {x : (x - c)^T E^-1 (x - c) <= 1}, as
-    x = c + L u with L L^T = E and u uniform in the unit disc.
+    Box: uniform in nominal +- range. Ellipsoid, which `check_ellipsoid` accepts: uniform in
+    {x : (x - c)^T E^-1 (x - c) <= 1}, as x = c + L u with L L^T = E, u uniform in the unit disc.
     """
     if shape == "box":
         nominal = torch.tensor([gains.stiffness, gains.damping], device=device)
         half = torch.tensor([gains.stiffness_range, gains.damping_range], device=device)
         return nominal + half * (2.0 * torch.rand(n, 2, device=device) - 1.0)
-    check_ellipsoid(gains)
     angle, area = torch.rand(2, n, device=device).unbind()
     angle = 2.0 * torch.pi * angle
     disc = area.sqrt() * torch.stack([angle.cos(), angle.sin()])
@@ -72,10 +71,8 @@ def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor
 def check_ellipsoid(gains: GroupGains) -> None:
     """PronkError for gains without an ellipsoid, or whose ellipsoid reaches gains of 0 or less."""
     (a, b), (c, d) = gains.ellipsoid
-    least = (
-        gains.ellipsoid_center[0] - max(a, 0.0) ** 0.5,
-        gains.ellipsoid_center[1] - abs(d) ** 0.5,
-    )
+    stiffness, damping = gains.ellipsoid_center
+    least = stiffness - max(a, 0.0) ** 0.5, damping - abs(d) ** 0.5
     if not (a > 0.0 and a * d - b * c > 0.0 and min(least) > 0.0):
         raise PronkError(
             f"the gains about {gains.stiffness:g} and {gains.damping:g} have no ellipsoid of "
@@ -129,10 +126,7 @@ def randomize_base_mass(env: Any, env_ids: None, added: Range, base: SceneEntity
 def randomize_battery(
     env: Any, env_ids: None, voltage: Range, resistance: Range, rated: float
 ) -> None:
-    """Draw each robot's battery: voltage at no load [V], resistance with the wires [ohm].
-
-    `rated` is the voltage of the drives' torque-speed line [V]. Not in the paper.
-    """
+    """Draw each robot's battery: voltage at no load [V], resistance with the wires [ohm]."""
     volts, ohms = (_uniform(env, span, env.num_envs, 1) for span in (voltage, resistance))
     joint_position_action(env).battery.set(volts, ohms, rated=rated)
 
@@ -141,7 +135,7 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
     """Draw the physics steps of the next policy step, once for all robots (D1, A1).
 
     The draw is a function of the step counter: the same in every process, so that GPUs need not
-    wait for one another. PronkError if a policy step could have no physics step.
+    wait for one another.
     """
     if nominal + added[0] < 1:
         raise PronkError(
@@ -156,10 +150,10 @@ def reset_state(
 ) -> None:
     """Draw the state in which an episode begins, about the initial state, which stands upright.
 
-    mjlab's events for this draw all six axes of pose and twist, in four times the operations: a
-    seventh of a training step with thousands of robots. Arguments are half-widths: `place` of the
-    position [m] and `speed` of the velocity [m/s] along world x and y, `heading` of the yaw angle
-    [rad], `joints` of the joint positions about the default pose [rad].
+    mjlab's events for this take four times the operations: a seventh of a training step with
+    thousands of robots. Arguments are half-widths: `place` of the position [m] and `speed` of the
+    velocity [m/s] along world x and y, `heading` of the yaw angle [rad], `joints` of the joint
+    positions about the default pose [rad].
     """
     robot = env.scene["robot"]
     root = robot.data.default_root_state[env_ids]

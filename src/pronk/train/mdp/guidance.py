@@ -43,9 +43,9 @@ def guidance(
     intended position by what torque and velocity need. Guided like that, a policy that only walks
     left the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
 
-    `stiffness` [N m/rad] and `damping` [N m s/rad] are of the drives, leg by leg, (12,); each leg
-    bears a quarter of the robot's mass; a policy step takes `dt` [s]. Returns (steps + 1, 12): the
-    last but one is for the step that ends with the lift-off, the last is zero.
+    `stiffness` [N m/rad] and `damping` [N m s/rad] are of the drives, leg by leg, (12,); a policy
+    step takes `dt` [s]. Returns (steps + 1, 12): the last but one is for the step that ends with
+    the lift-off, the last is zero.
     """
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)

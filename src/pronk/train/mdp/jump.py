@@ -95,7 +95,7 @@ class JumpSettings:
 
 
 class JumpState:
-    """State of the jumps of N robots; a `gain` is the increase of a best in the last step."""
+    """State of the jumps of N robots, and what changed in the last policy step."""
 
     def __init__(self, count: int, device: torch.device | str, settings: JumpSettings) -> None:
         self.settings = settings
@@ -108,50 +108,35 @@ class JumpState:
         def false() -> Tensor:
             return torch.zeros(count, dtype=torch.bool, device=device)
 
-        self.commanded = false()
-        """Jump input at the last step."""
+        self.commanded = false()  # jump input at the last step
         self.airborne = false()
-        self.mode = false()
-        """In jump mode."""
-        self.settling = zeros()
-        """Time left in jump mode once on the ground with the input off [s]."""
-        self.since = zeros()
-        """Time since the rising edge of the input [s]; 0 outside jump mode."""
-        self.vertical = zeros()
-        """Vertical velocity of the trunk at the last step [m/s]."""
-        self.overspeed = zeros()
-        """Speed above the command when the jump was commanded [m/s]."""
+        self.mode = false()  # in jump mode
+        self.settling = zeros()  # left in jump mode once on the ground with the input off [s]
+        self.since = zeros()  # since the rising edge of the input; 0 outside jump mode [s]
+        self.vertical = zeros()  # vertical velocity of the trunk at the last step [m/s]
+        self.overspeed = zeros()  # speed above the command when the jump was commanded [m/s]
+        # Factor, 0 to 1, on the rewards of the last lift-off, by its time and overspeed.
         self.reward_scale = zeros()
-        """Factor, 0 to 1, on the rewards of the last lift-off, by its time and overspeed."""
-        self.best_score = zeros()
-        """Best lift-off score of this command."""
+
+        # Of this command; a gain is the increase in the last step.
+        self.best_score = zeros()  # of a lift-off
         self.score_gain = zeros()
-        self.liftoffs = zeros()
-        """Number of lift-offs of this command that are no strides."""
-        self.hop = zeros()
-        """1 where the last step was a lift-off after the first of its command."""
-        self.highest = zeros()
-        """Highest trunk of this command [m]."""
-        self.lowest = zeros()
-        """Lowest trunk of this command before its first lift-off, `crouch` or more [m]."""
-        self.travel = zeros()
-        """Height of the jump so far, `highest` minus `lowest`, at most `max_travel` [m]."""
+        self.liftoffs = zeros()  # number of lift-offs that are no strides
+        self.hop = zeros()  # 1 where the last step was a lift-off after the first
+        self.highest = zeros()  # trunk [m]
+        self.lowest = zeros()  # trunk before the first lift-off, `crouch` or more [m]
+        self.travel = zeros()  # `highest` minus `lowest`, at most `max_travel` [m]
         self.travel_gain = zeros()
-        self.flight = zeros()
-        """Ground covered in the present flight, scaled, less the part due to overspeed [m]."""
-        self.overspeed_distance = zeros()
-        """The part due to overspeed [m]."""
-        self.best_flight = zeros()
-        """`flight` of the best flight of this command [m]."""
+        self.flight = zeros()  # ground covered in this flight, scaled, less overspeed [m]
+        self.overspeed_distance = zeros()  # the part due to overspeed [m]
+        self.best_flight = zeros()  # `flight` of the best flight [m]
         self.flight_gain = zeros()
-        self.stance = zeros(4, 2)
-        """Last position of each foot on the ground, world frame [m]. (N, 4, 2)"""
-        self.best_gap = zeros()
-        """Widest gap that a flight of this command has cleared, scaled [m]."""
+        self.stance = zeros(4, 2)  # last position of each foot on the ground, world frame [m]
+        self.best_gap = zeros()  # widest gap that a flight has cleared, scaled [m]
         self.gap_gain = zeros()
+        # Of the legs' lengths to a countermovement's, 0 to 1; 0 from the first lift-off or
+        # `prompt_s` on.
         self.similarity = zeros()
-        """Similarity of the legs' lengths to a countermovement's, 0 to 1; 0 from the first lift-off
-        or `prompt_s` on."""
 
     def reset(self, env_ids: Tensor) -> None:
         """Clear the state of some robots, env_ids (n,)."""
@@ -162,35 +147,20 @@ class JumpState:
     def advance(
         self,
         *,
-        jump: Tensor,
-        contact: Tensor,
-        height: Tensor,
-        vertical: Tensor,
-        velocity_error: Tensor,
-        turn: Tensor,
-        along: Tensor,
-        excess: Tensor,
-        feet: Tensor,
-        direction: Tensor,
-        extension: Tensor,
+        jump: Tensor,  # jump input, bool
+        contact: Tensor,  # foot contacts, bool, (N, 4)
+        height: Tensor,  # trunk over ground [m]
+        vertical: Tensor,  # vertical velocity of the trunk [m/s]
+        velocity_error: Tensor,  # distance of its horizontal velocity from the one rewarded [m/s]
+        turn: Tensor,  # norm of its roll and pitch rate [rad/s]
+        along: Tensor,  # part of its horizontal velocity in the commanded direction [m/s]
+        excess: Tensor,  # `along` without its upper limit, minus the commanded speed [m/s]
+        feet: Tensor,  # horizontal positions of the feet, world frame [m], (N, 4, 2)
+        direction: Tensor,  # unit vector of the commanded velocity, world frame, or zero, (N, 2)
+        extension: Tensor,  # length of each leg minus that in the default pose [m], (N, 4)
         dt: float,
     ) -> None:
-        """Advance by one policy step.
-
-        Args:
-            jump: Jump input, bool.
-            contact: Foot contacts, bool, (N, 4).
-            height: Trunk over ground [m].
-            vertical: Vertical velocity of the trunk [m/s].
-            velocity_error: Distance of its horizontal velocity from the one rewarded [m/s].
-            turn: Norm of the trunk's roll and pitch rate [rad/s].
-            along: Part of its horizontal velocity in the commanded direction [m/s].
-            excess: `along` without its upper limit, minus the commanded speed [m/s].
-            feet: Horizontal positions of the feet, world frame [m], (N, 4, 2).
-            direction: Unit vector of the commanded velocity, world frame, or zero, (N, 2).
-            extension: Length of each leg minus that in the default pose [m], (N, 4).
-            dt: Duration of the step [s].
-        """
+        """Advance by one policy step of `dt` [s]."""
         s = self.settings
         airborne = ~contact.any(dim=-1)
         begins = jump & ~self.commanded

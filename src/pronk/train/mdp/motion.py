@@ -21,47 +21,29 @@ if TYPE_CHECKING:
 
 @dataclass
 class Motion:
-    """One step of N robots with L legs and J joints."""
+    """One step of N robots with L legs and J joints; W is the world's frame, T the trunk's."""
 
-    position: Tensor
-    """Joint positions [rad]. (N, J)"""
-    velocity: Tensor
-    """Joint velocities [rad/s]. (N, J)"""
-    height: Tensor
-    """Trunk over ground [m]. (N,)"""
-    velocity_world: Tensor
-    """Velocity of the trunk, world frame [m/s]. (N, 3)"""
+    position: Tensor  # of the joints [rad], (N, J)
+    velocity: Tensor  # of the joints [rad/s], (N, J)
+    height: Tensor  # trunk over ground [m], (N,)
+    velocity_world: Tensor  # of the trunk, in W [m/s], (N, 3)
+    # Its horizontal part, forward and left of the heading [m/s], (N, 2). With the trunk's own axes,
+    # upward motion of a pitched trunk would count as forward motion.
     velocity_heading: Tensor
-    """Its horizontal part, forward and left of the heading [m/s]. (N, 2). With the trunk's own
-    axes, upward motion of a pitched trunk would count as forward motion."""
-    angular_velocity: Tensor
-    """In the trunk's frame [rad/s]. (N, 3)"""
-    gravity: Tensor
-    """Direction of gravity in the trunk's frame; (0, 0, -1) upright. (N, 3)"""
-    heading: Tensor
-    """Unit vector of the horizontal part of the trunk's x axis, world frame. (N, 2)"""
-    contact: Tensor
-    """Feet on the ground, bool. (N, L)"""
-    force: Tensor
-    """Magnitude of the ground's force on each foot [N]. (N, L)"""
-    foot_position: Tensor
-    """Horizontal, world frame [m]. (N, L, 2)"""
-    foot_height: Tensor
-    """Lowest point of each foot over ground [m]. (N, L)"""
-    knee_height: Tensor
-    """Axes of the knees over ground [m]. (N, L)"""
-    leg_length: Tensor
-    """From the axis of each hip pitch to the foot, shanks of nominal length [m]. (N, L)"""
-    foot_velocity: Tensor
-    """World frame [m/s]. (N, L, 3)"""
-    foot_velocity_change: Tensor
-    """Since the step before [m/s]. (N, L, 3)"""
-    non_foot_contacts: Tensor
-    """Number of parts other than feet on the ground. (N,)"""
-    torque: Tensor
-    """On the joints, as the drives gave it [N m]. (N, J)"""
-    torque_change: Tensor
-    """Since the step before [N m]. (N, J)"""
+    angular_velocity: Tensor  # of the trunk, in T [rad/s], (N, 3)
+    gravity: Tensor  # its direction in T, (0, 0, -1) upright, (N, 3)
+    heading: Tensor  # unit vector of the horizontal part of T's x axis, in W, (N, 2)
+    contact: Tensor  # feet on the ground, bool, (N, L)
+    force: Tensor  # magnitude of the ground's force on each foot [N], (N, L)
+    foot_position: Tensor  # horizontal, in W [m], (N, L, 2)
+    foot_height: Tensor  # lowest point of each foot over ground [m], (N, L)
+    knee_height: Tensor  # axes of the knees over ground [m], (N, L)
+    leg_length: Tensor  # from hip pitch axis to foot, shanks of nominal length [m], (N, L)
+    foot_velocity: Tensor  # in W [m/s], (N, L, 3)
+    foot_velocity_change: Tensor  # since the step before [m/s], (N, L, 3)
+    non_foot_contacts: Tensor  # number of parts other than feet on the ground, (N,)
+    torque: Tensor  # on the joints, as the drives gave it [N m], (N, J)
+    torque_change: Tensor  # since the step before [N m], (N, J)
 
     def reset(self, env_ids: Tensor) -> None:
         """Robots that start a new episode have no step before; env_ids (n,)."""

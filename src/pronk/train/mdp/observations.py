@@ -1,7 +1,6 @@
 """Observations: the measured vector, the jump input, and the state that only training has.
 
-The measured vector is laid out in `pronk.policy.observation`, with noise D7 to D10. The critic
-reads the simulator's state without noise and the randomized parameters of each robot.
+The measured vector is laid out in `pronk.policy.observation`.
 """
 
 from __future__ import annotations
@@ -105,8 +104,8 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
 def randomized_parameters(env: ManagerBasedRlEnv) -> list[Tensor]:
     """The parts of `RANDOMIZED`, in order. (N, size) each.
 
-    Stiffness and damping by joint group and leg; `voltage` is the battery's present one over the
-    rated one, `drop` in 1/kW; foot to knee axis in m, mass in kg, delay in physics steps.
+    Voltages over the rated one, `drop` in 1/kW, mass in kg, delay in physics steps, foot to knee
+    axis in m, stiffness and damping by joint group and leg.
     """
     model, action = env.sim.model, joint_position_action(env)
     feet, battery = motion_command(env).foot_geoms, action.battery

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from mjlab.envs import ManagerBasedRlEnvCfg
 from torch import Tensor, nn
 
 import pronk
@@ -25,8 +26,8 @@ from pronk.files import written_whole
 from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.observation import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
-from pronk.robots.robot import RobotSpec
-from pronk.train.gains import TrainingGains
+from pronk.robots import load_robot
+from pronk.train.mdp import actions, commands
 from pronk.train.rl.networks import EstimatorActor
 
 OPSET = 18
@@ -43,29 +44,19 @@ def versions() -> dict[str, str]:
 
 
 def contract_for(
-    robot: RobotSpec,
-    gains: TrainingGains,
-    *,
-    action_scale: float,
-    delay_steps: tuple[int, int],
-    command_limits: tuple[float, float, float],
-    lift_off_velocity: float | None,
-    provenance: Mapping[str, Any],
+    cfg: ManagerBasedRlEnvCfg, *, jump: bool, provenance: Mapping[str, Any]
 ) -> Contract:
-    """The contract of a policy that was trained on `robot`, whose order of joints is the actions'.
-
-    `action_scale` is the position target per unit of action [rad], `delay_steps` the smallest and
-    largest command delay [physics steps], `command_limits` the half-widths of forward, left [m/s]
-    and yaw rate [rad/s], `lift_off_velocity` the desired one [m/s], None without jump input.
-    """
+    """The contract of a policy that was trained in an environment, with or without jump input."""
+    command, action = cfg.commands[commands.NAME], cfg.actions[actions.NAME]
+    robot, gains = load_robot(command.robot), command.gains
     groups = [gains.groups[joint.group] for joint in robot.joints]
-    low, high = delay_steps
-    limits = zip(COMMANDS, command_limits, strict=True)
+    low, high = (steps * robot.timestep_s for steps in action.delay_steps)
+    limits = zip(COMMANDS, command.limits, strict=True)
     return Contract(
         robot=robot.name,
         joint_names=robot.joint_names,
         default_position=tuple(joint.default_position for joint in robot.joints),
-        action_scale=(action_scale,) * len(robot.joints),
+        action_scale=(float(action.scale),) * len(robot.joints),
         stiffness=tuple(group.stiffness for group in groups),
         damping=tuple(group.damping for group in groups),
         gains=gains.name,
@@ -76,10 +67,10 @@ def contract_for(
         policy_rate_hz=robot.policy_rate_hz,
         timestep_s=robot.timestep_s,
         decimation=robot.decimation,
-        delay_range_s=(low * robot.timestep_s, high * robot.timestep_s),
+        delay_range_s=(low, high),
         command_ranges={name: (-limit, limit) for name, limit in limits},
-        jump=lift_off_velocity is not None,
-        lift_off_velocity=lift_off_velocity,
+        jump=jump,
+        lift_off_velocity=command.settings.liftoff_velocity if jump else None,
         provenance=dict(provenance),
         versions=versions(),
     )
@@ -120,7 +111,7 @@ def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]
     """Largest absolute difference of all outputs between an exported policy and its actor.
 
     Both compute on the CPU: a GPU may round matrix products to TF32. `observations` has "measured"
-    (N, 105) and, for a policy that jumps, "jump" (N, 1). ArtefactError if the file cannot be run.
+    (N, 105) and, for a policy that jumps, "jump" (N, 1).
     """
     policy = load_policy(path)
     names = ("measured", "jump") if policy.contract.jump else ("measured",)
@@ -139,10 +130,8 @@ class _Exported(nn.Module):
         super().__init__()
         # The distribution holds tensors of the last update, which cannot be copied; only its
         # deterministic output is needed.
-        distribution = actor.distribution
-        assert distribution is not None, "an actor of PPO has a distribution"
-        self.head = distribution.as_deterministic_output_module()
-        self.actor = copy.deepcopy(actor, {id(distribution): nn.Identity()})
+        self.head = actor.distribution.as_deterministic_output_module()
+        self.actor = copy.deepcopy(actor, {id(actor.distribution): nn.Identity()})
         self.actor.distribution = None
         self.to("cpu", torch.float32).eval()
 

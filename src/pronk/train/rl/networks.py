@@ -22,11 +22,9 @@ from torch import Tensor, nn
 from pronk.errors import PronkError
 from pronk.policy.observation import (
     ACTOR_INDICES,
-    ACTOR_SIZE,
     ESTIMATE,
     ESTIMATE_SIZE,
     ESTIMATOR_INDICES,
-    ESTIMATOR_SIZE,
     MEASURED_SIZE,
 )
 
@@ -171,7 +169,7 @@ class Estimator(nn.Module):
 
     def __init__(self, jump_size: int = 1, hidden_dims: Sequence[int] = (256, 128)) -> None:
         super().__init__()
-        self.mlp = MLP(ESTIMATOR_SIZE + jump_size, ESTIMATE_SIZE, list(hidden_dims), "elu")
+        self.mlp = MLP(len(ESTIMATOR_INDICES) + jump_size, ESTIMATE_SIZE, list(hidden_dims), "elu")
         self.mlp[0] = JumpLinear(self.mlp[0], jump_size)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,7 +210,7 @@ class EstimatorActor(JumpModel):
             self.register_buffer(f"_{name}_indices", torch.tensor(indices), persistent=False)
 
     def _get_latent_dim(self) -> int:
-        return ACTOR_SIZE + self.jump_size
+        return ESTIMATE_SIZE + len(ACTOR_INDICES) + self.jump_size
 
     def get_latent(
         self, obs: Observations, masks: Tensor | None = None, hidden_state: Any = None

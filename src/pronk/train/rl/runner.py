@@ -20,7 +20,6 @@ from rsl_rl.utils.logger import Logger
 from torch import Tensor
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.train.mdp.actions import joint_position_action
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.reward_manager import StackedRewardManager
 from pronk.train.phases import PHASES, curriculum, phase_at
@@ -232,21 +231,15 @@ class PronkRunner(MjlabOnPolicyRunner):
     def _export(self, path: Path, phase: str) -> float:
         """Write a policy; largest difference of its outputs from PyTorch's on the last rollout."""
         env = self.env.unwrapped
-        command, action = motion_command(env), joint_position_action(env)
-        gains, lift_off = command.cfg.gains, command.cfg.settings.liftoff_velocity
         contract = contract_for(
-            command.robot,
-            gains,
-            action_scale=float(action.cfg.scale),
-            delay_steps=action.cfg.delay_steps,
-            command_limits=command.cfg.limits,
-            lift_off_velocity=lift_off if PHASES[phase].jump else None,
+            env.cfg,
+            jump=PHASES[phase].jump,
             provenance={
                 "run": path.parent.resolve().name,
                 "phases": {n: p["iterations"] for n, p in self.phases.items()},
                 "envs": env.num_envs * self.gpu_world_size,
                 "seed": self.cfg["seed"],
-                "ranges_sha256": gains.sha256,
+                "ranges_sha256": motion_command(env).cfg.gains.sha256,
                 **self.provenance,
             },
         )

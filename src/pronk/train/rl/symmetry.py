@@ -3,12 +3,7 @@
 The robot is its own mirror image in the plane of its trunk's x and z axes. In the mirror image
 vectors change the sign of y, angular velocities those of x and z; right and left legs change
 places; hip_roll (about x) changes sign, hip_pitch and knee (about y) do not. rsl_rl's symmetry
-extension trains on both sides (Mittal et al. 2024):
-
-    EstimatorPpoCfg(symmetry_cfg={
-        "data_augmentation_func": "pronk.train.rl.symmetry:with_mirror_image",
-        "use_data_augmentation": True,
-    })
+extension trains on both sides (Mittal et al. 2024).
 """
 
 from __future__ import annotations
@@ -45,15 +40,8 @@ _SIGNS = {
 }
 """Factors of vectors, in the trunk's frame."""
 _JOINTS = ("joint_position", "joint_velocity", "action")
-_FEET = (
-    "contact",
-    "foot_contact",
-    "foot_force",
-    "foot_height",
-    "shank_length",
-    "stiffness",
-    "damping",
-)
+_CONTACTS = ("contact", "foot_contact", "foot_force", "foot_height")
+_LEGS = (*_CONTACTS, "shank_length", "stiffness", "damping")
 """Quantities by leg; stiffness and damping are those of one joint group after the other."""
 
 
@@ -80,7 +68,7 @@ def _mirror(
         indices, factors = [0], [1.0]
         if name in _SIGNS:
             indices, factors = [0, 1, 2], list(_SIGNS[name])
-        elif name in _FEET:
+        elif name in _LEGS:
             indices, factors = other_leg, [1.0] * len(legs)
         elif name in _JOINTS:
             indices = [leg * len(joints) + i for leg in other_leg for i in range(len(joints))]

@@ -58,10 +58,7 @@ def jump_env_cfg(
     num_envs: int = 4096,
     seed: int = 0,
 ) -> ManagerBasedRlEnvCfg:
-    """The environment of all phases, with their PPO iterations by name.
-
-    `gain_shape` is that of the ranges of each group that gains are drawn from.
-    """
+    """The environment of all phases, with their PPO iterations by name."""
     delay = round(gains.delay_s / robot.timestep_s)
     return ManagerBasedRlEnvCfg(
         seed=seed,
@@ -121,7 +118,6 @@ def without_randomization(cfg: ManagerBasedRlEnvCfg, *, noise: bool = False) -> 
     if not noise:
         cfg.observations["measured"].enable_corruption = False
         action = cfg.actions[actions.NAME]
-        assert isinstance(action, actions.DelayedJointPositionActionCfg)
         middle = action.delay_steps[1] - DELAY_STEPS
         action.delay_steps = (middle, middle)
 
@@ -133,9 +129,7 @@ def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     cfg.episode_length_s = 1e6
     cfg.terminations = {n: t for n, t in cfg.terminations.items() if not t.time_out}
     cfg.curriculum = {}
-    command = cfg.commands[commands.NAME]
-    assert isinstance(command, commands.MotionCommandCfg)
-    command.jump_fraction = 1.0
+    cfg.commands[commands.NAME].jump_fraction = 1.0
     return cfg
 
 
@@ -144,7 +138,15 @@ def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
     body = legged(robot.source)
     feet = tuple(f"{leg}_foot_collision" for leg in body.legs)
     limbs = [f"{leg}_{link}_collision" for leg in body.legs for link in ("thigh", "shank")]
-    ground = ContactMatch(mode="body", pattern="terrain")
+
+    def sensor(name: str, geoms: tuple[str, ...], **measured: Any) -> ContactSensorCfg:
+        return ContactSensorCfg(
+            name=name,
+            primary=ContactMatch(mode="geom", pattern=geoms, entity="robot"),
+            secondary=ContactMatch(mode="body", pattern="terrain"),
+            **measured,
+        )
+
     entity = EntityCfg(
         spec_fn=partial(_spec, robot, feet),
         init_state=EntityCfg.InitialStateCfg(
@@ -155,26 +157,13 @@ def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
         articulation=EntityArticulationInfoCfg(actuators=actuators(robot, gains)),
         sort_actuators=True,
     )
-    sensors = (
-        ContactSensorCfg(
-            name="feet",
-            primary=ContactMatch(mode="geom", pattern=feet, entity="robot"),
-            secondary=ground,
-            fields=("found", "force"),
-            reduce="netforce",
-        ),
-        ContactSensorCfg(
-            name="limbs",
-            primary=ContactMatch(mode="geom", pattern=("trunk_collision", *limbs), entity="robot"),
-            secondary=ground,
-            fields=("found",),
-            reduce="none",
-        ),
-    )
     return SceneCfg(
         terrain=TerrainEntityCfg(terrain_type="plane"),
         entities={"robot": entity},
-        sensors=sensors,
+        sensors=(
+            sensor("feet", feet, fields=("found", "force"), reduce="netforce"),
+            sensor("limbs", ("trunk_collision", *limbs), fields=("found",), reduce="none"),
+        ),
         num_envs=num_envs,
         extent=2.0,
     )
@@ -243,6 +232,9 @@ def _events(
         for group in gains.groups.values():
             events.check_ellipsoid(group)
     body = legged(robot.source)
+    # D5, .18 to .20 m, and D6, -.4 to 1.6 kg, of the Mini Cheetah, in proportion.
+    shank = (0.18 / 0.195 * body.shank_length, 0.20 / 0.195 * body.shank_length)
+    added = (-0.4 / 12.0 * body.total_mass, 1.6 / 12.0 * body.total_mass)
     rated = robot.joints[0].drive.bus_voltage
 
     def once(func: Any, **params: Any) -> EventTermCfg:
@@ -257,18 +249,8 @@ def _events(
         # D2, one for all feet, which have priority over the floor.
         "friction": once(dr.geom_friction, ranges=(0.05, 3.0), shared_random=True, asset_cfg=feet),
         "gains": once(events.randomize_gains, ranges=ranges, shape=gain_shape),  # D3, D4
-        # D5, .18 to .20 m, and D6, -.4 to 1.6 kg, of the Mini Cheetah, in proportion.
-        "shank_length": once(
-            events.randomize_shank_length,
-            span=(0.18 / 0.195 * body.shank_length, 0.20 / 0.195 * body.shank_length),
-            feet=feet,
-            shanks=shanks,
-        ),
-        "base_mass": once(
-            events.randomize_base_mass,
-            added=(-0.4 / 12.0 * body.total_mass, 1.6 / 12.0 * body.total_mass),
-            base=base,
-        ),
+        "shank_length": once(events.randomize_shank_length, span=shank, feet=feet, shanks=shanks),
+        "base_mass": once(events.randomize_base_mass, added=added, base=base),
         # Lithium cells from 3.7 V (nominal, and all but empty) to 4.2 V (full); of six cells 5 to
         # 12 milliohm each, and plugs and wires. Not in the paper. A jump draws a kilowatt and more.
         "battery": once(
