@@ -44,13 +44,8 @@ def test_mjlab_knows_the_tasks_whatever_is_imported_first() -> None:
         "from mjlab.tasks.registry import list_tasks\n"
         "print(*list_tasks())"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"MJLAB_WARP_QUIET": "1"},
-    )
+    command, environment = [sys.executable, "-c", code], os.environ | {"MJLAB_WARP_QUIET": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert "Failed to load task package" not in done.stderr
     assert set(NAMES) <= set(done.stdout.split())
 
@@ -148,31 +143,25 @@ def test_the_training_simulator_responds_like_the_matched_one(joint: str, delay:
         + np.concatenate([np.zeros(delay), held[: len(held) - delay]]),
         pose=np.array([j.default_position for j in ROBOT.joints]),
     )
-    group = MATCHED.groups
-    joints = tuple(
-        replace(j, stiffness=group[j.group].stiffness, damping=group[j.group].damping)
-        for j in ROBOT.joints
-    )
-    gains = group[ROBOT.joint(joint).group]
+    pairs = [(j, MATCHED.groups[j.group]) for j in ROBOT.joints]
+    joints = tuple(replace(j, stiffness=g.stiffness, damping=g.damping) for j, g in pairs)
+    robot, gains = replace(ROBOT, joints=joints), MATCHED.groups[ROBOT.joint(joint).group]
     expected, other = (
-        simulate(replace(ROBOT, joints=joints), trace, stiffness, gains.damping)[
-            0, :: ROBOT.decimation
-        ]
+        simulate(robot, trace, stiffness, gains.damping)[0, :: ROBOT.decimation]
         for stiffness in (gains.stiffness, gains.stiffness - 0.1)
     )
     env = on_the_bench(joint, delay)
     env.reset()
-    robot = env.scene["robot"]
+    entity = env.scene["robot"]
     rest = at_rest(joint)
-    start = torch.tensor([[rest[name] for name in robot.joint_names]], dtype=torch.float32)
-    robot.write_joint_state_to_sim(start, torch.zeros_like(start))
-    excited = robot.joint_names.index(joint)
-    response = []
+    start = torch.tensor([[rest[name] for name in entity.joint_names]], dtype=torch.float32)
+    entity.write_joint_state_to_sim(start, torch.zeros_like(start))
+    excited = entity.joint_names.index(joint)
+    response, action = [], torch.zeros_like(start)
     for value in offset:
-        response.append(float(robot.data.joint_pos[0, excited]))
-        action = torch.zeros_like(start)
+        response.append(float(entity.data.joint_pos[0, excited]))
         action[0, excited] = float(value)
         env.step(action)
     assert np.ptp(expected) > 0.3
-    np.testing.assert_allclose(np.array(response), expected, atol=2e-5)
+    np.testing.assert_allclose(response, expected, atol=2e-5)
     assert np.abs(other - expected).max() > 2e-4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +12,11 @@ import pytest
 
 pytest.importorskip("torch")
 pytest.importorskip("mjlab")
+import pronk.robots
 from command_line import refused
 from pronk.errors import PronkError
 from pronk.train import devices
+from pronk.train.gains import training_gains
 from pronk.train.phases import TASKS
 from pronk.train.provenance import RunFolder
 from pronk.train.run import stop_signals, train
@@ -38,24 +41,18 @@ NAIVE = ("--gains", "naive")
         (("walk", *NAIVE, "--phase", "walk=many"), "walk=many|walk=300"),
         (("walk", *NAIVE, "--phase", "walk=3", "--phase", "walk=4"), "--phase walk|twice"),
         (("walk", "--gains", "a.yaml", "--ranges-from", "b.yaml"), "b.yaml|--gains naive"),
-        (("walk", "--gains", "a.yaml", "--ranges-from", "a.yaml"), "--gains naive"),
         (("walk", *NAIVE, "--ranges-from", "b.yaml"), "b.yaml|no such file"),
         (("jump", *NAIVE), "--init-checkpoint|pronk train all"),
         (("walk", *NAIVE, "--init-checkpoint", "x"), "--init-checkpoint x|jump"),
         (("jump", *NAIVE, "--init-checkpoint", "nowhere"), "nowhere|phase walk is over"),
-        (("walk", *NAIVE, "--gpu-ids", "one"), "--gpu-ids 'one'|0,1|all"),
         (("walk", *NAIVE, "--gpu-ids", "0,0"), "--gpu-ids '0,0'|different"),
         (("walk", *NAIVE, "--gpu-ids", "0", "--device", "cpu"), "--gpu-ids 0|cpu"),
-        (("walk", *NAIVE, "--device", "tpu"), "auto|cpu|cuda"),
         (("walk", *NAIVE, "--minutes", "0"), "minutes is 0|more than 0"),
         (("walk", *NAIVE, "--save-interval", "0"), "save-interval is 0|1 or more"),
         (("walk", *NAIVE, "--envs", "1"), "envs is 1|2 or more"),
-        (("walk", *NAIVE, "--seed", "-1"), "seed is -1|0 or more"),
-        (("walk", *NAIVE, "--logger", "csv"), "tensorboard|wandb"),
         (("walk", *NAIVE, "--ellipsoid"), "ellipsoid|box"),
         (("walk", *NAIVE, "--ellipsoid", "--resume"), "holds no run"),
         (("walk", *NAIVE, "--robot", "so101"), "so101|no training task|mini_cheetah"),
-        (("walk", *NAIVE, "--robot", "dragon"), "dragon|mini_cheetah"),
         (("walk", "--resume"), "holds no run|--resume"),
     ],
 )
@@ -94,10 +91,10 @@ def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
     again = TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored)
     assert again.iterations == {**TASKS["all"], "walk": 7}
     assert (again.seed, again.envs, again.gains, again.robot) == (0, 4096, "naive", "mini_cheetah")
-    for other in ({"envs": 8}, {"gains": "x.yaml"}, {"ellipsoid": True}, {"phase": ("walk=8",)}):
-        changed: dict[str, Any] = {"task": "all", "out": tmp_path, "resume": True, **other}
+    changes: Any = ({"envs": 8}, {"gains": "x.yaml"}, {"ellipsoid": True}, {"phase": ("walk=8",)})
+    for changed in changes:
         with pytest.raises(PronkError, match="leave it out"):
-            TrainSettings(**changed).resumed(stored)
+            TrainSettings(task="all", out=tmp_path, resume=True, **changed).resumed(stored)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -150,19 +147,13 @@ def env_cfg(robot, gains, **options):
 
 def test_a_robot_with_its_own_task(tmp_path: Path) -> None:
     """`env_cfgs.py` beside the robot's file; the configuration of PPO is the shared one."""
-    import pronk.robots
-
     shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
-    for path in shipped.iterdir():
-        if path.is_file():
-            (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(shipped, tmp_path, dirs_exist_ok=True)
     robot = str(tmp_path / "robot.yaml")
     with pytest.raises(PronkError, match="no training task"):
         load_task(robot)
     (tmp_path / "env_cfgs.py").write_text(ENV_CFGS)
     task = load_task(robot)
-    from pronk.train.gains import training_gains
-
     cfg = task.env_cfg(task.robot, training_gains("naive", task.robot), iterations=TASKS["all"])
     assert cfg.rewards["posture"].weight == -1.0
     assert task.rl_cfg(iterations=3).max_iterations == 3

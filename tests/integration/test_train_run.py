@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,16 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 import yaml
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 from pronk.cli import main as cli
 from pronk.policy.runtime import load_policy
 from pronk.train.phases import PHASES, TASKS
 from pronk.train.provenance import RunFolder
 from pronk.train.rl import checkpoint
+from pronk.train.rl.runner import PronkRunner
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 of_one_run = pytest.mark.xdist_group("run")
@@ -30,7 +35,8 @@ of_one_run = pytest.mark.xdist_group("run")
 GAINS = Path(__file__).parents[2] / "policies" / "gains.yaml"
 SMALL = ("--envs", "8", "--device", "cpu", "--save-interval", "1")
 ALL = ("all", "--gains", str(GAINS), *SMALL)
-SHORT = ("--phase", "walk=2", "--phase", "jump_a=1", "--phase", "jump_b=2")
+ITERATIONS = {"walk": 2, "jump_a": 1, "jump_b": 2}
+SHORT = [word for n, count in ITERATIONS.items() for word in ("--phase", f"{n}={count}")]
 
 
 @pytest.fixture(autouse=True)
@@ -46,12 +52,11 @@ def train(*arguments: str | Path) -> int:
     return cli.run(["train", *map(str, arguments)])
 
 
-def command(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Popen[str]:
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+def started(*arguments: str | Path, cwd: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-c", *map(str, arguments)],
         cwd=cwd,
-        env=environment,
+        env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -72,15 +77,14 @@ def test_a_run_writes_policies_checkpoints_and_provenance(whole: RunFolder) -> N
     walk, jump = (load_policy(whole.path / f"{name}.onnx").contract for name in ("walk", "policy"))
     assert (walk.jump, jump.jump) == (False, True)
     assert walk.provenance["phases"] == {"walk": 2}
-    assert jump.provenance["phases"] == {"walk": 2, "jump_a": 1, "jump_b": 2}
+    assert jump.provenance["phases"] == ITERATIONS
     assert jump.gains_sha256 == walk.gains_sha256 != ""
     found = whole.read()
     assert found["finished"]
     assert found["gains"]["virtual"]
-    for name, iterations in {"walk": 2, "jump_a": 1, "jump_b": 2}.items():
+    for name, iterations in ITERATIONS.items():
         phase = found["phases"][name]
-        assert phase["iterations"] == iterations
-        assert phase["env_steps"] == iterations * 24 * 8
+        assert (phase["iterations"], phase["env_steps"]) == (iterations, iterations * 24 * 8)
         assert phase.get("onnx_difference", 0.0) < 1e-5
         assert name in checkpoint.read(whole.path / f"{name}.pt")["infos"]["phases"]
     assert not checkpoint.jumps(checkpoint.read(whole.path / "walk.pt"))
@@ -105,7 +109,7 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
     words = ("train", "walk", "--gains", "naive", *SMALL, "--phase", "walk=6", "--out", folder.path)
-    process = command(code, *words)
+    process = started(code, *words, cwd=tmp_path)
     while not checkpoint.numbered(folder.path) and process.poll() is None:
         time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
@@ -114,10 +118,7 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     stopped = folder.read()
     assert not stopped["finished"]
     assert stopped["sessions"][0]["stopped"] == "SIGTERM"
-    last = checkpoint.latest(folder.path)
-    assert last is not None
-    done = checkpoint.read(last)["iter"] + 1
-    assert 1 <= done < 6
+    assert 1 <= checkpoint.read(folder.checkpoint())["iter"] + 1 < 6
     assert train("walk", "--resume", "--out", folder.path) == 0
     found = folder.read()
     assert found["finished"]
@@ -149,35 +150,25 @@ def test_a_jump_begins_with_a_walking_policy(whole: RunFolder, tmp_path: Path) -
 @of_one_run
 def test_mjlab_trains_every_phase_of_the_registered_task(whole: RunFolder, tmp_path: Path) -> None:
     """With the phase settings of `pronk train`, and rewards that its command line has changed."""
-    phases = {"walk": 2, "jump-a": 1, "jump-b": 2}
-    options = [f"--env.curriculum.phases.params.{n}={c}" for n, c in phases.items()]
-    rewards = "--env.rewards.posture"
-    process = command(
+    options = {f"curriculum.phases.params.{n}": count for n, count in ITERATIONS.items()}
+    options |= {"scene.num-envs": 8, "rewards.posture.weight": -0.5}
+    options |= {"rewards.posture.params.jump-scale": 0.25}
+    process = started(
         "from mjlab.scripts.train import main; main()",
         "Pronk-Jump-MiniCheetah",
-        "--env.scene.num-envs=8",
         "--agent.max-iterations=5",
-        *options,
-        f"{rewards}.weight=-0.5",
-        f"{rewards}.params.jump-scale=0.25",
+        *(f"--env.{name.replace('_', '-')}={value}" for name, value in options.items()),
         cwd=tmp_path,
     )
     output, _ = process.communicate()
     assert process.returncode == 0, output[-3000:]
     (folder,) = (tmp_path / "logs" / "rsl_rl" / "pronk_jump").iterdir()
-    assert load_policy(folder / "policy.onnx").contract.provenance["phases"] == {
-        "walk": 2,
-        "jump_a": 1,
-        "jump_b": 2,
-    }
-    theirs, ours = (
-        yaml.load((path / "params" / "env.yaml").read_text(), yaml.BaseLoader)
-        for path in (folder, whole.path)
-    )
+    assert load_policy(folder / "policy.onnx").contract.provenance["phases"] == ITERATIONS
+    files = (path / "params" / "env.yaml" for path in (folder, whole.path))
+    theirs, ours = (yaml.load(file.read_text(), yaml.BaseLoader) for file in files)
     assert theirs["curriculum"] == ours["curriculum"]
-    changed = theirs["rewards"].pop("posture")
+    changed, _ = (each["rewards"].pop("posture") for each in (theirs, ours))
     assert (changed["weight"], changed["params"]["jump_scale"]) == ("-0.5", "0.25")
-    del ours["rewards"]["posture"]
     assert theirs["rewards"] == ours["rewards"]
     for name in PHASES:
         a, b = (checkpoint.read(path / f"{name}.pt") for path in (folder, whole.path))
@@ -188,14 +179,6 @@ def test_mjlab_trains_every_phase_of_the_registered_task(whole: RunFolder, tmp_p
 
 def test_the_reward_rises() -> None:
     """16 robots and a small network, phase walk, 35 iterations."""
-    from dataclasses import asdict
-
-    from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.rl import RslRlVecEnvWrapper
-    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-
-    from pronk.train.rl.runner import PronkRunner
-
     cfg, learning = load_env_cfg("Pronk-Walk-MiniCheetah"), load_rl_cfg("Pronk-Walk-MiniCheetah")
     cfg.scene.num_envs, cfg.seed, learning.seed = 16, 1, 1
     learning.actor.hidden_dims = learning.critic.hidden_dims = (64, 64)

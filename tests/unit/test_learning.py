@@ -118,12 +118,8 @@ def test_ppo_and_supervision_change_different_weights() -> None:
         assert same(weights(actor.estimator), estimator)
         assert not same(weights(actor.mlp), network)
         assert all(p.grad is None for p in actor.estimator.parameters())
-    still = build(learning_rate=0.0, schedule="fixed")
-    parts = (still.get_policy().mlp, still.critic.mlp, still.get_policy().estimator)
-    before = [weights(part) for part in parts]
-    learn(still)
-    kept = [same(weights(part), old) for part, old in zip(parts, before, strict=True)]
-    assert kept == [True, True, False]
+        algorithm.update()
+        assert not same(weights(actor.estimator), estimator)
 
 
 def test_losses_are_means_over_the_rollout() -> None:
@@ -132,13 +128,11 @@ def test_losses_are_means_over_the_rollout() -> None:
     roll_out(algorithm)
     actor, rollout = algorithm.get_policy(), algorithm.storage.observations.flatten(0, 1).clone()
     with torch.no_grad():
-        contact, velocity = actor.estimator.losses(
-            actor.estimator_input(rollout), rollout["estimator_target"]
-        )
+        inputs = actor.estimator_input(rollout)
+        expected = actor.estimator.losses(inputs, rollout["estimator_target"])
     losses = algorithm.update()
-    assert losses["estimator_contact"] == pytest.approx(float(contact), rel=1e-5)
-    assert losses["estimator_velocity"] == pytest.approx(float(velocity), rel=1e-5)
-    assert {"value", "surrogate", "entropy"} <= losses.keys()
+    found = losses["estimator_contact"], losses["estimator_velocity"]
+    assert found == pytest.approx([float(loss) for loss in expected], rel=1e-5)
 
 
 def test_the_estimator_learns_a_known_function() -> None:
@@ -158,10 +152,10 @@ def test_the_estimator_learns_a_known_function() -> None:
     fresh = known()
     with torch.no_grad():
         contact, velocity = algorithm.get_policy().estimate(fresh)
-    target = fresh["estimator_target"]
+    true_contact, true_velocity = fresh["estimator_target"].split([4, 3], dim=1)
     # A random estimate has half of the contacts right and a velocity error of one.
-    assert float(((contact > 0.5) == (target[:, :4] > 0.5)).float().mean()) > 0.85
-    assert float((velocity - target[:, 4:]).square().mean().sqrt()) < 0.3
+    assert float(((contact > 0.5) == (true_contact > 0.5)).float().mean()) > 0.85
+    assert float((velocity - true_velocity).square().mean().sqrt()) < 0.3
 
 
 def test_statistics_are_those_of_all_rollouts_and_the_first_ratio_is_one() -> None:
