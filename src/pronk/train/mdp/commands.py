@@ -75,7 +75,6 @@ class MotionCommand(CommandTerm):
     def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         count, device = self.num_envs, self.device
-        self.robot = load_robot(cfg.robot)
         self.body = legged(cfg.robot)
         self.velocity = torch.zeros(count, 3, device=device)
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. (N, 3)"""
@@ -86,7 +85,8 @@ class MotionCommand(CommandTerm):
         """[rad]. (N, 12)"""
         self.position_limits: Tensor = entity.data.joint_pos_limits
         """[rad]. (N, 12, 2)"""
-        pairs = [(joint.drive, cfg.gains.groups[joint.group]) for joint in self.robot.joints]
+        joints = load_robot(cfg.robot).joints
+        pairs = [(joint.drive, cfg.gains.groups[joint.group]) for joint in joints]
         numbers = [(own.stiffness, own.damping, drive.effort_limit) for drive, own in pairs]
         self.stiffness, self.damping, self.effort_limit = torch.tensor(numbers).T.to(device)
         """Nominal [N m/rad, N m s/rad], and of the drives [N m]. (12,)"""

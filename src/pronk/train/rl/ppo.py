@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from mjlab.rl import RslRlPpoAlgorithmCfg
 from rsl_rl.algorithms import PPO
-from rsl_rl.extensions import Symmetry
 from rsl_rl.storage import RolloutStorage
 from torch import Tensor, nn
 
@@ -44,24 +43,12 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
     class_name: str = "pronk.train.rl.ppo:EstimatorPPO"
 
 
-class _Augmentation(Symmetry):
-    """rsl_rl's symmetry without the mirror loss.
-
-    rsl_rl computes that loss even where it is only logged: one more pass of the actor over every
-    mini-batch.
-    """
-
-    def compute_loss(self, actor: Any, batch: RolloutStorage.Batch, rows: int) -> Tensor:
-        return batch.advantages.new_zeros(())
-
-
 class EstimatorPPO(PPO):
     """rsl_rl's PPO; the estimator inside the actor has an optimizer of its own."""
 
     _raw_actor: EstimatorActor
     _raw_critic: JumpCritic
     optimizer: torch.optim.Optimizer
-    symmetry: Symmetry | None
 
     def __init__(
         self,
@@ -89,8 +76,11 @@ class EstimatorPPO(PPO):
                 f"{estimator_learning_rate:g}; expected more than 0."
             )
         super().__init__(actor, critic, storage, **cfg)
-        if self.symmetry is not None and not self.symmetry.use_mirror_loss:
-            self.symmetry = _Augmentation(**cfg["symmetry_cfg"])
+        self._augments = self.symmetry is not None and not self.symmetry.use_mirror_loss
+        if self._augments:
+            # rsl_rl computes the mirror loss even where it is only logged: one more pass of the
+            # actor over every mini-batch.
+            self.symmetry.compute_loss = lambda _, batch, rows: batch.advantages.new_zeros(())
         self.estimator_epochs = estimator_epochs
         self.estimator_mini_batches = estimator_mini_batches
         self._coefficients = torch.tensor(
@@ -113,7 +103,7 @@ class EstimatorPPO(PPO):
         PPO's, `estimator_contact` [nat] and `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
-        if isinstance(self.symmetry, _Augmentation):
+        if self._augments:
             del losses["symmetry"]
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())

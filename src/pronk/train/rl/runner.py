@@ -46,7 +46,7 @@ class DeviceLogger(Logger):
 
     def __init__(self, runner: PronkRunner) -> None:
         """Take the place of the logger that rsl_rl has given the runner."""
-        vars(self).update(vars(runner.logger))
+        self.__dict__.update(vars(runner.logger))
         self.device = "cpu"
         """rsl_rl averages the figures of an iteration here."""
         self._runner = runner
