@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from pronk.evaluation.bodies import (
 )
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Results
-from pronk.evaluation.trial import Plan
+from pronk.evaluation.trial import Plan, Setup
 from pronk.evaluation.variation import NOMINAL, Parameter, add_variation
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
@@ -108,8 +107,8 @@ def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
 # --- Other runs than jumps ----------------------------------------------------------------------
 
 
-def setup(out: Path) -> Any:
-    return {"robot": ROBOT, "sim_params": SIM_PARAMS, "out": out}
+def setup(out: Path) -> Setup:
+    return Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=out)
 
 
 def reloaded(found: Results, folder: Path) -> Results:
@@ -126,7 +125,7 @@ def test_only_the_varied_number_differs(tmp_path: Path) -> None:
     own = SIM_PARAMS.machine.bus_voltage
     changes = {"says": "battery", "unit": "V", "trained": "24 V"}
     volts = Parameter(name="bus_voltage", values=(18.0, own), **changes)
-    found = add_variation([policy], plan, parameters=(volts,), **setup(tmp_path))
+    found = add_variation([policy], plan, setup(tmp_path), parameters=(volts,))
     nominal, low, same = found.rows
     assert nominal.parameter == NOMINAL
     # The same value again is the same jump, to the last digit; another is another.
@@ -142,7 +141,7 @@ def test_a_walking_policy_stands(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     policy = write_hopper(tmp_path / "policy.onnx", jump=False)
     cases = (Case(name="stand", command=STILL), Case(name="slow", command=(0.1, 0.0, 0.0)))
-    found = walk.add_walks([policy], cases=cases, runs=1, seconds=2.4, **setup(tmp_path))
+    found = walk.add_walks([policy], setup(tmp_path), cases=cases, runs=1, seconds=2.4)
     stand, slow = (found.cell("matched", case.name) for case in cases)
     assert (stand.n, stand.fell, stand.non_foot_contact) == (1, 0, 0)
     # It stands whatever the command.

@@ -18,7 +18,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results
 from pronk.evaluation.jumps import measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case, parse_case
-from pronk.evaluation.trial import Plan, draw, load_subjects, prepare, run_trial
+from pronk.evaluation.trial import Plan, Setup, draw, load_subjects, prepare, run_trial
 from pronk.files import sha256
 from pronk.processes import in_processes
 from pronk.runtime.script import STILL, Script
@@ -48,7 +48,7 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
-    return run_trial(policies, PLAN, robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes)
+    return run_trial(policies, PLAN, Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes))
 
 
 # --- What is drawn ------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ from pronk.evaluation.crossing import (
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Results, Row
+from pronk.evaluation.trial import Setup
 from pronk.runtime.script import STILL, Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
@@ -241,7 +242,8 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     slow = Case(name="forward", command=(0.2, 0.0, 0.0))
     script = Script(command=slow.command, stand_s=0.1)
     plan = replace(PLAN, cases=(slow,), practice=1, script=script)
-    found = add_crossings([policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
+    setup = Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
+    found = add_crossings([policy], plan, setup)
     assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
     assert climbs(found)[0].largest == 0.0
     assert repr(results.load(tmp_path, CROSSING).rows) == repr(found.rows)

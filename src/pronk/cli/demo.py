@@ -132,10 +132,10 @@ def jump_and_film(
     if not policies:
         return None, ()
     setup = setup_of(policies[0], out)
-    trial = run_trial(policies, Plan(jumps=jumps, seed=seed), overwrite=True, **setup)
+    trial = run_trial(policies, Plan(jumps=jumps, seed=seed), setup, overwrite=True)
     first = replace(trial, subjects=trial.subjects[:1])
     films = record_all(
-        first, out, out / VIDEOS, robot=setup["robot"], cases=(FILMED,), slow=2.0, warn=console.warn
+        first, out, out / VIDEOS, robot=setup.robot, cases=(FILMED,), slow=2.0, warn=console.warn
     )
     return trial, films
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -14,7 +14,7 @@ from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.evaluation.tables import Sheet
-    from pronk.evaluation.trial import Plan
+    from pronk.evaluation.trial import Plan, Setup
 
 RATES_JUMPS = 3
 """At 2.25 m/s, beside the paper's commands: enough to draw its figure of roll and pitch rates."""
@@ -79,11 +79,14 @@ def trial(
     cases, rates = parse_cases(commands or ["paper"]), 0 if commands else RATES_JUMPS
     plan = Plan(cases=cases, jumps=jumps, rates=rates, seed=seed)
     policies = [policy, *also]
-    setup: Any = setup_of(policy, out, sim_params, robot, processes=processes)
+    setup = setup_of(policy, out, sim_params, robot, processes=processes)
     with console.progress() as report:
-        bar = report.bar("jumping")
         found = run_trial(
-            policies, plan, keep_captures=keep_captures, overwrite=overwrite, progress=bar, **setup
+            policies,
+            plan,
+            replace(setup, progress=report.bar("jumping")),
+            keep_captures=keep_captures,
+            overwrite=overwrite,
         )
     sheets = list(tables.sheets(found))
     for sheet in sheets:
@@ -102,10 +105,10 @@ def trial(
                 found,
                 out,
                 out / VIDEOS,
-                robot=setup["robot"],
+                robot=setup.robot,
                 cases=[case.name for case in plan.cases],
                 warn=console.warn,
-                at_once=setup["processes"],
+                at_once=setup.processes,
                 progress=report.bar("rendering videos"),
             )
         wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
@@ -135,7 +138,7 @@ def trial(
 def _extra_sheets(
     names: Sequence[str],
     policies: Sequence[Path],
-    setup: Any,
+    setup: Setup,
     plan: Plan,
     own: Sequence[Path],
     report: console.Reporter,
@@ -147,19 +150,20 @@ def _extra_sheets(
     from pronk.evaluation.walk import add_walks
     from pronk.report import extra_pages
 
+    def shown(stage: str) -> Setup:
+        return replace(setup, progress=report.bar(stage))
+
     seed = plan.seed
     if "walk" in names:
-        walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **setup)
-        for sheet in extra_pages.walk_tables(walks):
+        for sheet in extra_pages.walk_tables(add_walks(policies, shown("walking"), seed=seed)):
             yield replace(sheet, title=f"Virtual robot, walking: {sheet.title}")
     if "crossing" in names:
-        bar = report.bar("crossing")
-        crossed = add_crossings(policies, CrossingPlan(seed=seed), progress=bar, **setup)
+        crossed = add_crossings(policies, CrossingPlan(seed=seed), shown("crossing"))
         sheet = extra_pages.crossing_table(crossed)
         yield replace(sheet, title=f"Virtual robot, crossing: {sheet.title}")
     if "variation" in names:
-        bar, few = report.bar("varying the robot"), Plan(jumps=5, seed=seed)
-        yield variation.table(variation.add_variation(policies, few, progress=bar, **setup))
+        few = Plan(jumps=5, seed=seed)
+        yield variation.table(variation.add_variation(policies, few, shown("varying the robot")))
     if "bodies" in names:
         plan_n = Plan(jumps=plan.jumps, seed=seed)
-        yield bodies.table(bodies.add_bodies(policies, plan_n, own=own, stages=report, **setup))
+        yield bodies.table(bodies.add_bodies(policies, plan_n, setup, own=own, stages=report))

@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -115,10 +115,10 @@ class Bodies:
 def add_bodies(
     policies: Sequence[Path],
     plan: Plan,
+    setup: Setup,
     *,
     own: Sequence[Path] = (),
     stages: Callable[[str, float], None],
-    **setup: Unpack[Setup],
 ) -> Bodies:
     """Draw robots, match each, try policies on each, and write `bodies.json`.
 
@@ -127,8 +127,7 @@ def add_bodies(
     parameters of `setup`; `own` has for each, in order, a policy that was trained with its gains.
     `stages` is called with a stage and its share done.
     """
-    begun, robot, out = time.perf_counter(), setup["robot"], setup["out"]
-    processes, bodies = setup.get("processes", 1), []
+    begun, robot, bodies = time.perf_counter(), setup.robot, []
     if len(own) > COUNT:
         raise PronkError(f"own policies for {len(own)} bodies; there are {COUNT}.")
     subjects = load_subjects(policies, robot)
@@ -136,35 +135,29 @@ def add_bodies(
     for paths in given:
         load_subjects(paths, robot)
     for number, paths in enumerate(given, start=1):
-        name, folder = f"body {number}", out / FOLDER / f"body_{number}"
-        seed = 1000 * plan.seed + number
-        params = draw_robot(setup["sim_params"], robot, seed=seed)
-        how: Any = {"name": name, "processes": processes, "stages": stages}
-        matched, logs = match_body(robot, params, folder, seed=seed, **how)
-        digest = sha256(folder / SIM_PARAMS)
-        trial = run_trial(
-            paths,
-            plan,
-            robot=robot,
-            sim_params=params,
-            out=folder / TRIAL,
-            about={"file": str(folder / SIM_PARAMS), "sha256": digest},
-            overwrite=True,
-            processes=processes,
+        name, folder = f"body {number}", f"{FOLDER}/body_{number}"
+        seed, place = 1000 * plan.seed + number, setup.out / folder
+        changed = replace(
+            setup,
+            sim_params=draw_robot(setup.sim_params, robot, seed=seed),
+            out=place / TRIAL,
             progress=partial(stages, f"{name}: jump"),
         )
-        head: Any = {"name": name, "folder": str(folder.relative_to(out)), "seed": seed}
+        matched, logs = match_body(changed, place, name=name, seed=seed, stages=stages)
+        about = {"file": str(place / SIM_PARAMS), "sha256": sha256(place / SIM_PARAMS)}
+        trial = run_trial(paths, plan, replace(changed, about=about), overwrite=True)
         errors = _errors(robot, logs, matched, trial.subjects)
-        bodies.append(Body(**head, sha256=digest, errors=errors, trial=trial))
+        head: Any = {"name": name, "folder": folder, "seed": seed, "sha256": about["sha256"]}
+        bodies.append(Body(**head, errors=errors, trial=trial))
     found = Bodies(
         robot=robot.name,
         subjects=subjects,
-        sim_params=dict(setup.get("about") or {}),
+        sim_params=setup.about,
         seed=plan.seed,
         seconds=time.perf_counter() - begun,
         bodies=tuple(bodies),
     )
-    save(out, found)
+    save(setup.out, found)
     return found
 
 
@@ -286,33 +279,27 @@ def save_sim_params(path: Path, sim_params: SimParams, *, says: str) -> None:
 
 
 def match_body(
-    robot: RobotSpec,
-    sim_params: SimParams,
-    folder: Path,
-    *,
-    name: str,
-    seed: int,
-    processes: int,
-    stages: Callable[[str, float], None],
+    setup: Setup, folder: Path, *, name: str, seed: int, stages: Callable[[str, float], None]
 ) -> tuple[MatchedGains, list[JointLog]]:
     """Excite all joints of a virtual robot with the paper's chirp, and match them.
 
     The match reads the logs and nothing else. A folder that has the robot's gains is read. `seed`
-    is of all noise; `processes` sweep legs at once; `stages` are named after `name`.
+    is of all noise; `stages` are named after `name`.
     """
+    robot, processes = setup.robot, setup.processes
     files = [folder / LOGS / f"{file_name(joint)}.mcap" for joint in robot.joint_names]
     same = False
     if (folder / GAINS).exists():  # written last
         with suppress(PronkError):
-            same = load_sim_params(folder / SIM_PARAMS) == sim_params
+            same = load_sim_params(folder / SIM_PARAMS) == setup.sim_params
     if not same:
         (folder / GAINS).unlink(missing_ok=True)
         says = f"A randomized virtual robot, drawn by `{WRITER}`, seed {seed}."
-        save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
+        save_sim_params(folder / SIM_PARAMS, setup.sim_params, says=says)
         plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=REPEATS)
         plan.check()
         how: Any = {"processes": processes, "progress": partial(stages, f"{name}: sweep")}
-        sweep_virtual(plan, sim_params, folder / LOGS, seed=seed, overwrite=True, **how)
+        sweep_virtual(plan, setup.sim_params, folder / LOGS, seed=seed, overwrite=True, **how)
         stages(f"{name}: match", 0.0)
         logs = read_logs(files, processes=processes, robot=robot)
         found = match_logs(logs, robot, settings=SETTINGS)

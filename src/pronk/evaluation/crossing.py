@@ -26,13 +26,14 @@ Crossed means all of this, from the jump input to 2 s after the landing:
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -47,7 +48,7 @@ from pronk.evaluation.jumps import (
     sample_at,
 )
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Kind, Results, Row, Subject
+from pronk.evaluation.results import Results, Row, Subject, extra_kind
 from pronk.evaluation.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
 from pronk.processes import in_processes
 from pronk.robots import load_robot
@@ -114,10 +115,8 @@ class Obstacle:
         """A block between two places of the course and two heights."""
         along = direction(self.command)
         x, y = (0.5 * (begin + end) * along).tolist()
-        across = np.where(along != 0.0, 0.5 * (end - begin), WIDE).tolist()
-        return Box(
-            center=(x, y, 0.5 * (low + high)), half_size=(across[0], across[1], 0.5 * (high - low))
-        )
+        a, b = np.where(along != 0.0, 0.5 * (end - begin), WIDE).tolist()
+        return Box(center=(x, y, 0.5 * (low + high)), half_size=(a, b, 0.5 * (high - low)))
 
 
 def direction(command: Velocity) -> Array:
@@ -180,13 +179,7 @@ class CrossingFigures:
         return not self.why
 
 
-CROSSING = Kind(
-    table="crossing.csv",
-    summary="crossing.json",
-    schema="pronk/trial-crossing/4",
-    writer="pronk trial POLICY --crossing",
-    figures=CrossingFigures,
-)
+CROSSING = extra_kind("crossing", figures=CrossingFigures)
 
 
 def lost(seen: Capture, obstacle: Obstacle) -> bool:
@@ -339,9 +332,9 @@ def search(
             x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
             offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
             yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
-            named: Any = {"policy": subject.name, "case": case.name}
+            row = Row(policy=subject.name, case=case.name, number=count, seed=seed, script=script)
             yield Attempt(
-                row=Row(**named, number=count, seed=seed, script=script),
+                row=row,
                 subject=subject,
                 robot=robot.source,
                 sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
@@ -378,30 +371,26 @@ def search(
     return rows
 
 
-def add_crossings(policies: Sequence[Path], plan: CrossingPlan, **setup: Unpack[Setup]) -> Results:
+def add_crossings(policies: Sequence[Path], plan: CrossingPlan, setup: Setup) -> Results:
     """Let policies cross gaps and steps; write `crossing.csv` and `crossing.json`.
 
     Arguments and errors as of `run_trial`; the progress is an estimate.
     """
-    begun, robot, rounds = time.perf_counter(), setup["robot"], 0
-    subjects = load_subjects(policies, robot)
-    progress = setup.get("progress") or (lambda share: None)
+    begun, rounds = time.perf_counter(), itertools.count()
+    subjects = load_subjects(policies, setup.robot)
 
     def run(tasks: list[Attempt]) -> list[Row]:
         """Run one round; about five more follow each."""
-        nonlocal rounds
         tasks[0].build()  # refuses impossible parameters
-        found = in_processes(
-            attempt,
-            tasks,
-            processes=setup.get("processes", 1),
-            progress=lambda part: progress((rounds + part) / (rounds + part + 5.0)),
-        )
-        rounds += 1
-        return found
+        done = next(rounds)
 
-    rows = search(subjects, plan, robot=robot, sim_params=setup["sim_params"], run=run)
-    progress(1.0)
+        def progress(part: float) -> None:
+            setup.progress((done + part) / (done + part + 5.0))
+
+        return in_processes(attempt, tasks, processes=setup.processes, progress=progress)
+
+    rows = search(subjects, plan, robot=setup.robot, sim_params=setup.sim_params, run=run)
+    setup.progress(1.0)
     return finished(
         CROSSING,
         subjects,
@@ -410,7 +399,7 @@ def add_crossings(policies: Sequence[Path], plan: CrossingPlan, **setup: Unpack[
         cases=plan.cases,
         seed=plan.seed,
         script=plan.script,
-        rules=asdict(JumpRules.of(robot)),
+        rules=asdict(JumpRules.of(setup.robot)),
         settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
         timing={"seconds": time.perf_counter() - begun},
     )
@@ -463,15 +452,14 @@ def rung_of(rows: Sequence[Row]) -> Rung:
 def climbs(results: Results) -> tuple[Climb, ...]:
     """Sum up every policy with every command and kind of obstacle."""
     found = []
-    for policy in (subject.name for subject in results.subjects):
-        for case in (case.name for case in results.cases):
-            for kind in results.settings["kinds"]:
-                own = [r for r in results.of(policy, case) if r.figures.obstacle == kind]
-                sizes = sorted({row.figures.size for row in own})
-                rungs = [rung_of([r for r in own if r.figures.size == size]) for size in sizes]
-                enough = [rung.crossed >= results.settings["enough"] for rung in rungs]
-                whole = enough.index(False) if False in enough else len(enough)
-                largest = sizes[whole - 1] if whole else 0.0
-                ever = max((r.figures.size for r in own if r.figures.success), default=0.0)
-                found.append(Climb(policy, case, kind, tuple(rungs), largest, ever))
+    tried = itertools.product(results.subjects, results.cases, results.settings["kinds"])
+    for subject, case, kind in tried:
+        rows = results.of(subject.name, case.name)
+        own = [row for row in rows if row.figures.obstacle == kind]
+        sizes = sorted({row.figures.size for row in own})
+        rungs = [rung_of([row for row in own if row.figures.size == size]) for size in sizes]
+        crossed = itertools.takewhile(lambda r: r.crossed >= results.settings["enough"], rungs)
+        largest = max((rung.size for rung in crossed), default=0.0)
+        ever = max((row.figures.size for row in own if row.figures.success), default=0.0)
+        found.append(Climb(subject.name, case.name, kind, tuple(rungs), largest, ever))
     return tuple(found)

@@ -220,13 +220,10 @@ class Figure:
         return self.name if unit == "1" else f"{self.name}_{unit}"
 
 
-def number(unit: str, says: str) -> Any:
-    """Declare a figure that is a number: its unit and its equation."""
-    return field(default=math.nan, metadata={"unit": unit, "says": says})
-
-
-def _joints(unit: str, says: str) -> Any:
-    return field(default=(), metadata={"unit": unit, "says": says, "joints": True})
+def number(unit: str, says: str, *, joints: bool = False) -> Any:
+    """Declare a figure that is a number, or one of each joint: its unit and its equation."""
+    metadata = {"unit": unit, "says": says, "joints": joints}
+    return field(default=() if joints else math.nan, metadata=metadata)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,15 +288,18 @@ class JumpFigures:
     cost_of_transport: float = number(
         "1", "electrical energy / (m g |p_c - p_b|) from b, 1 s after the command to run, to c"
     )
-    peak_torque: tuple[float, ...] = _joints("N m", "greatest |motor torque| over c .. e")
-    peak_speed: tuple[float, ...] = _joints(
-        "rad/s", "greatest |joint speed|, averaged over 10 ms, over c .. e"
+    peak_torque: tuple[float, ...] = number(
+        "N m", "greatest |motor torque| over c .. e", joints=True
     )
-    torque_margin: tuple[float, ...] = _joints(
+    peak_speed: tuple[float, ...] = number(
+        "rad/s", "greatest |joint speed|, averaged over 10 ms, over c .. e", joints=True
+    )
+    torque_margin: tuple[float, ...] = number(
         "1",
         "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
         "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
         "negative beyond it, where a motor gives more than the model of its drive",
+        joints=True,
     )
 
     @property
@@ -317,32 +317,6 @@ FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
 
 
 # ---- figures of a capture ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class JumpEvents:
-    """Rise and fall of the jump input, lift-off and touchdown, on the capture's clock [s]."""
-
-    on: float
-    off: float
-    liftoff: float
-    touchdown: float
-
-
-def jump_events(
-    capture: Capture, script: Script, rules: JumpRules, *, began: float = 0.0
-) -> JumpEvents | None:
-    """Return the times of the main flight, or None without a jump.
-
-    `began` is when the policy took over, on the capture's clock [s].
-    """
-    rise, end = began + script.on, fallen_at(capture)
-    on = sample_at(capture, rise)
-    main = jump_flights(capture, on, rules, end).main if on < end else None
-    if main is None:
-        return None
-    up, down = (float(capture.time[k]) for k in main)
-    return JumpEvents(on=rise, off=began + script.off, liftoff=up, touchdown=down)
 
 
 def measure(

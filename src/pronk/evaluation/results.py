@@ -1,8 +1,8 @@
 """The results of a trial: a JSON file with what was run, every run and sums, and a CSV table.
 
-Jumps, walks, varied robots and crossings share one container, one table and one codec; a `Kind` has
-what differs. Unknown numbers are NaN, in CSV an empty cell, in JSON null. pronk reads the runs in
-the JSON file; its sums, and the table with one row a run, are for other readers.
+Jumps, walks, varied robots and crossings differ by their `Kind`. Unknown numbers are NaN, in CSV an
+empty cell, in JSON null. pronk reads the runs in the JSON file; its sums, and the table with one
+row a run, are for other readers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import io
 import json
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from pronk.arrays import Array
 from pronk.errors import ArtefactError
-from pronk.evaluation.jumps import JumpFigures, figures_of
+from pronk.evaluation.jumps import JumpFigures, figures_of, measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.files import write_text
 from pronk.runtime.script import Script
@@ -39,15 +39,17 @@ one jump alone, which does not scatter."""
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of results: its files `NAME.csv` and `NAME.json`, and its figures."""
+    """A kind of runs: how one is measured, and the files of its results."""
 
     table: str
     summary: str
     schema: str
     writer: str
     """The command that writes it."""
-    figures: type[Any]
+    figures: type[Any] = JumpFigures
     """Dataclass of one run's figures: flags, texts, and numbers with `Figure` metadata."""
+    measure: Callable[..., Any] = measure
+    """From capture to figures; a function of a module."""
     compared: tuple[str, ...] = ()
     """Figures whose scatter is compared between policies."""
     jump: bool = True
@@ -59,18 +61,23 @@ JUMPS = Kind(
     summary="summary.json",
     schema="pronk/trial/4",
     writer="pronk trial POLICY --out FOLDER",
-    figures=JumpFigures,
     compared=(
-        "height",
-        "apex_gain",
-        "lift_off_velocity",
-        "distance",
-        "along",
-        "distance_minima",
-        "gap",
+        *("height", "apex_gain", "lift_off_velocity", "distance", "along"),
+        *("distance_minima", "gap"),
     ),
 )
 TABLE, SUMMARY = JUMPS.table, JUMPS.summary
+
+
+def extra_kind(name: str, **fields: Any) -> Kind:
+    """Return the kind of an option of `pronk trial`, which names its files."""
+    return Kind(
+        table=f"{name}.csv",
+        summary=f"{name}.json",
+        schema=f"pronk/trial-{name}/4",
+        writer=f"pronk trial POLICY --{name}",
+        **fields,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """Many jumps of the virtual robot: every policy with every command, each jump from its own start.
 
-    results = run_trial([Path("policy.onnx")], Plan(), robot=robot, sim_params=params, out=out)
+    results = run_trial([Path("policy.onnx")], Plan(), setup_of(Path("policy.onnx"), out))
 
 Each jump has a new virtual robot with its own heading, joint offsets and noise, and a jump input
 that rises up to `spread_s` later, so that it meets every phase of the gait. All of it is drawn from
@@ -21,15 +21,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict, Unpack
+from typing import Any
 
 import msgspec
 import numpy as np
 
 import pronk
 from pronk.errors import ArtefactError, HardwareError, PronkError
-from pronk.evaluation.jumps import JumpRules, measure
+from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
 from pronk.files import sha256
@@ -46,9 +47,6 @@ from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
 
-Keep = Literal["none", "some", "all"]
-"""Captures: of no jump, of the first with each command and those at `RATES`, of every jump."""
-
 CAPTURES, VIDEOS = "captures", "videos"
 """Folders beside the table."""
 OFFSET = 0.05
@@ -58,7 +56,8 @@ _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets that are tried until the robot stands."""
 
 
-class Setup(TypedDict):
+@dataclass(frozen=True, kw_only=True)
+class Setup:
     """What every kind of trial runs on."""
 
     robot: RobotSpec
@@ -66,11 +65,11 @@ class Setup(TypedDict):
     sim_params: SimParams
     """Of the virtual robot; its ground is the terrain."""
     out: Path
-    about: NotRequired[Mapping[str, Any] | None]
+    about: Mapping[str, Any] = field(default_factory=dict)
     """Source of the parameters, kept with the results."""
-    processes: NotRequired[int]
+    processes: int = 1
     """Runs at once; no number depends on it."""
-    progress: NotRequired[Callable[[float], None] | None]
+    progress: Callable[[float], None] = lambda share: None
     """Called with the share done, 0 to 1."""
 
 
@@ -116,14 +115,12 @@ def draw(plan: Plan, case: Case, number: int, robot: RobotSpec) -> tuple[Script,
     """Draw the script, the start and the noise seed of one jump, numbered from 0."""
     rng = case_rng(plan.seed, case, number)
     ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
+    later = plan.script.run_s + ticks / robot.policy_rate_hz
+    script = replace(plan.script, command=case.command, run_s=later)
     yaw = float(rng.uniform(-math.pi, math.pi))
     offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
-    later = plan.script.run_s + ticks / robot.policy_rate_hz
-    return (
-        replace(plan.script, command=case.command, run_s=later),
-        Start(yaw=yaw, joint_offset=tuple(offset.tolist())),
-        int(rng.integers(2**31)),
-    )
+    start = Start(yaw=yaw, joint_offset=tuple(offset.tolist()))
+    return script, start, int(rng.integers(2**31))
 
 
 # ---- one run ----
@@ -142,8 +139,8 @@ class Job:
     start: Start
     out: Path = Path()
     """Folder of the row's capture."""
-    measure: Callable[..., Any] = measure
-    """From capture to figures; a function of a module."""
+    measure: Callable[..., Any] = JUMPS.measure
+    """As of `Kind`."""
 
     def build(self, share: float = 1.0) -> VirtualRobot:
         """Build the virtual robot, not connected, at a share of the joint offsets."""
@@ -219,67 +216,70 @@ def plan_jobs(
     plan: Plan,
     *,
     robot: RobotSpec,
-    sim_params: SimParams,
-    out: Path = Path(),
-    keep: Keep = "none",
-    measure: Callable[..., Any] = measure,
+    keep: Callable[[Case, int], bool] = lambda case, number: False,
+    **common: Any,
 ) -> list[Job]:
-    """Return every run of a plan; captures are kept in `out`."""
+    """Return every run of a plan; captures are kept of those that `keep` says.
+
+    `common` has the fields that all jobs share, such as `sim_params`.
+    """
     found: list[Job] = []
-    common: Any = {"robot": robot.source, "sim_params": sim_params, "out": out, "measure": measure}
-    runs = (
-        (subject, case, number)
-        for subject in subjects
-        for case in plan.tried
-        for number in range(plan.jumps if case in plan.cases else plan.rates)
-    )
-    for subject, case, number in runs:
-        script, start, seed = draw(plan, case, number, robot)
-        kept = keep == "all" or (keep == "some" and (number == 0 or case not in plan.cases))
-        stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-        named: Any = {"policy": subject.name, "case": case.name, "number": number, "seed": seed}
-        row = Row(**named, script=script, capture=f"{CAPTURES}/{stem}.npz" if kept else "")
-        found.append(Job(row=row, subject=subject, start=start, **common))
+    for subject, case in product(subjects, plan.tried):
+        for number in range(plan.jumps if case in plan.cases else plan.rates):
+            script, start, seed = draw(plan, case, number, robot)
+            stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
+            row = Row(
+                policy=subject.name,
+                case=case.name,
+                number=number,
+                seed=seed,
+                script=script,
+                capture=f"{CAPTURES}/{stem}.npz" if keep(case, number) else "",
+            )
+            found.append(Job(row=row, subject=subject, robot=robot.source, start=start, **common))
     return found
 
 
 def run_trial(
     policies: Sequence[Path],
     plan: Plan,
+    setup: Setup,
     *,
     kind: Kind = JUMPS,
     varied: Sequence[tuple[str, float, SimParams]] = (),
     settings: Mapping[str, Any] | None = None,
-    measure: Callable[..., Any] = measure,
     keep_captures: bool = False,
     overwrite: bool = False,
-    **setup: Unpack[Setup],
 ) -> Results:
     """Run policies on the virtual robot, measure and save; scatter is compared with the first's.
 
-    Of jumps `keep_captures` keeps every capture, not the first with each command alone, and
-    `overwrite` replaces a trial in the folder; other kinds are added to it. `varied` has parameter,
-    value and body of every body, if there are more than that of `setup`; `measure` is as in `Job`.
-    Impossible policies, parameters and folders are refused before the first step.
+    Of jumps the captures of the first with each command and of those at `RATES` are kept, with
+    `keep_captures` all, and `overwrite` replaces a trial in the folder; other kinds are added to
+    it. `varied` has parameter, value and body of every body, if there are more than that of
+    `setup`. Impossible policies, parameters and folders are refused before the first step.
     """
-    robot, out, processes = setup["robot"], setup["out"], setup.get("processes", 1)
-    subjects, jobs = load_subjects(policies, robot, jump=kind.jump), []
-    keep: Keep = "none" if kind is not JUMPS else "all" if keep_captures else "some"
-    how: Any = {"robot": robot, "out": out, "keep": keep, "measure": measure}
-    for parameter, value, params in varied or [("", math.nan, setup["sim_params"])]:
+    robot, jobs = setup.robot, []
+    subjects = load_subjects(policies, robot, jump=kind.jump)
+
+    def keep(case: Case, number: int) -> bool:
+        some = number == 0 or case not in plan.cases
+        return kind is JUMPS and (keep_captures or some)
+
+    how: Any = {"robot": robot, "out": setup.out, "keep": keep, "measure": kind.measure}
+    for parameter, value, params in varied or [("", math.nan, setup.sim_params)]:
         made = plan_jobs(subjects, plan, sim_params=params, **how)
         made[0].build()  # refuses impossible parameters
         jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
     if kind is JUMPS:
-        prepare(out, overwrite=overwrite)
+        prepare(setup.out, overwrite=overwrite)
     begun = time.perf_counter()
-    done = in_processes(_timed, jobs, processes=processes, progress=setup.get("progress"))
+    done = in_processes(_timed, jobs, processes=setup.processes, progress=setup.progress)
     rows, seconds, cpu_s = zip(*done, strict=True)
     simulated = sum(row.script.seconds for row in rows)
     timing = {
         "seconds": time.perf_counter() - begun,
         "simulated_s": simulated,
-        "processes": processes,
+        "processes": setup.processes,
         "cores": os.cpu_count() or 1,
         "simulated_s_per_s_and_process": simulated / sum(seconds),
         # Does not depend on other work on the machine.
@@ -308,14 +308,14 @@ def finished(
     """Save and return the results of runs; `rest` are further fields of `Results`."""
     results = Results(
         kind=kind,
-        robot=setup["robot"].name,
+        robot=setup.robot.name,
         subjects=subjects,
         rows=tuple(rows),
-        sim_params=dict(setup.get("about") or {}),
+        sim_params=setup.about,
         versions=versions(),
         **rest,
     )
-    save(setup["out"], results)
+    save(setup.out, results)
     return results
 
 
@@ -334,16 +334,13 @@ def setup_of(
     known = load_robot(robot or load_policy(policy).contract.robot)
     file = sim_params or (SHIPPED if known.name == SHIPPED_ROBOT else None)
     source = "shipped with pronk" if file else f"derived from the model of {known.name}"
-    return {
-        "robot": known,
-        "sim_params": load_sim_params(sim_params, known),
-        "out": out,
-        "about": {
-            "file": str(sim_params) if sim_params else source,
-            "sha256": sha256(file) if file else "",
-        },
-        "processes": cores() if processes is None else processes,
-    }
+    return Setup(
+        robot=known,
+        sim_params=load_sim_params(sim_params, known),
+        out=out,
+        about={"file": str(sim_params or source), "sha256": sha256(file) if file else ""},
+        processes=cores() if processes is None else processes,
+    )
 
 
 def load_subjects(
@@ -421,6 +418,6 @@ def versions() -> dict[str, str]:
     import onnxruntime
     import scipy
 
-    modules = {"mujoco": mujoco, "numpy": np, "scipy": scipy, "onnxruntime": onnxruntime}
-    found = {"python": platform.python_version(), "pronk": pronk.__version__}
-    return found | {name: str(module.__version__) for name, module in modules.items()}
+    modules = (pronk, mujoco, np, scipy, onnxruntime)
+    found = {module.__name__: str(module.__version__) for module in modules}
+    return {"python": platform.python_version()} | found

@@ -8,24 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Unpack
 
 import msgspec
 
 from pronk.evaluation import tables
-from pronk.evaluation.jumps import JumpFigures
-from pronk.evaluation.results import Cell, Kind, Results
+from pronk.evaluation.results import Cell, Results, extra_kind
 from pronk.evaluation.tables import Sheet, landed
 from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.virtual.sim_params import SimParams, with_changes
 
-VARIATION = Kind(
-    table="variation.csv",
-    summary="variation.json",
-    schema="pronk/trial-variation/4",
-    writer="pronk trial POLICY --variation",
-    figures=JumpFigures,
-)
+VARIATION = extra_kind("variation")
 NOMINAL = "nominal"
 """Name of the point that changes nothing."""
 VARIED_FIGURES = (
@@ -39,7 +31,7 @@ VARIED_FIGURES = (
     "speed",
     "energy",
 )
-"""Figures that tables show."""
+"""Figures whose definitions the report shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,31 +107,23 @@ def line(results: Results, parameter: str, policy: str, case: str) -> tuple[Cell
 def add_variation(
     policies: Sequence[Path],
     plan: Plan,
+    setup: Setup,
     *,
     parameters: tuple[Parameter, ...] = PARAMETERS,
-    **setup: Unpack[Setup],
 ) -> Results:
     """Let policies jump on varied virtual robots; write `variation.csv` and `variation.json`.
 
     Arguments and errors as of `run_trial`.
     """
-    base = setup["sim_params"]
-    varied = [
-        (each.name, value, with_changes(base, **{each.name: value}))
-        for each in parameters
-        for value in each.values
-    ]
-    return run_trial(
-        policies,
-        plan,
-        kind=VARIATION,
-        varied=[(NOMINAL, 0.0, base), *varied],
-        settings={
-            "parameters": [asdict(each) for each in parameters],
-            "nominal": {each.name: each.of(base) for each in parameters},
-        },
-        **setup,
-    )
+    base = setup.sim_params
+    varied = [(NOMINAL, 0.0, base)]
+    for each in parameters:
+        varied += [(each.name, v, with_changes(base, **{each.name: v})) for v in each.values]
+    settings = {
+        "parameters": [asdict(each) for each in parameters],
+        "nominal": {each.name: each.of(base) for each in parameters},
+    }
+    return run_trial(policies, plan, setup, kind=VARIATION, varied=varied, settings=settings)
 
 
 def table(results: Results) -> Sheet:

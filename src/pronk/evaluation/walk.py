@@ -9,17 +9,16 @@ comes back into the battery is taken off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pronk.evaluation.jumps import (
     GRAVITY,
-    Figure,
     JumpRules,
     fallen_at,
     figures_of,
@@ -28,7 +27,7 @@ from pronk.evaluation.jumps import (
     uncommanded_height,
 )
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Kind, Results
+from pronk.evaluation.results import Results, extra_kind
 from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
@@ -89,15 +88,7 @@ class WalkFigures:
         return not self.fell
 
 
-WALK_FIGURES: Mapping[str, Figure] = figures_of(WalkFigures)
-WALK = Kind(
-    table="walk.csv",
-    summary="walk.json",
-    schema="pronk/trial-walk/4",
-    writer="pronk trial POLICY --walk",
-    figures=WalkFigures,
-    jump=False,
-)
+WALK_FIGURES = figures_of(WalkFigures)
 
 
 def measure_walk(
@@ -146,6 +137,9 @@ def measure_walk(
     return WalkFigures(**figures)
 
 
+WALK = extra_kind("walk", figures=WalkFigures, measure=measure_walk, jump=False)
+
+
 def walk_script(command: Velocity, *, seconds: float = WALK_S) -> Script:
     """Stand for a moment, then the velocity for `seconds`; no jump, no stop."""
     return Script(command=command, run_s=seconds, jump_s=0.0, keep_s=0.0, stop_s=0.0)
@@ -153,12 +147,12 @@ def walk_script(command: Velocity, *, seconds: float = WALK_S) -> Script:
 
 def add_walks(
     policies: Sequence[Path],
+    setup: Setup,
     *,
     cases: tuple[Case, ...] = WALKS,
     runs: int = 20,
     seconds: float = WALK_S,
     seed: int = 0,
-    **setup: Unpack[Setup],
 ) -> Results:
     """Let policies walk on the virtual robot and write `walk.csv` and `walk.json`.
 
@@ -166,4 +160,4 @@ def add_walks(
     """
     script = walk_script(STILL, seconds=seconds)
     plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    return run_trial(policies, plan, kind=WALK, measure=measure_walk, **setup)
+    return run_trial(policies, plan, setup, kind=WALK)

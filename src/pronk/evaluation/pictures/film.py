@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pronk.arrays import Array, Mask
-from pronk.evaluation.jumps import JumpEvents, heading
+from pronk.evaluation.jumps import heading
 from pronk.virtual.capture import Capture
 
 Samples = NDArray[np.intp]
@@ -33,6 +33,16 @@ _MEASURED = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
+class JumpEvents:
+    """Rise and fall of the jump input, lift-off and touchdown, on the capture's clock [s]."""
+
+    on: float
+    off: float
+    liftoff: float
+    touchdown: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Film:
     """F frames to render, and the P poses of the strip (none without a jump)."""
 
@@ -41,8 +51,6 @@ class Film:
     title: str
     """The command."""
     note: str
-    virtual: bool
-    """Of the virtual robot; the frames are labelled accordingly."""
     events: JumpEvents | None
     origin: tuple[float, float]
     """Zero of the tape on the floor: the trunk at lift-off, or at the start [m]."""
@@ -78,7 +86,6 @@ def plan(
     robot: str,
     title: str,
     note: str = "",
-    virtual: bool = True,
     events: JumpEvents | None,
     span: tuple[float, float],
     slow: float = 1.0,
@@ -107,7 +114,6 @@ def plan(
         robot=robot,
         title=title,
         note=note,
-        virtual=virtual,
         events=events,
         origin=(float(capture.position[zero, 0]), float(capture.position[zero, 1])),
         direction=direction,

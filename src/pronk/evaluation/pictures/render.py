@@ -230,9 +230,8 @@ def _label(
 def _title(draw: ImageDraw.ImageDraw, film: Film, width: int, scale: float) -> None:
     pad = 14.0 * scale
     _label(draw, f"{film.title}\n{film.note}".strip(), (pad, pad), "la", 15.0 * scale)
-    if film.virtual:
-        corner = (width - pad, pad)
-        _label(draw, "virtual robot", corner, "ra", 13.0 * scale, fill=_DARK, ink=_WHITE)
+    corner = (width - pad, pad)
+    _label(draw, "virtual robot", corner, "ra", 13.0 * scale, fill=_DARK, ink=_WHITE)
 
 
 def _height_plot(

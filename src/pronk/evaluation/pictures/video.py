@@ -21,8 +21,7 @@ from typing import Any
 
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.evaluation.jumps import JumpRules, jump_events
-from pronk.evaluation.pictures.film import SCHEMA, Film, plan
+from pronk.evaluation.pictures.film import SCHEMA, Film, JumpEvents, plan
 from pronk.evaluation.results import Results, Row
 from pronk.files import save_artefact
 from pronk.robots.robot import RobotSpec
@@ -99,8 +98,8 @@ def environment(backend: str) -> dict[str, str]:
 def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
     """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, each whole, and return them.
 
-    `warn` is called with one sentence about what this machine lacks; without OpenGL a `VideoError`
-    is raised.
+    `warn` is called with one sentence about what this machine lacks, but for OpenGL, without which
+    a `VideoError` is raised.
     """
     backend = find_gl()
     endings = [".gif", ".png"] if film.labels else [".gif"]
@@ -127,10 +126,9 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 def films_of(
     found: Results, folder: Path, *, robot: RobotSpec, cases: Container[str], slow: float = SLOW
 ) -> dict[str, Film]:
-    """Plan a film of each policy with each command of `cases`, by the name of its files.
+    """Plan a film of each subject with each command of `cases`, by the name of its files.
 
-    A robot that did not jump is filmed as well. `folder` has the captures; `robot` is that of the
-    trial, of which the results have only the name.
+    `folder` has the captures; of `robot` the results have only the name.
     """
     first: dict[tuple[str, str], Row] = {}
     policies = {subject.name for subject in found.subjects}
@@ -139,19 +137,19 @@ def films_of(
             first.setdefault((row.policy, row.case), row)
     films = {}
     for row in first.values():
-        capture = captures.load(folder / row.capture)
-        rules, on = JumpRules(**found.rules), row.began + row.script.on
-        events = jump_events(capture, row.script, rules, began=row.began)
-        span = (on - _BEFORE_S, on + _AFTER_S)
-        if events:
-            span = (events.liftoff - _BEFORE_JUMP_S, events.touchdown + _AFTER_JUMP_S)
+        on = row.began + row.script.on
+        events, span = None, (on - _BEFORE_S, on + _AFTER_S)
+        if row.figures.found:
+            up = on + row.figures.delay
+            down = up + row.figures.duration
+            events = JumpEvents(on=on, off=row.began + row.script.off, liftoff=up, touchdown=down)
+            span = (up - _BEFORE_JUMP_S, down + _AFTER_JUMP_S)
         # The name is without what a shell or a link would trip over.
         films[re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}")] = plan(
-            capture,
+            captures.load(folder / row.capture),
             robot=robot.source,
             title=row.case if "," in row.case else f"{row.case} m/s",
             note=f"policy: {row.policy}" + ("" if events else ", no jump"),
-            virtual=found.virtual,
             events=events,
             span=span,
             slow=slow,
@@ -173,8 +171,7 @@ def record_all(
 ) -> tuple[Path, ...]:
     """Write the files of each of `films_of` into `out`, as far as this machine can.
 
-    `warn` is called once with each sentence about what is missing; `at_once` films are rendered at
-    the same time.
+    `warn` is called once with each sentence about what is missing.
     """
     try:
         find_gl()
