@@ -9,8 +9,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +49,10 @@ def evaluation_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Make an environment of training one to evaluate in; changes `cfg` and returns it.
 
-    As many robots as the plan has, no time-out, no rewards, and the step listener. Randomization
-    `full` is as in training. `noise` is the nominal body and gains, undisturbed, with noise, timing
-    (D1) and command delay drawn as in training: the closest to the paper's figures, of one robot
-    measured several times. With `none` only starts and times are drawn.
+    It has no time-out, no rewards, and the step listener. Randomization `full` is as in training.
+    `noise` is the nominal body and gains, undisturbed, with noise, timing (D1) and command delay
+    drawn as in training: the closest to the paper's figures, of one robot measured several times.
+    With `none` only starts and times are drawn.
     """
     if randomization != "full":
         without_randomization(cfg, noise=randomization == "noise")
@@ -81,6 +83,14 @@ def evaluate(
     cfg = task.env_cfg(task.robot, gains, iterations=TASKS["all"], seed=plan.seed)
     env = ManagerBasedRlEnv(cfg=evaluation_cfg(cfg, plan, randomization), device=device)
     progress("building", 1.0)
+    with closing(env):
+        found = evaluate_policy(
+            subject.act,
+            env,
+            plan,
+            estimate=subject.estimate,
+            progress=partial(progress, "walking and jumping"),
+        )
     about = {
         "policy": subject.about,
         "gains": {"name": gains.name, "sha256": gains.sha256, "virtual": gains.virtual},
@@ -88,18 +98,7 @@ def evaluate(
         "device": device_facts(device.partition(":")[0], 1),
         "versions": versions(),
     }
-    try:
-        return evaluate_policy(
-            subject.act,
-            env,
-            plan,
-            estimate=subject.estimate,
-            progress=lambda share: progress("walking and jumping", share),
-            about=about,
-            before=before,
-        )
-    finally:
-        env.close()
+    return replace(found, about=about, before=before or {})
 
 
 # ---- the policy under evaluation ----
@@ -110,7 +109,7 @@ class Subject:
     """A policy under evaluation."""
 
     act: Policy
-    estimate: Estimate | None
+    estimate: Estimate
     jump: bool
     """Whether it has the jump input."""
     robot: str

@@ -53,7 +53,6 @@ class Plan:
     walks: tuple[Case, ...] = WALKS
     jumps: tuple[Case, ...] = JUMPS
     walk_s: float = 20.0
-    """Length of a walk [s]."""
     settle_s: float = 2.0
     """Time to accelerate, left out of the errors [s]."""
     script: Script = field(default_factory=lambda: Script(command=STILL))
@@ -61,7 +60,6 @@ class Plan:
     spread_s: float = 0.5
     """The jump input rises up to this much later, uniformly [s]."""
     rules: JumpRules | None = None
-    """Those of the robot if None."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan."""
@@ -70,7 +68,7 @@ class Plan:
 
     @property
     def jump_rules(self) -> JumpRules:
-        """The definitions of a jump."""
+        """`rules`, or those of the robot."""
         return self.rules or JumpRules.of(self.robot)
 
     @property

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -98,7 +98,7 @@ class Run:
     def go(
         self, policy: Policy, estimate: Estimate | None, progress: Callable[[float], None]
     ) -> None:
-        """Simulate the whole plan; `estimate` is the policy's estimator, if it is evaluated."""
+        """Simulate the whole plan; arguments are those of `evaluate_policy`."""
         # Not inference mode, which would leave the environment with read-only tensors.
         with torch.no_grad():
             before, self._motion.scripted = self._motion.scripted, True
@@ -205,10 +205,9 @@ class Run:
         *squares, right, count = self._estimates.tolist()
         if not count:
             return {}
-        sums = dict(zip(("forward", "left", "up"), squares, strict=True)) | {
-            "velocity": sum(squares)
-        }
-        errors = {name: math.sqrt(total / count) for name, total in sums.items()}
+        names = ("forward", "left", "up", "velocity")
+        sums = zip(names, (*squares, sum(squares)), strict=True)
+        errors = {name: math.sqrt(total / count) for name, total in sums}
         return errors | {"contacts_right": right / count}
 
 
@@ -219,14 +218,12 @@ def evaluate_policy(
     *,
     estimate: Estimate | None = None,
     progress: Callable[[float], None] = lambda share: None,
-    about: Mapping[str, Any] | None = None,
-    before: Mapping[str, float] | None = None,
 ) -> Evaluation:
     """Run the whole plan in one batch and measure every robot.
 
     `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
     random generators of the process are seeded with the plan's seed. `estimate` is the policy's
-    estimator, if it is evaluated too; `about` and `before` are as of `Evaluation`.
+    estimator, if it is evaluated too.
     """
     began = time.perf_counter()
     run = Run(env.unwrapped, plan)
@@ -250,21 +247,18 @@ def evaluate_policy(
         estimator=run.estimator_errors(),
         plan=vars(plan) | {"robot": plan.robot.name, "rules": plan.jump_rules},
         seconds=time.perf_counter() - began,
-        about=dict(about or {}),
-        before=dict(before or {}),
     )
 
 
 def _walk(capture: Capture, case: Case, plan: Plan) -> dict[str, float]:
     """The figures of a robot that walks."""
-    script, rules = walk_script(case.command, seconds=plan.walk_s), plan.jump_rules
-    script = replace(script, stand_s=0.0)
-    how: Any = {"began": 0.0, "rules": rules, "settle_s": plan.settle_s}
+    script = replace(walk_script(case.command, seconds=plan.walk_s), stand_s=0.0)
+    how: Any = {"began": 0.0, "rules": plan.jump_rules, "settle_s": plan.settle_s}
     found = measure_walk(capture, script, plan.robot, **how)
     first, last = round(plan.settle_s / capture.dt), fallen_at(capture) - 1
     x, y, _ = capture.position[last] - capture.position[min(first, last)]
     return vars(found) | {
-        "uncommanded": found.uncommanded - rules.standing_height,
+        "uncommanded": found.uncommanded - plan.jump_rules.standing_height,
         "drift": math.hypot(x, y) if first <= last else math.nan,
     }
 
