@@ -137,9 +137,8 @@ def test_height_is_of_the_crouch_before_and_the_half_second_after() -> None:
         assert jump_of(whole, 80).height == pytest.approx(STAND + top - low, abs=1e-9)
     # Without a jump it is of the search.
     for wait, height in ((300, 0.2), (301, 0.0)):
-        assert jump_of(series(ground(80 + wait), ground(1, 0.1)), 80).height == pytest.approx(
-            height
-        )
+        found = jump_of(series(ground(80 + wait), ground(1, 0.1)), 80)
+        assert found.height == pytest.approx(height)
 
 
 def test_a_jump_lifts_off_within_the_search_time() -> None:
@@ -319,7 +318,6 @@ def test_loads_by_hand() -> None:
 
 def test_began_shifts_the_script() -> None:
     seen = seen_jump()
-    later = replace(seen, time=seen.time + 3.0)
-    ours, theirs = figures(later, began=3.0), figures(seen)
-    for name, figure in FIGURES.items():
-        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), nan_ok=True), figure
+    ours, theirs = figures(replace(seen, time=seen.time + 3.0), began=3.0), figures(seen)
+    for name in FIGURES:
+        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), nan_ok=True), name
