@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import signal
 import socket
@@ -13,10 +12,10 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from command_line import invoke
@@ -32,11 +31,9 @@ from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.teleop import OperatorCommand
 from pronk.virtual.capture import Capture
 from pronk.virtual.sim_params import load_sim_params
-from seen_jump import motion
+from seen_jump import STANDING, Z_OFF, G, changed, seen_jump
 
-BODY = legged("mini_cheetah")
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
-GRAVITY = 9.81
 
 
 class Pad:
@@ -82,8 +79,7 @@ def test_a_jump_lasts_as_long_as_in_the_trial_however_often_one_presses() -> Non
     assert joystick.take_reset()
     assert not joystick.commanded(0.0)[1]
 
-
-def test_a_policy_without_jump_input_gets_none() -> None:
+    # A policy without a jump input gets none.
     pad = Pad()
     pad.state = OperatorCommand(jump=True)
     joystick = Joystick(ranges=RANGES, jumps=False, gamepad=pad)
@@ -91,46 +87,35 @@ def test_a_policy_without_jump_input_gets_none() -> None:
     assert not any(jumps(joystick, 0.0, 50))
 
 
-def flown(speed: float, *, tilt: float = 0.0) -> Gauge:
-    """A ballistic flight from standing height, sampled every 2 ms; then the trunk leans."""
-    gauge = Gauge(JumpRules.of(ROBOT))
-    for time_ in np.arange(0.0, 1.2, 0.002).tolist():
-        t, lean = time_ - 0.3, 0.5 * tilt * (time_ > 1.0)
-        airborne = 0.0 <= t <= 2.0 * speed / GRAVITY
-        z = BODY.standing_height + (speed * t - 0.5 * GRAVITY * t * t if airborne else 0.0)
-        sample = motion(
-            np.array([time_]),
-            position=np.array([[1.5 * time_, 0.0, z]]),
-            orientation=np.array([[math.cos(lean), math.sin(lean), 0.0, 0.0]]),
-            velocity=np.array([[1.5, 0.0, speed - GRAVITY * t if airborne else 0.0]]),
-            contact=np.full((1, 4), not airborne),
-        )
-        gauge.add(sample)
+def seen_by_gauge(capture: Capture) -> Gauge:
+    gauge = Gauge(JumpRules(standing_height=STANDING))
+    for k in range(0, len(capture.time), 2):
+        arrays = {one.name: getattr(capture, one.name)[k : k + 1] for one in fields(Capture)}
+        gauge.add(Capture(**arrays))
     return gauge
 
 
 def test_jumps_and_falls_are_measured() -> None:
-    gauge = flown(2.0)
+    seen = seen_jump(up=2.0, speed=1.5)
+    gauge = seen_by_gauge(seen)
     (hop,) = gauge.hops
     assert hop.vertical == pytest.approx(2.0, abs=0.03)
-    assert hop.apex == pytest.approx(BODY.standing_height + 4.0 / (2.0 * GRAVITY), abs=1e-3)
-    assert hop.duration == pytest.approx(4.0 / GRAVITY, abs=0.005)
-    assert hop.distance == pytest.approx(1.5 * hop.duration)
-    # v^2 / 2g is 2.5 cm: less than the 3 cm of a jump.
-    assert flown(0.7).hops == []
-    fallen = flown(2.0, tilt=1.5)
+    assert hop.apex == pytest.approx(Z_OFF + 2.0**2 / (2.0 * G), abs=1e-3)
+    assert hop.duration == pytest.approx(2.0 * 2.0 / G, abs=0.005)
+    assert hop.distance == pytest.approx(1.5 * hop.duration, abs=0.005)
+    # Less than the 3 cm over standing height of a jump.
+    low = changed(seen, "position", (slice(None), 2), STANDING)
+    assert seen_by_gauge(low).hops == []
+    fallen = seen_by_gauge(changed(seen, "orientation", slice(7000, None), [0.7, 0.7, 0.0, 0.0]))
     assert (gauge.fallen, fallen.fallen) == (False, True)
     assert "fell" in readout(fallen, 1.0)
 
 
-class Heights:
+class Heights(list[float]):
     """A page that keeps the heights of the trunk."""
 
-    def __init__(self) -> None:
-        self.heights: list[float] = []
-
     def show(self, sample: Capture, gauge: Gauge, factor: float) -> None:
-        self.heights.append(float(sample.position[0, 2]))
+        self.append(float(sample.position[0, 2]))
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +128,7 @@ def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_robot_hops_and_resets_no_faster_than_real_time(
     hopper: Path, act: str, at: float, end: float
 ) -> None:
-    joystick, page, done = Joystick(ranges=RANGES), Heights(), []
+    joystick, heights, done = Joystick(ranges=RANGES), Heights(), []
 
     def until(simulated: float) -> bool:
         if simulated >= at and not done:
@@ -151,10 +136,9 @@ def test_the_robot_hops_and_resets_no_faster_than_real_time(
             getattr(joystick, act)()
         return simulated >= end
 
-    figures = play(ROBOT, load_policy(hopper), load_sim_params(), joystick, page, until=until)
-    heights = page.heights
+    figures = play(ROBOT, load_policy(hopper), load_sim_params(), joystick, heights, until=until)
     assert figures["wall_s"] >= 0.97 * end
-    assert heights[0] == pytest.approx(BODY.standing_height, abs=0.06)
+    assert heights[0] == pytest.approx(legged(ROBOT.source).standing_height, abs=0.06)
     if act == "jump":
         assert figures["simulated_s"] == pytest.approx(1.0)
         assert max(heights) > heights[0] + 0.05
