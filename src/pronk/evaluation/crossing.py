@@ -47,7 +47,7 @@ from pronk.evaluation.jumps import (
     number,
     sample_at,
 )
-from pronk.evaluation.protocol import Case
+from pronk.evaluation.protocol import Case, named
 from pronk.evaluation.results import Results, Row, Subject, extra_kind
 from pronk.evaluation.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
 from pronk.processes import in_processes
@@ -292,12 +292,7 @@ LADDERS: Mapping[Shape, Ladder] = {
 class CrossingPlan:
     """Commands, sizes and runs; the commands are those of the paper's gaps (R3)."""
 
-    cases: tuple[Case, ...] = (
-        Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-        Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-        Case(name="side +1", command=(0.0, 1.0, 0.0)),
-        Case(name="side -1", command=(0.0, -1.0, 0.0)),
-    )
+    cases: tuple[Case, ...] = named("forward 2", "back 2", "side +1", "side -1")
     ladders: Mapping[Shape, Ladder] = field(default_factory=lambda: dict(LADDERS))
     runs: int = 5
     """For each size and lead."""

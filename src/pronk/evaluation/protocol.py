@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from pronk.errors import PronkError
-from pronk.runtime.script import Velocity
+from pronk.runtime.script import STILL, Velocity
 
 Pair = tuple[float, float]
 """Mean and standard deviation."""
@@ -22,16 +22,32 @@ class Case:
     """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
 
 
-PAPER_COMMANDS = (
-    Case(name="forward 1", command=(1.0, 0.0, 0.0)),
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="side -1", command=(0.0, -1.0, 0.0)),
-    Case(name="side +1", command=(0.0, 1.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-)
-"""The jumps of Table III of the paper. Positive sideways is to the left: the paper does not define
-it, and its robot is symmetric."""
-RATES = Case(name="forward 2.25", command=(2.25, 0.0, 0.0))
+_COMMANDS: Mapping[str, Velocity] = {
+    "forward 1": (1.0, 0.0, 0.0),
+    "forward 2": (2.0, 0.0, 0.0),
+    "forward 2.25": (2.25, 0.0, 0.0),
+    "forward 3": (3.0, 0.0, 0.0),
+    "back 2": (-2.0, 0.0, 0.0),
+    "back 3": (-3.0, 0.0, 0.0),
+    **dict.fromkeys(("side +1", "left 1"), (0.0, 1.0, 0.0)),
+    **dict.fromkeys(("side -1", "right 1"), (0.0, -1.0, 0.0)),
+    **dict.fromkeys(("turn +2", "yaw 2"), (0.0, 0.0, 2.0)),
+    **dict.fromkeys(("turn -2", "yaw -2"), (0.0, 0.0, -2.0)),
+    "stand": STILL,
+}
+
+
+def named(*names: str) -> tuple[Case, ...]:
+    """Return commands by name. Positive sideways and positive turns are to the left.
+
+    The paper does not define the side, and its robot is symmetric.
+    """
+    return tuple(Case(name=name, command=_COMMANDS[name]) for name in names)
+
+
+PAPER_COMMANDS = named("forward 1", "forward 2", "side -1", "side +1", "back 2")
+"""The jumps of Table III of the paper."""
+(RATES,) = named("forward 2.25")
 """Of the paper's figure of roll and pitch rates (R7)."""
 
 

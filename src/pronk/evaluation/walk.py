@@ -26,7 +26,7 @@ from pronk.evaluation.jumps import (
     sample_at,
     uncommanded_height,
 )
-from pronk.evaluation.protocol import Case
+from pronk.evaluation.protocol import Case, named
 from pronk.evaluation.results import Results, extra_kind
 from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.robots.legged import legged
@@ -42,17 +42,8 @@ NO_PATH = 0.5
 """Shortest path that has a cost of transport [m]."""
 WALK_S = 20.0
 """Length of a walk [s]."""
-WALKS = (
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-    Case(name="side +1", command=(0.0, 1.0, 0.0)),
-    Case(name="side -1", command=(0.0, -1.0, 0.0)),
-    Case(name="turn +2", command=(0.0, 0.0, 2.0)),
-    Case(name="turn -2", command=(0.0, 0.0, -2.0)),
-    Case(name="stand", command=(0.0, 0.0, 0.0)),
-)
-"""The paper's R4, turning at the ends of the trained range (C3), and standing. Positive sideways
-and positive turns are to the left."""
+WALKS = named("forward 2", "back 2", "side +1", "side -1", "turn +2", "turn -2", "stand")
+"""The paper's R4, turning at the ends of the trained range (C3), and standing."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.protocol import PAPER_COMMANDS, Case
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case, named
 from pronk.evaluation.results import Spread
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script
@@ -26,16 +26,9 @@ Samples = NDArray[np.int64]
 
 NEVER = 2**30
 """A sample that does not come."""
-WALKS = (
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-    Case(name="left 1", command=(0.0, 1.0, 0.0)),
-    Case(name="right 1", command=(0.0, -1.0, 0.0)),
-    Case(name="forward 3", command=(3.0, 0.0, 0.0)),
-    Case(name="back 3", command=(-3.0, 0.0, 0.0)),
-    Case(name="yaw 2", command=(0.0, 0.0, 2.0)),
-    Case(name="yaw -2", command=(0.0, 0.0, -2.0)),
-    Case(name="stand", command=(0.0, 0.0, 0.0)),
+WALKS = named(
+    *("forward 2", "back 2", "left 1", "right 1", "forward 3", "back 3"),
+    *("yaw 2", "yaw -2", "stand"),
 )
 """Velocities to keep."""
 JUMPS = PAPER_COMMANDS
