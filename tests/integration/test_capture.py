@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from pronk.virtual.plant import Plant, legs_of, motor_of
 from pronk.virtual.robot import VirtualRobot
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains
 
-FEET = [f"{leg}_foot" for leg in ("FR", "FL", "HR", "HL")]
 KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]
 
 
@@ -55,15 +55,22 @@ def test_samples_are_a_millisecond_apart_from_the_clocks_zero(seen: Capture) -> 
     assert np.linalg.norm(seen.orientation, axis=1) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_feet_are_where_the_trunk_and_the_joints_put_them(seen: Capture) -> None:
-    model = ROBOT.build_spec().compile()
+def posed(model: mujoco.MjModel, seen: Capture, samples: Sequence[int]) -> Iterator[mujoco.MjData]:
+    """Put a model into the poses of samples."""
     data = mujoco.MjData(model)
     joints = [model.joint(name).qposadr[0] for name in ROBOT.joint_names]
-    sites = [model.site(name).id for name in FEET]
-    for k in (0, 120, 250, 699):
+    for k in samples:
         data.qpos[:3], data.qpos[3:7] = seen.position[k], seen.orientation[k]
         data.qpos[joints] = seen.joint_position[k]
         mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        yield data
+
+
+def test_feet_are_where_the_trunk_and_the_joints_put_them(seen: Capture) -> None:
+    model, samples = ROBOT.build_spec().compile(), (0, 120, 250, 699)
+    sites = [model.site(f"{leg}_foot").id for leg in ("FR", "FL", "HR", "HL")]
+    for k, data in zip(samples, posed(model, seen, samples), strict=True):
         np.testing.assert_allclose(seen.foot_position[k], data.site_xpos[sites], atol=1e-12)
 
 
@@ -92,17 +99,9 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
         name = model.body(body).name
         model.body_mass[body] = plant.body(name).mass[0]
         model.body_ipos[body] = plant.body(name).ipos
-    data = mujoco.MjData(model)
-    joints = [model.joint(name).qposadr[0] for name in ROBOT.joint_names]
     airborne = np.flatnonzero(~seen.contact.any(axis=1))
     flight = airborne[airborne < airborne[0] + 40]
-    centre = []
-    for k in flight:
-        data.qpos[:3], data.qpos[3:7] = seen.position[k], seen.orientation[k]
-        data.qpos[joints] = seen.joint_position[k]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        centre.append(data.subtree_com[1].copy())
+    centre = [data.subtree_com[1].copy() for data in posed(model, seen, flight)]
     fit = np.polyfit(seen.time[flight], np.array(centre), 2)
     np.testing.assert_allclose(2.0 * fit[0], [0.0, 0.0, -9.81], atol=0.05)
 
@@ -172,11 +171,6 @@ def test_capture_outlives_the_connection_and_is_stored(seen: Capture, tmp_path: 
 
 def test_files_that_are_no_capture(seen: Capture, tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
-    with pytest.raises(ArtefactError):
-        load(path)
-    path.write_bytes(b"PK not a zip")
-    with pytest.raises(ArtefactError):
-        load(path)
     arrays = {part.name: getattr(seen, part.name) for part in fields(Capture)}
     missing = {name: value for name, value in arrays.items() if name != "contact"}
     for schema, stored, named in (
