@@ -58,7 +58,7 @@ GAP = obstacle()
 def settled(
     seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return measure_crossing(seen, obstacle, triggered=triggered, rules=RULES)
+    return measure_crossing(seen, obstacle, 0.65, triggered=triggered, rules=RULES)
 
 
 # --- The course ---------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def test_what_happens_elsewhere_does_not_count() -> None:
 
 # --- The search ---------------------------------------------------------------------------------
 
-SIM_PARAMS = load_sim_params()
+SETUP = Setup(robot=ROBOT, sim_params=load_sim_params(), out=Path())
 CASE = Case(name="forward 2", command=FORWARD)
 LADDER = Ladder((0.1, 0.2, 0.3, 0.4), (0.0, 0.1))
 PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2)
@@ -181,7 +181,7 @@ def climb(
         why = "" if good else crossing.NON_FOOT_CONTACT
         return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
 
-    return search([subject("matched")], plan, robot=ROBOT, sim_params=SIM_PARAMS, run=run), done
+    return search([subject("matched")], plan, SETUP, run=run), done
 
 
 def result(rows: list[Row]) -> Results:
@@ -234,8 +234,7 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     slow = Case(name="forward", command=(0.2, 0.0, 0.0))
     script = Script(command=slow.command, stand_s=0.1)
     plan = replace(PLAN, cases=(slow,), practice=1, script=script)
-    setup = Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
-    found = add_crossings([policy], plan, setup)
+    found = add_crossings([policy], plan, replace(SETUP, out=tmp_path))
     assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
     assert climbs(found)[0].largest == 0.0
     assert repr(results.load(tmp_path, CROSSING).rows) == repr(found.rows)

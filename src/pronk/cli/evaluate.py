@@ -12,22 +12,18 @@ import tyro
 from pronk.cli import console
 from pronk.errors import PronkError
 
-What = Literal["all", "walk", "jump"]
-Drawn = Literal["full", "noise", "none"]
-Device = Literal["auto", "cpu", "cuda"]
-
 
 def evaluate(
     policy: tyro.conf.Positional[Path],
     gains: str,
     out: Annotated[Path, tyro.conf.arg(aliases=("--json",))] = Path("evaluation.json"),
     like: Annotated[Path | None, tyro.conf.arg(name="ranges-from")] = None,
-    what: What = "all",
+    what: Literal["all", "walk", "jump"] = "all",
     robots: int = 1000,
-    randomization: Drawn = "full",
+    randomization: Literal["full", "noise", "none"] = "full",
     before: Path | None = None,
     seed: int = 0,
-    device: Device = "auto",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> None:
     """Walk and jump with many robots at once; errors, heights, falls, acceptance criteria.
 

@@ -52,12 +52,10 @@ from pronk.evaluation.results import Results, Row, Subject, extra_kind
 from pronk.evaluation.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
 from pronk.processes import in_processes
 from pronk.robots import load_robot
-from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import ticks
 from pronk.runtime.script import STILL, Commanded, Script, Velocity
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground, Start
-from pronk.virtual.sim_params import SimParams
 
 Shape = Literal["flat", "gap", "up", "down"]
 
@@ -189,14 +187,15 @@ def lost(seen: Capture, obstacle: Obstacle) -> bool:
 
 
 def measure_crossing(
-    seen: Capture, obstacle: Obstacle, *, triggered: float | None, rules: JumpRules
+    seen: Capture, obstacle: Obstacle, lead: float, *, triggered: float | None, rules: JumpRules
 ) -> CrossingFigures:
     """Measure one run at an obstacle.
 
     `triggered` is when the jump input rose, on the capture's clock [s]; None for never.
     """
+    figures: dict[str, Any] = {"obstacle": obstacle.kind, "size": obstacle.size, "lead": lead}
     if triggered is None:
-        return CrossingFigures(why=NOT_TRIGGERED)
+        return CrossingFigures(why=NOT_TRIGGERED, **figures)
     along, count, far = direction(obstacle.command), len(seen.time), obstacle.far
     on = min(sample_at(seen, triggered), count - 1)
     feet, trunk = seen.foot_position[:, :, :2] @ along, seen.position[:, :2] @ along
@@ -204,7 +203,7 @@ def measure_crossing(
     first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
     landed, legs = int(first.max()), np.arange(feet.shape[1])
     settled = landed + round(rules.upright_s / seen.dt)
-    figures: dict[str, Any] = {"speed": float(seen.velocity[on, :2] @ along)}
+    figures["speed"] = float(seen.velocity[on, :2] @ along)
     main = jump_flights(seen, on, rules, count).main
     if main is not None:
         before = seen.contact[: main.liftoff]
@@ -266,9 +265,9 @@ def attempt(task: Attempt) -> Row:
         elif since > operator.triggered + after or lost(machine.snapshot(), obstacle):
             break
     triggered = None if operator.triggered is None else began + operator.triggered
-    figures = measure_crossing(machine.capture(), obstacle, triggered=triggered, rules=rules)
-    measured = replace(figures, obstacle=obstacle.kind, size=obstacle.size, lead=task.lead)
-    return replace(task.row, figures=measured)
+    how: Any = {"triggered": triggered, "rules": rules}
+    figures = measure_crossing(machine.capture(), obstacle, task.lead, **how)
+    return replace(task.row, figures=figures)
 
 
 # ---- many runs ----
@@ -308,12 +307,12 @@ class CrossingPlan:
 def search(
     subjects: Sequence[Subject],
     plan: CrossingPlan,
+    setup: Setup,
     *,
-    robot: RobotSpec,
-    sim_params: SimParams,
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:
     """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
+    robot, ground = setup.robot, setup.sim_params.ground
 
     def attempts(
         subject: Subject, case: Case, kind: Shape, size: float, lead: float, runs: int
@@ -332,37 +331,40 @@ def search(
                 row=row,
                 subject=subject,
                 robot=robot.source,
-                sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
+                sim_params=replace(setup.sim_params, ground=obstacle.on(ground)),
                 start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
                 obstacle=obstacle,
                 lead=lead,
             )
 
-    pairs = [(subject, case) for subject in subjects for case in plan.cases]
+    pairs = list(itertools.product(subjects, plan.cases))
     flat = (attempts(*pair, "flat", 0.0, 0.0, plan.practice) for pair in pairs)
     rows = run([task for tasks in flat for task in tasks])
-    climbing: dict[tuple[str, str, Shape], tuple[Subject, Case, int, float]] = {}
+    climbing: list[tuple[Subject, Case, Shape, float]] = []
     for subject, case in pairs:
         names = (subject.name, case.name)
         own = [row.figures.reach for row in rows if (row.policy, row.case) == names]
         if known := list(filter(math.isfinite, own)):  # without a jump there is nothing to cross
-            reach = float(np.mean(known))
-            climbing |= {(*names, kind): (subject, case, 0, reach) for kind in plan.ladders}
-    while climbing:
+            climbing += [(subject, case, kind, float(np.mean(known))) for kind in plan.ladders]
+    for rung in itertools.count():
+        climbing = [one for one in climbing if rung < len(plan.ladders[one[2]].sizes)]
+        if not climbing:
+            break
         steps: list[Attempt] = []
-        for (_, _, kind), (subject, case, rung, reach) in climbing.items():
-            ladder = plan.ladders[kind]
-            for lead in (round(reach + beyond, 4) for beyond in ladder.leads):
-                steps += attempts(subject, case, kind, ladder.sizes[rung], lead, plan.runs)
+        for subject, case, kind, reach in climbing:
+            sizes, leads = plan.ladders[kind]
+            for lead in (round(reach + beyond, 4) for beyond in leads):
+                steps += attempts(subject, case, kind, sizes[rung], lead, plan.runs)
         found = run(steps)
         rows += found
-        for key, (subject, case, rung, reach) in list(climbing.items()):
-            tried = [r for r in found if (r.policy, r.case, r.figures.obstacle) == key]
-            higher = rung + 1 < len(plan.ladders[key[2]].sizes)
-            if rung_of(tried).crossed >= plan.enough and higher:
-                climbing[key] = subject, case, rung + 1, reach
-            else:
-                del climbing[key]
+        tried: dict[tuple[str, str, str], list[Row]] = {}
+        for row in found:
+            tried.setdefault((row.policy, row.case, row.figures.obstacle), []).append(row)
+        climbing = [
+            (subject, case, kind, reach)
+            for subject, case, kind, reach in climbing
+            if rung_of(tried[subject.name, case.name, kind]).crossed >= plan.enough
+        ]
     return rows
 
 
@@ -384,7 +386,7 @@ def add_crossings(policies: Sequence[Path], plan: CrossingPlan, setup: Setup) ->
 
         return in_processes(attempt, tasks, processes=setup.processes, progress=progress)
 
-    rows = search(subjects, plan, robot=setup.robot, sim_params=setup.sim_params, run=run)
+    rows = search(subjects, plan, setup, run=run)
     setup.progress(1.0)
     return finished(
         CROSSING,

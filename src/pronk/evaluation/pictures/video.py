@@ -22,7 +22,7 @@ from typing import Any
 from pronk import opengl
 from pronk.errors import PronkError
 from pronk.evaluation.pictures.film import SCHEMA, Film, JumpEvents, plan
-from pronk.evaluation.results import Results, Row
+from pronk.evaluation.results import Results
 from pronk.files import save_artefact
 from pronk.robots.robot import RobotSpec
 from pronk.virtual import capture as captures
@@ -126,17 +126,15 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 def films_of(
     found: Results, folder: Path, *, robot: RobotSpec, cases: Container[str], slow: float = SLOW
 ) -> dict[str, Film]:
-    """Plan a film of each subject with each command of `cases`, by the name of its files.
+    """Plan a film of the first run of each subject with each command of `cases`, by file name.
 
     `folder` has the captures; of `robot` the results have only the name.
     """
-    first: dict[tuple[str, str], Row] = {}
+    films = {}
     policies = {subject.name for subject in found.subjects}
     for row in found.rows:
-        if row.capture and row.policy in policies and row.case in cases:
-            first.setdefault((row.policy, row.case), row)
-    films = {}
-    for row in first.values():
+        if row.number or not row.capture or row.policy not in policies or row.case not in cases:
+            continue
         on = row.began + row.script.on
         events, span = None, (on - _BEFORE_S, on + _AFTER_S)
         if row.figures.found:

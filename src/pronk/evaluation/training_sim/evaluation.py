@@ -95,10 +95,10 @@ class Plan:
 
         For each robot, in samples of `dt`, (N,); `NEVER` for what does not happen.
         """
-        jumping = np.arange(self.size) >= self.walkers
         draws = np.random.default_rng(self.seed).random(self.size - self.walkers)
         on = np.full(self.size, NEVER)
-        on[jumping] = np.rint((self.script.on + self.spread_s * draws) / dt)
+        on[self.walkers :] = np.rint((self.script.on + self.spread_s * draws) / dt)
+        jumping = on < NEVER
         off = np.where(jumping, on + round(self.script.jump_s / dt), NEVER)
         return {
             "start": np.where(jumping, round(self.script.start / dt), 0),
