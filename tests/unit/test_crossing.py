@@ -13,21 +13,7 @@ import pytest
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
 from pronk.evaluation import crossing, results
-from pronk.evaluation.crossing import (
-    CROSSING,
-    Attempt,
-    CrossingFigures,
-    CrossingPlan,
-    Ladder,
-    Obstacle,
-    Operator,
-    add_crossings,
-    climbs,
-    direction,
-    lost,
-    measure_crossing,
-    search,
-)
+from pronk.evaluation.crossing import Attempt, CrossingFigures, CrossingPlan, Ladder, Obstacle
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Results, Row
@@ -58,7 +44,7 @@ GAP = obstacle()
 def settled(
     seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return measure_crossing(seen, obstacle, 0.65, triggered=triggered, rules=RULES)
+    return crossing.measure_crossing(seen, obstacle, 0.65, triggered=triggered, rules=RULES)
 
 
 # --- The course ---------------------------------------------------------------------------------
@@ -86,13 +72,13 @@ def test_the_floor_is_where_it_should_be(
 def test_a_course_leads_straight_on() -> None:
     for command in ((1.0, 1.0, 0.0), STILL):
         with pytest.raises(PronkError, match="course"):
-            direction(command)
+            crossing.direction(command)
 
 
 def test_the_operator_looks_at_the_trunk() -> None:
     script = Script(command=FORWARD, stand_s=1.0, jump_s=0.4, keep_s=0.2)
     place = 5.0  # where it stands does not matter before it runs
-    operator = Operator(script, trigger_at=1.5, where=lambda: place)
+    operator = crossing.Operator(script, trigger_at=1.5, where=lambda: place)
     assert operator(0.5) == (STILL, False)
     place = 1.49
     assert operator(1.0) == (FORWARD, False)
@@ -141,7 +127,7 @@ LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
 )
 def test_why_a_gap_was_not_crossed(seen: Capture, size: float, why: str, ends: bool) -> None:
     assert settled(seen, obstacle(size=size)).why == why
-    assert lost(seen, obstacle(size=size)) is ends
+    assert crossing.lost(seen, obstacle(size=size)) is ends
 
 
 def test_what_happens_elsewhere_does_not_count() -> None:
@@ -152,7 +138,7 @@ def test_what_happens_elsewhere_does_not_count() -> None:
     # Steps have no bottom to fall into.
     assert settled(LOW, obstacle("down")).success
     assert settled(LOW, obstacle("up")).landing == pytest.approx(LANDED - EDGE, abs=2e-3)
-    assert not lost(LOW, obstacle("up"))
+    assert not crossing.lost(LOW, obstacle("up"))
 
 
 # --- The search ---------------------------------------------------------------------------------
@@ -181,12 +167,13 @@ def climb(
         why = "" if good else crossing.NON_FOOT_CONTACT
         return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
 
-    return search([subject("matched")], plan, SETUP, run=run), done
+    return crossing.search([subject("matched")], plan, SETUP, run=run), done
 
 
 def result(rows: list[Row]) -> Results:
     settings = {"kinds": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough}
-    return of_kind(CROSSING, ("matched",), cases=(CASE,), rows=tuple(rows), settings=settings)
+    rest: Any = {"rows": tuple(rows), "settings": settings}
+    return of_kind(crossing.CROSSING, ("matched",), cases=(CASE,), **rest)
 
 
 def test_sizes_grow_until_no_lead_does() -> None:
@@ -195,7 +182,7 @@ def test_sizes_grow_until_no_lead_does() -> None:
     rows, _ = climb(crossed)
     # Two jumps of practice, then three runs for each of two leads at three sizes.
     assert len(rows) == 2 + 3 * 2 * 3
-    (found,) = climbs(result(rows))
+    (found,) = crossing.climbs(result(rows))
     assert [rung.size for rung in found.rungs] == [0.1, 0.2, 0.3]
     assert [(rung.crossed, rung.runs) for rung in found.rungs] == [(3, 3), (2, 3), (1, 3)]
     assert [rung.lead for rung in found.rungs] == pytest.approx([0.65, 0.55, 0.65])
@@ -204,14 +191,14 @@ def test_sizes_grow_until_no_lead_does() -> None:
     # A larger gap does not count without the smaller.
     rows, _ = climb({(0.1, 0.0): 0, (0.1, 0.1): 1})
     more = [replace(row, figures=replace(row.figures, size=0.2, why="")) for row in rows[2:]]
-    (found,) = climbs(result([*rows, *more]))
+    (found,) = crossing.climbs(result([*rows, *more]))
     assert (found.largest, found.ever) == (0.0, 0.2)
 
 
 def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
     rows, _ = climb({}, reach=math.nan)
     assert len(rows) == PLAN.practice
-    assert climbs(result(rows))[0].rungs == ()
+    assert crossing.climbs(result(rows))[0].rungs == ()
 
 
 def test_starts_depend_on_command_and_number_alone() -> None:
@@ -234,8 +221,8 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     slow = Case(name="forward", command=(0.2, 0.0, 0.0))
     script = Script(command=slow.command, stand_s=0.1)
     plan = replace(PLAN, cases=(slow,), practice=1, script=script)
-    found = add_crossings([policy], plan, replace(SETUP, out=tmp_path))
+    found = crossing.add_crossings([policy], plan, replace(SETUP, out=tmp_path))
     assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
-    assert climbs(found)[0].largest == 0.0
-    assert repr(results.load(tmp_path, CROSSING).rows) == repr(found.rows)
+    assert crossing.climbs(found)[0].largest == 0.0
+    assert repr(results.load(tmp_path, crossing.CROSSING).rows) == repr(found.rows)
     assert np.isnan(found.rows[0].figures.reach)

@@ -61,11 +61,11 @@ def failed(whole: Evaluation) -> list[str]:
 
 
 def test_a_good_policy_meets_every_criterion() -> None:
-    found = evaluation_checks(evaluation(before={case.name: 0.1 for case in WALKS}))
-    assert [check.what for check in found if not check.passed] == []
+    good = evaluation(before={case.name: 0.1 for case in WALKS})
+    assert failed(good) == []
     # 4 walks of two, 2 turns, standing; 5 jumps of seven; 2 of flights without a jump input; 2 of
     # the estimator; the cost.
-    assert len(found) == 8 + 2 + 1 + 5 * 7 + 2 + 2 + 1
+    assert len(evaluation_checks(good)) == 8 + 2 + 1 + 5 * 7 + 2 + 2 + 1
 
 
 @pytest.mark.parametrize(
@@ -101,9 +101,8 @@ def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
     before = dict.fromkeys(("forward 2", "back 2", "left 1", "right 1"), 0.1)
     assert cost_of_jumping(before, dict.fromkeys(before, 0.12)) == pytest.approx(1.2)
     assert math.isnan(cost_of_jumping({"forward 2": 0.1}, before))
-    assert failed(evaluation(before=dict.fromkeys(before, 0.09))) == [
-        "speed error over that before jumping"
-    ]
+    (what,) = failed(evaluation(before=dict.fromkeys(before, 0.09)))
+    assert what == "speed error over that before jumping"
 
 
 def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
