@@ -14,14 +14,7 @@ from hypothesis import strategies as st
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation import results, variation, walk
-from pronk.evaluation.bodies import (
-    GROUP_TORQUE,
-    TOLERANCES,
-    draw_robot,
-    gains_errors,
-    save_sim_params,
-)
+from pronk.evaluation import bodies, results, variation, walk
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Results
 from pronk.evaluation.trial import Plan, Setup
@@ -44,8 +37,8 @@ QUICK = MatchSettings(method="paper", estimator=Estimator(segment_s=4.0), zero_a
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_draws_stay_within_their_tolerances(seed: int) -> None:
-    drawn = draw_robot(SIM_PARAMS, ROBOT, seed=seed)
-    for part, tolerances in TOLERANCES.items():
+    drawn = bodies.draw_robot(SIM_PARAMS, ROBOT, seed=seed)
+    for part, tolerances in bodies.TOLERANCES.items():
         pairs = [(getattr(SIM_PARAMS, part), getattr(drawn, part))]
         if part == "joints":
             pairs = [(SIM_PARAMS.joints[name], new) for name, new in drawn.joints.items()]
@@ -53,7 +46,7 @@ def test_draws_stay_within_their_tolerances(seed: int) -> None:
             if field == "breakaway":
                 assert new.breakaway >= new.coulomb
             else:
-                batch = GROUP_TORQUE * (1.0 + tolerance.half) if field == "torque_scale" else 0.0
+                batch = bodies.GROUP_TORQUE * (1.0 + tolerance.half) * (field == "torque_scale")
                 value, found = (np.atleast_1d(getattr(each, field)) for each in (own, new))
                 centre = tolerance.centre if tolerance.kind == "about" else value
                 half = tolerance.half + batch
@@ -63,18 +56,18 @@ def test_draws_stay_within_their_tolerances(seed: int) -> None:
 
 
 def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
-    one, again, other = (draw_robot(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
+    one, again, other = (bodies.draw_robot(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
     assert one == again != other
     assert one.joints["FR_knee"] != SIM_PARAMS.joints["FR_knee"]
     path = tmp_path / "body" / "sim_params.yaml"
-    save_sim_params(path, one, says="A body.\nFrom a test.")
+    bodies.save_sim_params(path, one, says="A body.\nFrom a test.")
     assert load_sim_params(path) == one
     assert path.read_text().startswith("# A body.\n# From a test.\n")
     # What is not drawn stays.
     assert one.machine.encoder_bits == SIM_PARAMS.machine.encoder_bits
     scene = replace(one, ground=replace(one.ground, floor=-1.0))
     with pytest.raises(PronkError, match="no terrain"):
-        save_sim_params(path, scene, says="")
+        bodies.save_sim_params(path, scene, says="")
     assert load_sim_params(path) == one
     for each in (one, other):
         VirtualRobot(ROBOT, each, base="ground")  # refuses what cannot exist
@@ -87,7 +80,7 @@ def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
     pairs, chirp = (20.6, 0.492), Excitation(offsets=Chirp(length_s=8.0).samples())
     logs = [synthetic_log(ROBOT, "FR_hip_roll", [chirp], *pairs)]
     gains = {"naive": {"FR_hip_roll": (17.0, 0.4)}, "own": {"FR_hip_roll": pairs}}
-    found = gains_errors(logs, ROBOT, gains, settings=QUICK)
+    found = bodies.gains_errors(logs, ROBOT, gains, settings=QUICK)
     assert found["own"] < 0.01
     matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
     assert found["naive"] == pytest.approx(matched.naive_error_db, rel=1e-4)

@@ -21,12 +21,7 @@ from tensordict import TensorDict
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.training_sim.adapter import (
-    blank_actor,
-    evaluate,
-    evaluation_cfg,
-    load_subject,
-)
+from pronk.evaluation.training_sim import adapter
 from pronk.evaluation.training_sim.evaluation import NEVER, Plan
 from pronk.evaluation.training_sim.run import TERM, evaluate_policy
 from pronk.robots import load_robot
@@ -68,7 +63,7 @@ def observed() -> SimpleNamespace:
     cfg.events["reset"].params = dict.fromkeys(("place", "speed", "heading", "joints"), 0.0)
     state = cfg.scene.entities["robot"].init_state
     state.pos = (0.0, 0.0, state.pos[2] + DROP)
-    cfg = evaluation_cfg(cfg, SHORT, "none")
+    cfg = adapter.evaluation_cfg(cfg, SHORT, "none")
     cfg.events["decimation"] = decimation
     env = ManagerBasedRlEnv(cfg, device="cpu")
     listener = env.metrics_manager.cfg[TERM].func
@@ -175,7 +170,7 @@ def test_an_environment_of_training_is_refused() -> None:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
     torch.manual_seed(5)
-    actor = blank_actor()
+    actor = adapter.blank_actor()
     torch.nn.init.normal_(actor.mlp[0].jump_weight)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
     gains = {"name": "matched", "sha256": "ab" * 32}
@@ -189,7 +184,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
 
 def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) -> None:
     folder, actor = trained
-    subject = load_subject(folder, "cpu")
+    subject = adapter.load_subject(folder, "cpu")
     obs = TensorDict({"measured": torch.randn(5, 105), "jump": torch.ones(5, 1)}, [5])
     with torch.no_grad():
         assert torch.equal(subject.act(obs), actor(obs))
@@ -217,7 +212,7 @@ def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> N
         ("model_4.pt", "its actor is not that"),
     ):
         with pytest.raises(ArtefactError, match=what):
-            load_subject(tmp_path / name, "cpu")
+            adapter.load_subject(tmp_path / name, "cpu")
 
 
 def test_an_exported_policy_does_what_its_checkpoint_does(
@@ -229,7 +224,7 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     contract = contract_for(cfg, jump=True, provenance={})
     path = tmp_path / "policy.onnx"
     export_policy(trained[1], contract, path)
-    subject, original = load_subject(path, "cpu"), load_subject(trained[0], "cpu")
+    subject, original = adapter.load_subject(path, "cpu"), adapter.load_subject(trained[0], "cpu")
     assert subject.jump
     assert subject.knows(gains)
     # More robots than cores, fewer robots than cores, each with its own output.
@@ -248,9 +243,9 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
-    gains = training_gains("naive", ROBOT)
-    before = {"forward 2": 0.1}
-    found = evaluate(load_subject(trained[0], "cpu"), gains, plan, device="cpu", before=before)
+    gains, before = training_gains("naive", ROBOT), {"forward 2": 0.1}
+    subject = adapter.load_subject(trained[0], "cpu")
+    found = adapter.evaluate(subject, gains, plan, device="cpu", before=before)
     assert [walk.name for walk in found.walks] == ["forward 2", "stand"]
     assert (found.jumps, found.before, found.about["randomization"]) == ((), before, "full")
     assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}

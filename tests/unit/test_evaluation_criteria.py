@@ -13,14 +13,7 @@ import pytest
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import cost_of_jumping, evaluation_checks
 from pronk.evaluation.results import Spread
-from pronk.evaluation.training_sim.evaluation import (
-    JUMPS,
-    NEVER,
-    WALKS,
-    CommandResult,
-    Evaluation,
-    Plan,
-)
+from pronk.evaluation.training_sim import evaluation as sim
 from pronk.evaluation.training_sim.results import load_speed_errors, save
 from pronk.robots import load_robot
 
@@ -36,16 +29,16 @@ GOOD_JUMP = {"height": 0.5, "distance": 1.2, "lift_off_velocity": 2.4, "delay": 
 GOOD_JUMP |= {"upright": 1.0, "single": 1.0}
 
 
-def command_result(name: str, jump: bool, **changes: float | Spread) -> CommandResult:
+def command_result(name: str, jump: bool, **changes: float | Spread) -> sim.CommandResult:
     figures = {**(GOOD_JUMP if jump else GOOD_WALK), **changes}
     spreads = {n: v if isinstance(v, Spread) else spread(v) for n, v in figures.items()}
-    return CommandResult(name=name, command=(2.0, 0.0, 0.0), figures=spreads)
+    return sim.CommandResult(name=name, command=(2.0, 0.0, 0.0), figures=spreads)
 
 
-def evaluation(**changes: Any) -> Evaluation:
-    whole = Evaluation(
-        walks=tuple(command_result(case.name, jump=False) for case in WALKS),
-        jumps=tuple(command_result(case.name, jump=True) for case in JUMPS),
+def evaluation(**changes: Any) -> sim.Evaluation:
+    whole = sim.Evaluation(
+        walks=tuple(command_result(case.name, jump=False) for case in sim.WALKS),
+        jumps=tuple(command_result(case.name, jump=True) for case in sim.JUMPS),
         estimator={"velocity": 0.14, "contacts_right": 0.96},
         plan={"robots": 10, "seed": 3},
         seconds=1.0,
@@ -53,7 +46,7 @@ def evaluation(**changes: Any) -> Evaluation:
     return replace(whole, **changes)
 
 
-def failed(whole: Evaluation) -> list[str]:
+def failed(whole: sim.Evaluation) -> list[str]:
     return [check.what for check in evaluation_checks(whole) if not check.passed]
 
 
@@ -61,7 +54,7 @@ def failed(whole: Evaluation) -> list[str]:
 
 
 def test_a_good_policy_meets_every_criterion() -> None:
-    good = evaluation(before={case.name: 0.1 for case in WALKS})
+    good = evaluation(before={case.name: 0.1 for case in sim.WALKS})
     assert failed(good) == []
     # 4 walks of two, 2 turns, standing; 5 jumps of seven; 2 of flights without a jump input; 2 of
     # the estimator; the cost.
@@ -108,7 +101,7 @@ def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
 def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
     path = tmp_path / "evaluation.json"
     save(path, evaluation())
-    assert load_speed_errors(path) == {case.name: 0.1 for case in WALKS}
+    assert load_speed_errors(path) == {case.name: 0.1 for case in sim.WALKS}
     assert len(json.loads(path.read_text())["checks"]) == 50
     for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/3"}', "not"):
         path.write_text(text)
@@ -120,13 +113,13 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
 
 
 def test_every_robot_has_its_command_and_its_times() -> None:
-    plan = Plan(robot=ROBOT, robots=200, seed=4)
+    plan = sim.Plan(robot=ROBOT, robots=200, seed=4)
     assert plan.size == 14 * 200
     commands = plan.commands()[[0, plan.walkers - 1, -1], 0]
     assert commands.tolist() == [2.0, 0.0, -2.0]
     times = plan.times(DT)
     walking = {name: set(values[: plan.walkers].tolist()) for name, values in times.items()}
-    assert walking == {"start": {0}, "stop": {NEVER}, "on": {NEVER}, "off": {NEVER}}
+    assert walking == {"start": {0}, "stop": {sim.NEVER}, "on": {sim.NEVER}, "off": {sim.NEVER}}
     start, stop, on, off = (times[name][plan.walkers :] for name in ("start", "stop", "on", "off"))
     # 1 s of standing, 2.5 s of running, up to half a second more, evenly.
     assert 3.5 <= DT * on.min() < 3.51
@@ -137,4 +130,4 @@ def test_every_robot_has_its_command_and_its_times() -> None:
     assert plan.seconds == 20.0
     assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
     with pytest.raises(PronkError, match="robots"):
-        Plan(robot=ROBOT, robots=0)
+        sim.Plan(robot=ROBOT, robots=0)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
+import seen_jump as case
 from pronk.evaluation.jumps import (
     FIGURES,
     JumpFigures,
@@ -26,20 +27,7 @@ from pronk.evaluation.jumps import (
 from pronk.robots import load_robot
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
-from seen_jump import (
-    CROUCH,
-    DELAY,
-    DT,
-    FEET,
-    SCRIPT,
-    STANDING,
-    TUCKED,
-    Z_OFF,
-    G,
-    changed,
-    motion,
-    seen_jump,
-)
+from seen_jump import SCRIPT, STANDING, G, changed, motion, seen_jump
 
 ROBOT = load_robot("mini_cheetah")
 RULES = JumpRules(standing_height=STANDING)
@@ -190,7 +178,7 @@ def test_heading_is_the_yaw_whatever_the_tilt(yaw: float, pitch: float, roll: fl
 
 UP = 2.0
 FLIGHT = round(2.0 * UP / G, 3)
-ON, OFF, DOWN = SCRIPT.on, SCRIPT.on + DELAY, SCRIPT.on + DELAY + FLIGHT
+ON, OFF, DOWN = SCRIPT.on, SCRIPT.on + case.DELAY, SCRIPT.on + case.DELAY + FLIGHT
 
 
 def figures(capture: Capture, **changes: Any) -> JumpFigures:
@@ -199,7 +187,7 @@ def figures(capture: Capture, **changes: Any) -> JumpFigures:
 
 
 def at(*times: float) -> slice:
-    return slice(*(round(t / DT) for t in times))
+    return slice(*(round(t / case.DT) for t in times))
 
 
 def test_a_jump_by_hand() -> None:
@@ -208,10 +196,10 @@ def test_a_jump_by_hand() -> None:
     flags = ("standing", "found", "upright", "success", "non_foot_contact", "fell")
     assert [getattr(found, name) for name in flags] == [True] * 4 + [False] * 2
     expected = {
-        "delay": DELAY,
+        "delay": case.DELAY,
         "duration": FLIGHT,
-        "height": Z_OFF + rise - (STANDING - CROUCH),
-        "apex_gain": Z_OFF + rise - STANDING,
+        "height": case.Z_OFF + rise - (STANDING - case.CROUCH),
+        "apex_gain": case.Z_OFF + rise - STANDING,
         "rise": rise,
         "ballistic": rise,
         "lift_off_velocity": UP,
@@ -220,20 +208,20 @@ def test_a_jump_by_hand() -> None:
         "along": FLIGHT,
         # The feet are as wide apart as the hips: what is left of the distance is the gap (A16).
         # Their last stand is one sample before lift-off.
-        "gap": FLIGHT + DT - (FEET[0, 0] - FEET[2, 0]),
+        "gap": FLIGHT + case.DT - (case.FEET[0, 0] - case.FEET[2, 0]),
         "flights": 1.0,
         "high_flights": 1.0,
         "speed": 1.0,
     }
     assert {name: getattr(found, name) for name in expected} == pytest.approx(expected, abs=1e-5)
     # The trunk is lowest .1 s after the jump input and .1 s after touchdown.
-    assert found.distance_minima == pytest.approx(DELAY - 0.1 + FLIGHT, abs=2e-3)
+    assert found.distance_minima == pytest.approx(case.DELAY - 0.1 + FLIGHT, abs=2e-3)
     # 100 W from the input to .5 s after touchdown; 1 m/s.
-    assert found.energy == pytest.approx(100.0 * (DELAY + FLIGHT + 0.5), abs=0.2)
+    assert found.energy == pytest.approx(100.0 * (case.DELAY + FLIGHT + 0.5), abs=0.2)
     assert found.cost_of_transport == pytest.approx(100.0 / (12.0 * G), rel=1e-6)
-    assert found.clearance == pytest.approx(rise + TUCKED, abs=1e-4)
+    assert found.clearance == pytest.approx(rise + case.TUCKED, abs=1e-4)
     # A quarter of the flight away from the apex: 3/4 of the rise, sin(pi / 4) of the tuck.
-    expected = 0.75 * rise + math.sin(math.pi / 4.0) * TUCKED
+    expected = 0.75 * rise + math.sin(math.pi / 4.0) * case.TUCKED
     assert found.clearance_half == pytest.approx(expected, abs=2e-3)
 
 
@@ -256,7 +244,9 @@ def test_without_a_jump() -> None:
     assert (found.standing, found.found, found.success) == (True, False, False)
     assert all(math.isnan(each) for each in (found.distance, found.gap, found.apex_gain))
     # Height is that of the 1.5 s after the input.
-    assert found.height == pytest.approx(Z_OFF + UP**2 / (2.0 * G) - (STANDING - CROUCH), abs=1e-5)
+    assert found.height == pytest.approx(
+        case.Z_OFF + UP**2 / (2.0 * G) - (STANDING - case.CROUCH), abs=1e-5
+    )
     assert found.flights == found.high_flights == 0.0
 
 
