@@ -18,6 +18,7 @@ from PIL import Image
 
 from hopper import DEFAULT, ROBOT, write_hopper
 from pronk import opengl
+from pronk.errors import PronkError
 from pronk.evaluation.pictures import render, video
 from pronk.evaluation.pictures.film import FPS, Film, JumpEvents, plan
 from pronk.evaluation.protocol import Case
@@ -118,7 +119,7 @@ def test_every_frame_says_that_the_robot_is_virtual() -> None:
 def backend() -> str:
     try:
         return video.find_gl()
-    except video.VideoError as error:
+    except PronkError as error:
         pytest.skip(str(error))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, fields
 from threading import Lock
 from typing import Any, Protocol
@@ -195,7 +196,7 @@ def play(
     gauge = Gauge(JumpRules.of(robot))
     machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
     began, simulated, resets, over = time.perf_counter(), 0.0, 0, False
-    try:
+    with suppress(KeyboardInterrupt), closing(machine):  # the usual end
         while not over:
             machine.sampled = None
             machine.connect()
@@ -213,10 +214,5 @@ def play(
                 ahead = start + late + since - time.perf_counter()
                 time.sleep(max(0.0, ahead))
                 late -= ahead if ahead < -_LATE_S else 0.0
-    except KeyboardInterrupt:
-        pass  # the usual end
-    finally:
-        machine.close()
     wall_s = time.perf_counter() - began
-    hops = list(gauge.hops)
-    return {"simulated_s": simulated, "wall_s": wall_s, "resets": resets, "hops": hops}
+    return {"simulated_s": simulated, "wall_s": wall_s, "resets": resets, "hops": gauge.hops}

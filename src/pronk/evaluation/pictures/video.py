@@ -36,10 +36,6 @@ _BEFORE_JUMP_S, _AFTER_JUMP_S = 1.0, 1.2
 _PROBE_S = 60.0
 
 
-class VideoError(PronkError):
-    """This machine cannot make a video; the message names what it lacks."""
-
-
 def no_encoder() -> str | None:
     """Why no MP4 can be written here, as one sentence; None if one can."""
     try:
@@ -58,7 +54,7 @@ def no_encoder() -> str | None:
 def find_gl() -> str:
     """The GL backend (a value of MUJOCO_GL) that renders offscreen here; found by trying.
 
-    One that is set in the environment is tried first.
+    One that is set in the environment is tried first. Raise `PronkError` if there is none.
     """
     candidates = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     if chosen := opengl.requested():
@@ -67,7 +63,7 @@ def find_gl() -> str:
         with suppress(subprocess.TimeoutExpired):
             if not _run(name, timeout=_PROBE_S).returncode:
                 return name
-    raise VideoError(
+    raise PronkError(
         f"no video: of {' and '.join(candidates) or 'the system'} no OpenGL renders offscreen "
         "here; `apt-get install libosmesa6` gives one that needs neither GPU nor display."
     )
@@ -98,8 +94,7 @@ def environment(backend: str) -> dict[str, str]:
 def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
     """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, each whole, and return them.
 
-    `warn` is called with one sentence about what this machine lacks, but for OpenGL, without which
-    a `VideoError` is raised.
+    `warn` is called with one sentence about what this machine lacks, but for OpenGL: see `find_gl`.
     """
     backend = find_gl()
     endings = [".gif", ".png"] if film.labels else [".gif"]
@@ -173,7 +168,7 @@ def record_all(
     """
     try:
         find_gl()
-    except VideoError as error:
+    except PronkError as error:
         warn(str(error))
         return ()
     planned = films_of(found, folder, robot=robot, cases=cases, slow=slow)

@@ -95,24 +95,13 @@ class Run:
         the share of right contacts, and the count of policy steps."""
         self._state = self._read()
 
+    @torch.no_grad()  # inference mode would leave the environment with read-only tensors
     def go(
         self, policy: Policy, estimate: Estimate | None, progress: Callable[[float], None]
     ) -> None:
         """Simulate the whole plan; arguments are those of `evaluate_policy`."""
-        # Not inference mode, which would leave the environment with read-only tensors.
-        with torch.no_grad():
-            before, self._motion.scripted = self._motion.scripted, True
-            self._listener.listener = self._record
-            try:
-                self._steps(policy, estimate, progress)
-            finally:
-                self._listener.listener = None
-                self._motion.scripted = before
-
-    def _steps(
-        self, policy: Policy, estimate: Estimate | None, progress: Callable[[float], None]
-    ) -> None:
         env, plan, end = self._env, self._plan, len(self._states)
+        self._motion.scripted, self._listener.listener = True, self._record
         first, last = (round(t / self.dt) for t in (plan.settle_s, plan.walk_s))
         self._set_commands(0)
         obs, _ = env.reset(seed=plan.seed)
@@ -221,9 +210,9 @@ def evaluate_policy(
 ) -> Evaluation:
     """Run the whole plan in one batch and measure every robot.
 
-    `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
-    random generators of the process are seeded with the plan's seed. `estimate` is the policy's
-    estimator, if it is evaluated too.
+    `env` was built with `evaluation_cfg` for the same plan, wrapped or not; it is of no other use
+    afterwards. The random generators of the process are seeded with the plan's seed. `estimate` is
+    the policy's estimator, if it is evaluated too.
     """
     began = time.perf_counter()
     run = Run(env.unwrapped, plan)
