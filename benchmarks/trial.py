@@ -24,7 +24,7 @@ from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.protocol import PAPER_COMMANDS
-from pronk.evaluation.trial import Job, Plan, load_subjects, plan_jobs, run_job
+from pronk.evaluation.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
 from pronk.robots import load_robot
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
@@ -103,7 +103,8 @@ def run(
     robot = load_robot(ROBOT)
     (subject,) = load_subjects([policy], robot)
     plan = Plan(cases=(CASE,), jumps=1, seed=seed)
-    [job] = plan_jobs([subject], plan, robot=robot, sim_params=sim_params or load_sim_params())
+    params = sim_params or load_sim_params()
+    [job] = plan_jobs([subject], plan, Setup(robot=robot, sim_params=params, out=Path()))
     recording = Recording(job)  # the warm-up as well
 
     def trial_block() -> float:

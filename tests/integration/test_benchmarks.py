@@ -25,7 +25,7 @@ from hopper import ROBOT as HOPPER
 from hopper import write_hopper
 from pronk.errors import LogError, PronkError
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.trial import Job, Plan, load_subjects, plan_jobs, run_job
+from pronk.evaluation.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
 from pronk.logs.joint_log import JointLog
 from pronk.robots import load_robot
 from pronk.runtime.script import STILL, Script
@@ -224,7 +224,8 @@ def job(tmp_path: Path) -> Job:
     script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
     subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], HOPPER)
     plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
-    [job] = plan_jobs(subjects, plan, robot=HOPPER, sim_params=load_sim_params())
+    setup = Setup(robot=HOPPER, sim_params=load_sim_params(), out=tmp_path)
+    [job] = plan_jobs(subjects, plan, setup)
     return replace(job, row=replace(job.row, capture=""))
 
 

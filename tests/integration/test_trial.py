@@ -48,7 +48,9 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
-    return run_trial(policies, PLAN, Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes))
+    progress = changes.pop("progress", None)
+    setup = Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes)
+    return run_trial(policies, PLAN, setup, progress=progress)
 
 
 # --- What is drawn ------------------------------------------------------------------------------

@@ -84,9 +84,10 @@ def trial(
         found = run_trial(
             policies,
             plan,
-            replace(setup, progress=report.bar("jumping")),
+            setup,
             keep_captures=keep_captures,
             overwrite=overwrite,
+            progress=report.bar("jumping"),
         )
     sheets = list(tables.sheets(found))
     for sheet in sheets:
@@ -150,20 +151,19 @@ def _extra_sheets(
     from pronk.evaluation.walk import add_walks
     from pronk.report import extra_pages
 
-    def shown(stage: str) -> Setup:
-        return replace(setup, progress=report.bar(stage))
-
     seed = plan.seed
     if "walk" in names:
-        for sheet in extra_pages.walk_tables(add_walks(policies, shown("walking"), seed=seed)):
+        walks = add_walks(policies, setup, seed=seed, progress=report.bar("walking"))
+        for sheet in extra_pages.walk_tables(walks):
             yield replace(sheet, title=f"Virtual robot, walking: {sheet.title}")
     if "crossing" in names:
-        crossed = add_crossings(policies, CrossingPlan(seed=seed), shown("crossing"))
+        bar = report.bar("crossing")
+        crossed = add_crossings(policies, CrossingPlan(seed=seed), setup, progress=bar)
         sheet = extra_pages.crossing_table(crossed)
         yield replace(sheet, title=f"Virtual robot, crossing: {sheet.title}")
     if "variation" in names:
-        few = Plan(jumps=5, seed=seed)
-        yield variation.table(variation.add_variation(policies, few, shown("varying the robot")))
+        bar, few = report.bar("varying the robot"), Plan(jumps=5, seed=seed)
+        yield variation.table(variation.add_variation(policies, few, setup, progress=bar))
     if "bodies" in names:
         plan_n = Plan(jumps=plan.jumps, seed=seed)
         yield bodies.table(bodies.add_bodies(policies, plan_n, setup, own=own, stages=report))

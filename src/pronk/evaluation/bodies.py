@@ -137,15 +137,12 @@ def add_bodies(
     for number, paths in enumerate(given, start=1):
         name, folder = f"body {number}", f"{FOLDER}/body_{number}"
         seed, place = 1000 * plan.seed + number, setup.out / folder
-        changed = replace(
-            setup,
-            sim_params=draw_robot(setup.sim_params, robot, seed=seed),
-            out=place / TRIAL,
-            progress=partial(stages, f"{name}: jump"),
-        )
+        params = draw_robot(setup.sim_params, robot, seed=seed)
+        changed = replace(setup, sim_params=params, out=place / TRIAL)
         matched, logs = match_body(changed, place, name=name, seed=seed, stages=stages)
         about = {"file": str(place / SIM_PARAMS), "sha256": sha256(place / SIM_PARAMS)}
-        trial = run_trial(paths, plan, replace(changed, about=about), overwrite=True)
+        how: Any = {"overwrite": True, "progress": partial(stages, f"{name}: jump")}
+        trial = run_trial(paths, plan, replace(changed, about=about), **how)
         errors = _errors(robot, logs, matched, trial.subjects)
         head: Any = {"name": name, "folder": folder, "seed": seed, "sha256": about["sha256"]}
         bodies.append(Body(**head, errors=errors, trial=trial))

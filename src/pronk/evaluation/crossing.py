@@ -51,7 +51,6 @@ from pronk.evaluation.protocol import Case, named
 from pronk.evaluation.results import Results, Row, Subject, extra_kind
 from pronk.evaluation.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
 from pronk.processes import in_processes
-from pronk.robots import load_robot
 from pronk.runtime.rollout import ticks
 from pronk.runtime.script import STILL, Commanded, Script, Velocity
 from pronk.virtual.capture import Capture
@@ -248,7 +247,7 @@ class Attempt(Job):
 
 def attempt(task: Attempt) -> Row:
     """Run once at an obstacle and measure it."""
-    script, obstacle, robot = task.row.script, task.obstacle, load_robot(task.robot)
+    script, obstacle, robot = task.row.script, task.obstacle, task.setup.robot
     along, machine, rules = direction(script.command), task.set_down(), JumpRules.of(robot)
     operator = Operator(
         script,
@@ -312,7 +311,7 @@ def search(
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:
     """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
-    robot, ground = setup.robot, setup.sim_params.ground
+    robot, params = setup.robot, setup.sim_params
 
     def attempts(
         subject: Subject, case: Case, kind: Shape, size: float, lead: float, runs: int
@@ -330,8 +329,8 @@ def search(
             yield Attempt(
                 row=row,
                 subject=subject,
-                robot=robot.source,
-                sim_params=replace(setup.sim_params, ground=obstacle.on(ground)),
+                kind=CROSSING,
+                setup=replace(setup, sim_params=replace(params, ground=obstacle.on(params.ground))),
                 start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
                 obstacle=obstacle,
                 lead=lead,
@@ -368,7 +367,13 @@ def search(
     return rows
 
 
-def add_crossings(policies: Sequence[Path], plan: CrossingPlan, setup: Setup) -> Results:
+def add_crossings(
+    policies: Sequence[Path],
+    plan: CrossingPlan,
+    setup: Setup,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Results:
     """Let policies cross gaps and steps; write `crossing.csv` and `crossing.json`.
 
     Arguments and errors as of `run_trial`; the progress is an estimate.
@@ -380,14 +385,15 @@ def add_crossings(policies: Sequence[Path], plan: CrossingPlan, setup: Setup) ->
         """Run one round; about five more follow each."""
         tasks[0].build()  # refuses impossible parameters
         done = next(rounds)
-
-        def progress(part: float) -> None:
-            setup.progress((done + part) / (done + part + 5.0))
-
-        return in_processes(attempt, tasks, processes=setup.processes, progress=progress)
+        return in_processes(
+            attempt,
+            tasks,
+            processes=setup.processes,
+            progress=lambda part: progress((done + part) / (done + part + 5.0)),
+        )
 
     rows = search(subjects, plan, setup, run=run)
-    setup.progress(1.0)
+    progress(1.0)
     return finished(
         CROSSING,
         subjects,

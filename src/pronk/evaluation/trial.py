@@ -69,8 +69,6 @@ class Setup:
     """Source of the parameters, kept with the results."""
     processes: int = 1
     """Runs at once; no number depends on it."""
-    progress: Callable[[float], None] = lambda share: None
-    """Called with the share done, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,21 +131,16 @@ class Job:
     row: Row
     """The run, without figures."""
     subject: Subject
-    robot: str
-    """Name or path."""
-    sim_params: SimParams
+    setup: Setup
     start: Start
-    out: Path = Path()
-    """Folder of the row's capture."""
-    measure: Callable[..., Any] = JUMPS.measure
-    """As of `Kind`."""
+    kind: Kind
 
     def build(self, share: float = 1.0) -> VirtualRobot:
         """Build the virtual robot, not connected, at a share of the joint offsets."""
         offset = tuple(share * each for each in self.start.joint_offset or ())
         return VirtualRobot(
-            load_robot(self.robot),
-            self.sim_params,
+            self.setup.robot,
+            self.setup.sim_params,
             seed=self.row.seed,
             base="ground",
             start=replace(self.start, joint_offset=offset or None),
@@ -163,7 +156,7 @@ class Job:
             machine = self.build(share)
             machine.connect()
             try:
-                check_standing(load_robot(self.robot), machine.latest())
+                check_standing(self.setup.robot, machine.latest())
                 break
             except HardwareError:
                 if share == _OFFSETS[-1]:
@@ -185,14 +178,14 @@ def _opened(path: str, sha256: str) -> Policy:
 
 def run_job(job: Job) -> Row:
     """Run one job and measure it."""
-    machine, robot, script = job.set_down(), load_robot(job.robot), job.row.script
+    machine, robot, script = job.set_down(), job.setup.robot, job.row.script
     began = machine.now()
     if not list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds)):
         raise HardwareError("the policy made no step; let it run for one tick or more.")
     recorded = machine.capture()
-    figures = job.measure(recorded, script, robot, began=began)
+    figures = job.kind.measure(recorded, script, robot, began=began)
     if job.row.capture:
-        captures.save(job.out / job.row.capture, recorded)
+        captures.save(job.setup.out / job.row.capture, recorded)
     return replace(job.row, figures=figures, began=began)
 
 
@@ -214,19 +207,16 @@ def cores() -> int:
 def plan_jobs(
     subjects: Sequence[Subject],
     plan: Plan,
+    setup: Setup,
+    kind: Kind = JUMPS,
     *,
-    robot: RobotSpec,
     keep: Callable[[Case, int], bool] = lambda case, number: False,
-    **common: Any,
 ) -> list[Job]:
-    """Return every run of a plan; captures are kept of those that `keep` says.
-
-    `common` has the fields that all jobs share, such as `sim_params`.
-    """
+    """Return every run of a plan; captures are kept of those that `keep` says."""
     found: list[Job] = []
     for subject, case in product(subjects, plan.tried):
         for number in range(plan.jumps if case in plan.cases else plan.rates):
-            script, start, seed = draw(plan, case, number, robot)
+            script, start, seed = draw(plan, case, number, setup.robot)
             stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
             row = Row(
                 policy=subject.name,
@@ -236,7 +226,7 @@ def plan_jobs(
                 script=script,
                 capture=f"{CAPTURES}/{stem}.npz" if keep(case, number) else "",
             )
-            found.append(Job(row=row, subject=subject, robot=robot.source, start=start, **common))
+            found.append(Job(row=row, subject=subject, setup=setup, start=start, kind=kind))
     return found
 
 
@@ -250,6 +240,7 @@ def run_trial(
     settings: Mapping[str, Any] | None = None,
     keep_captures: bool = False,
     overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
 ) -> Results:
     """Run policies on the virtual robot, measure and save; scatter is compared with the first's.
 
@@ -257,6 +248,7 @@ def run_trial(
     `keep_captures` all, and `overwrite` replaces a trial in the folder; other kinds are added to
     it. `varied` has parameter, value and body of every body, if there are more than that of
     `setup`. Impossible policies, parameters and folders are refused before the first step.
+    `progress` is called with the share done, 0 to 1.
     """
     robot, jobs = setup.robot, []
     subjects = load_subjects(policies, robot, jump=kind.jump)
@@ -265,15 +257,14 @@ def run_trial(
         some = number == 0 or case not in plan.cases
         return kind is JUMPS and (keep_captures or some)
 
-    how: Any = {"robot": robot, "out": setup.out, "keep": keep, "measure": kind.measure}
     for parameter, value, params in varied or [("", math.nan, setup.sim_params)]:
-        made = plan_jobs(subjects, plan, sim_params=params, **how)
+        made = plan_jobs(subjects, plan, replace(setup, sim_params=params), kind, keep=keep)
         made[0].build()  # refuses impossible parameters
         jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
     if kind is JUMPS:
         prepare(setup.out, overwrite=overwrite)
     begun = time.perf_counter()
-    done = in_processes(_timed, jobs, processes=setup.processes, progress=setup.progress)
+    done = in_processes(_timed, jobs, processes=setup.processes, progress=progress)
     rows, seconds, cpu_s = zip(*done, strict=True)
     simulated = sum(row.script.seconds for row in rows)
     timing = {

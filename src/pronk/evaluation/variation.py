@@ -5,9 +5,10 @@ Every point has the script, starts, noise and times of every other point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -110,6 +111,7 @@ def add_variation(
     setup: Setup,
     *,
     parameters: tuple[Parameter, ...] = PARAMETERS,
+    progress: Callable[[float], None] | None = None,
 ) -> Results:
     """Let policies jump on varied virtual robots; write `variation.csv` and `variation.json`.
 
@@ -123,7 +125,8 @@ def add_variation(
         "parameters": [asdict(each) for each in parameters],
         "nominal": {each.name: each.of(base) for each in parameters},
     }
-    return run_trial(policies, plan, setup, kind=VARIATION, varied=varied, settings=settings)
+    how: Any = {"varied": varied, "settings": settings, "progress": progress}
+    return run_trial(policies, plan, setup, kind=VARIATION, **how)
 
 
 def table(results: Results) -> Sheet:

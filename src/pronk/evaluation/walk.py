@@ -9,7 +9,7 @@ comes back into the battery is taken off.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,6 +144,7 @@ def add_walks(
     runs: int = 20,
     seconds: float = WALK_S,
     seed: int = 0,
+    progress: Callable[[float], None] | None = None,
 ) -> Results:
     """Let policies walk on the virtual robot and write `walk.csv` and `walk.json`.
 
@@ -151,4 +152,4 @@ def add_walks(
     """
     script = walk_script(STILL, seconds=seconds)
     plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    return run_trial(policies, plan, setup, kind=WALK)
+    return run_trial(policies, plan, setup, kind=WALK, progress=progress)
