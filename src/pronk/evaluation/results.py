@@ -238,10 +238,10 @@ class Results:
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
         """Every policy with every command, on every varied body."""
-        groups: dict[tuple[str, float, str, str], list[Row]] = {}
+        groups: dict[tuple[str, ...], list[Row]] = {}
         for row in self.rows:
-            # NaN is equal to nothing, not even as a key.
-            key = (row.parameter, row.value if row.parameter else 0.0, row.policy, row.case)
+            # The value as text: NaN is equal to nothing.
+            key = (row.parameter, str(row.value), row.policy, row.case)
             groups.setdefault(key, []).append(row)
         return tuple(self._cell(rows) for rows in groups.values())
 
