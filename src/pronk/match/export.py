@@ -21,7 +21,7 @@ import math
 import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import mujoco
@@ -32,7 +32,7 @@ from pronk.errors import PronkError, RobotError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec, set_law
-from pronk.robots.robot import RobotSpec
+from pronk.robots.robot import Drive, RobotSpec
 from pronk.simulators.profiles import Profile, profile, profile_of, profiles
 
 Per = Literal["group", "joint"]
@@ -62,31 +62,22 @@ class Actuator:
     """Dry friction at rest [N m]."""
     stribeck: float
     """Share of it that motion takes away."""
-    viscous_damping: float
-    """Passive viscous friction [N m s/rad]."""
-    effort_limit: float
-    """[N m]"""
-    stall_torque: float
-    """[N m]"""
-    no_load_speed: float
-    """[rad/s]"""
     delay_s: float
     """Command delay [s]."""
+    drive: Drive
+    """Its limits and viscous friction."""
 
-    @property
-    def sliding_friction(self) -> float:
-        """Dry friction in motion [N m]."""
-        return self.frictionloss * (1.0 - self.stribeck)
-
-    @property
-    def all_damping(self) -> float:
-        """Damping and viscous friction, for an engine with one parameter for both [N m s/rad]."""
-        return self.damping + self.viscous_damping
-
-    @property
-    def viscous_per_degree(self) -> float:
-        """Passive viscous friction [N m s/degree]."""
-        return math.radians(self.viscous_damping)
+    def value(self, name: str) -> float:
+        """A parameter by its name: a field, one of the drive, or what is computed of both."""
+        computed = {
+            # Dry friction in motion [N m].
+            "sliding_friction": self.frictionloss * (1.0 - self.stribeck),
+            # For an engine with one parameter for damping and viscous friction [N m s/rad].
+            "all_damping": self.damping + self.drive.viscous_damping,
+            # [N m s/degree]
+            "viscous_per_degree": math.radians(self.drive.viscous_damping),
+        }
+        return float({**vars(self.drive), **vars(self), **computed}[name])
 
 
 def actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list[Actuator]:
@@ -125,10 +116,7 @@ def actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list
                     frictionloss=_mean(dry, drive.frictionloss),
                     stribeck=_mean([j.stribeck for j in known], 0.0),
                     delay_s=_mean([j.delay_s for j in known], 0.0),
-                    viscous_damping=drive.viscous_damping,
-                    effort_limit=drive.effort_limit,
-                    stall_torque=drive.stall_torque,
-                    no_load_speed=drive.no_load_speed,
+                    drive=drive,
                 )
             )
     return out
@@ -142,32 +130,27 @@ def stability_share(robot: RobotSpec, drives: Sequence[Actuator]) -> float:
     damping is implicit. For one joint of law E this is 2 h kd / J + h^2 kp / J < 4. Law I has no
     limit. The robot floats in its default pose, where its joints feel the least inertia.
     """
-    spec = free_spec(robot)
-    for one in drives:
-        for name in one.joints:
-            spec.joint(name).armature = one.armature
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
-    mujoco.mj_forward(model, data)
-    mass, step = np.zeros((model.nv, model.nv)), robot.law.substep(robot.timestep_s)
-    mujoco.mj_fullM(model, data, mass)
-    stiffness, damping = np.zeros(model.nv), np.zeros(model.nv)
+    model, law = free_spec(robot).compile(), robot.law
+    step = law.substep(robot.timestep_s)
+    stiffness, damping = np.zeros((2, model.nv))
     for one in drives:
         for name in one.joints:
             dof = model.joint(name).dofadr[0]
+            model.dof_armature[dof] = one.armature
             stiffness[dof] = one.stiffness
-            damping[dof] = robot.law.damping(one.stiffness, one.damping, step)
-    implicit = np.zeros(model.nv) if robot.law.kind == "explicit" else damping.copy()
-    (damping if robot.law.passive_damping == "explicit" else implicit)[:] += model.dof_damping
-    return float(
-        scipy.linalg.eigh(
-            np.diag(2.0 * step * damping + step**2 * stiffness),
-            mass + step * np.diag(implicit),
-            eigvals_only=True,
-        )[-1]
-        / 4.0
-    )
+            damping[dof] = law.damping(one.stiffness, one.damping, step)
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    implicit = np.zeros(model.nv) if law.kind == "explicit" else damping.copy()
+    (damping if law.passive_damping == "explicit" else implicit)[:] += model.dof_damping
+    largest = scipy.linalg.eigh(
+        np.diag(2.0 * step * damping + step**2 * stiffness),
+        mass + step * np.diag(implicit),
+        eigvals_only=True,
+    )[-1]
+    return float(largest / 4.0)
 
 
 def require_stable(holds: Profile, robot: RobotSpec, drives: Sequence[Actuator]) -> float:
@@ -192,33 +175,38 @@ class Target:
     body: Callable[[Target, list[Actuator], Profile, RobotSpec], str]
     settings: str
     """What must be set beside the text; {timestep}, {decimation}, {iterations} are filled in."""
-    arguments: Mapping[str, str] = field(default_factory=dict)
-    """Name of an argument to a field of `Actuator`."""
+    parameters: str = ""
+    """What the text sets: words `ARGUMENT=NAME`, or `ARGUMENT` of that name (`Actuator.value`)."""
     call: str = ""
     """Class of the configuration."""
     delay: tuple[str, ...] = ()
     """Arguments that take a delay in physics steps."""
-    delay_seconds: bool = False
-    """True if it takes delays in seconds."""
+
     no_delay: str = "delay the actions in the environment"
     """What to do about a delay that the target cannot express."""
     stribeck: bool = False
     """True if friction can fall with speed."""
-    comment: tuple[str, str] = ("# ", "")
-    """Before every line of the header, or (open, close) around it."""
+    xml: bool = False
+    """True if the text is XML of MuJoCo, which also takes delays in seconds."""
+
+    @property
+    def arguments(self) -> dict[str, str]:
+        """Names of arguments to those of `Actuator.value`."""
+        pairs = (word.partition("=") for word in self.parameters.split())
+        return {argument: name or argument for argument, _, name in pairs}
 
 
-def _fields(target: Target, one: Actuator, indent: str = "        ", form: str = "{}={},") -> str:
-    """The arguments of an actuator, one a line."""
-    return "".join(
-        f"{indent}{form.format(argument, _number(getattr(one, name)))}\n"
-        for argument, name in target.arguments.items()
-    )
+def _fields(target: Target, one: Actuator, form: str) -> str:
+    """The arguments of an actuator, each in a form."""
+    pairs = target.arguments.items()
+    return "".join(form.format(argument, _number(one.value(name))) for argument, name in pairs)
 
 
-def _delay(target: Target, one: Actuator, profile: Profile) -> str:
-    steps = round(one.delay_s / profile.timestep_s)
-    return "".join(f"        {name}={steps},\n" for name in target.delay) if steps else ""
+def _lines(target: Target, one: Actuator, profile: Profile) -> str:
+    """The arguments of an actuator with its delay, one a line."""
+    steps, form = round(one.delay_s / profile.timestep_s), "        {}={},\n"
+    delay = [form.format(name, steps) for name in target.delay if steps]
+    return _fields(target, one, form) + "".join(delay)
 
 
 def _mjlab(target: Target, drives: list[Actuator], profile: Profile, _robot: RobotSpec) -> str:
@@ -229,7 +217,7 @@ def _mjlab(target: Target, drives: list[Actuator], profile: Profile, _robot: Rob
     entries = "".join(
         f"    {target.call}(  # {one.name}\n"
         f"        target_names_expr={_names(one.own_joints)},\n"
-        f"{_fields(target, one)}{_delay(target, one, profile)}    ),\n"
+        f"{_lines(target, one, profile)}    ),\n"
         for one in drives
     )
     events = "".join(
@@ -259,7 +247,7 @@ def _isaaclab(target: Target, drives: list[Actuator], profile: Profile, _robot: 
     entries = "".join(
         f'    "{one.name}": {target.call}(\n'
         f"        joint_names_expr={list(one.own_joints)!r},\n"
-        f"{_fields(target, one)}{_delay(target, one, profile)}"
+        f"{_lines(target, one, profile)}"
         f"    ),  # draw stiffness from {_pair(one.stiffness_range)}, "
         f"damping from {_pair(one.damping_range)}\n"
         for one in drives
@@ -270,7 +258,7 @@ def _isaaclab(target: Target, drives: list[Actuator], profile: Profile, _robot: 
 def _by_joint(target: Target, drives: list[Actuator]) -> str:
     """`JOINTS`, a dict of parameters by joint name."""
     lines = "".join(
-        f'    "{name}": dict({_fields(target, one, "", "{}={},").replace(chr(10), " ").strip()}),\n'
+        f'    "{name}": dict({_fields(target, one, "{}={}, ").strip()}),\n'
         for one in drives
         for name in one.own_joints
     )
@@ -319,27 +307,25 @@ def _playground(target: Target, drives: list[Actuator], profile: Profile, _r: Ro
 
 def _newton(target: Target, drives: list[Actuator], profile: Profile, _robot: RobotSpec) -> str:
     """A USD layer: an actuator prim and the passive parameters of every joint."""
-    passive = {"armature": "armature", "friction": "frictionloss", "damping": "viscous_per_degree"}
-    joints, prims = "", ""
+    passive = replace(
+        target, parameters="armature friction=frictionloss damping=viscous_per_degree"
+    )
+    form, joints, prims = "            float newton:{} = {}\n", "", ""
     for one in drives:
         steps = round(one.delay_s / profile.timestep_s)
         late = f"            int newton:delaySteps = {steps}\n" if steps else ""
         schemas = '"NewtonPDControlAPI", "NewtonDCMotorClampingAPI"'
         schemas += ', "NewtonActuatorDelayAPI"' if steps else ""
         for name in one.own_joints:
-            values = "".join(
-                f"            float newton:{key} = {_number(getattr(one, attribute))}\n"
-                for key, attribute in passive.items()
-            )
             joints += (
                 f'        over "{name}" (\n            prepend apiSchemas = ["NewtonJointAPI"]\n'
-                f"        )\n        {{\n{values}        }}\n"
+                f"        )\n        {{\n{_fields(passive, one, form)}        }}\n"
             )
             prims += (
                 f'        def NewtonActuator "{name}_actuator" (\n'
                 f"            prepend apiSchemas = [{schemas}]\n        )\n        {{\n"
                 f"            rel newton:targets = </Robot/joints/{name}>\n"
-                f"{_fields(target, one, ' ' * 12, 'float newton:{} = {}')}{late}        }}\n"
+                f"{_fields(target, one, form)}{late}        }}\n"
             )
     return (
         'over "Robot"\n{\n    over "joints"\n    {\n'
@@ -347,7 +333,7 @@ def _newton(target: Target, drives: list[Actuator], profile: Profile, _robot: Ro
     )
 
 
-def _mjcf_spec(drives: list[Actuator], robot: RobotSpec) -> mujoco.MjSpec:
+def _mjcf(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) -> str:
     """The whole robot with a native `dcmotor` a joint, of any drive law.
 
     Joints that were not matched have the robot's published gains.
@@ -373,16 +359,12 @@ def _mjcf_spec(drives: list[Actuator], robot: RobotSpec) -> mujoco.MjSpec:
             actuator.delay, actuator.interp = one.delay_s, 1
             actuator.nsample = math.ceil(one.delay_s / spec.option.timestep) + 1
     spec.compile()
-    return spec
+    return str(spec.to_xml())
 
 
-def _mjcf(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) -> str:
-    return str(_mjcf_spec(drives, robot).to_xml())
-
-
-def _snippet(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) -> str:
+def _snippet(target: Target, drives: list[Actuator], profile: Profile, robot: RobotSpec) -> str:
     """What a model of one's own needs: option, joint attributes, and actuators."""
-    root = ET.fromstring(_mjcf_spec(drives, robot).to_xml())
+    root = ET.fromstring(_mjcf(target, drives, profile, robot))
     own = dict(zip(_flat(drives, "joints"), _flat(drives, "own_joints"), strict=True))
     integrator = "Euler" if robot.law.kind == "explicit" else "implicitfast"
     step = robot.law.substep(robot.timestep_s)
@@ -402,29 +384,24 @@ def _snippet(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) 
     return "\n".join([*lines, "</actuator>", ""])
 
 
-_GAINS = {name: name for name in ("stiffness", "damping", "armature")}
-_FRICTION = {
-    "friction": "frictionloss",
-    "dynamic_friction": "sliding_friction",
-    "viscous_friction": "viscous_damping",
-}
-_OLD_LIMITS = {
-    "actuator_effort_limit": "effort_limit",
-    "actuator_velocity_limit": "velocity_limit",
-    "joint_effort_limit": "effort_limit_sim",
-}
-"""Names in Isaac Lab 3.0: those in 2.3."""
+_GAINS = "stiffness damping armature"
+_FRICTION = (
+    "friction=frictionloss dynamic_friction=sliding_friction viscous_friction=viscous_damping"
+)
+_LIMIT = "actuator_effort_limit=effort_limit"
+_MOTOR = "saturation_effort=stall_torque"
 _STEP = "Set sim.dt to {timestep} s and decimation to {decimation}"
-_PHYSX = f"{_STEP}, PhysX's solver to TGS. Friction is a torque since Isaac Sim 5.0; before it was "
-_PHYSX += "a coefficient."
+_PHYSX = (
+    f"{_STEP}, PhysX's solver to TGS. Friction is a torque since Isaac Sim 5.0; before it was "
+    "a coefficient."
+)
 _ONCE = f"{_PHYSX} Set enable_external_forces_every_iteration to False."
-_EFFORT = {"actuator_effort_limit": "effort_limit"}
 _PHYSX_TARGETS = {
     "isaaclab-implicit": Target(
         profile="isaaclab-implicit",
         body=_isaaclab,
         call="ImplicitActuatorCfg",
-        arguments=_GAINS | _FRICTION | {"joint_effort_limit": "effort_limit"},
+        parameters=f"{_GAINS} {_FRICTION} joint_effort_limit=effort_limit",
         settings=f"{_PHYSX} Set solver_position_iteration_count to {{iterations}}, that of "
         "velocity to 0.",
         stribeck=True,
@@ -433,10 +410,7 @@ _PHYSX_TARGETS = {
         profile="isaaclab-explicit",
         body=_isaaclab,
         call="DCMotorCfg",
-        arguments=_GAINS
-        | _FRICTION
-        | _EFFORT
-        | {"saturation_effort": "stall_torque", "actuator_velocity_limit": "no_load_speed"},
+        parameters=f"{_GAINS} {_FRICTION} {_LIMIT} {_MOTOR} actuator_velocity_limit=no_load_speed",
         settings=_ONCE,
         stribeck=True,
         no_delay="delay the actions in the environment, or take isaaclab-delayed",
@@ -445,17 +419,25 @@ _PHYSX_TARGETS = {
         profile="isaaclab-explicit",
         body=_isaaclab,
         call="DelayedPDActuatorCfg",
-        arguments=_GAINS | _FRICTION | _EFFORT,
+        parameters=f"{_GAINS} {_FRICTION} {_LIMIT}",
         delay=("min_delay", "max_delay"),
         settings=f"{_ONCE} DelayedPDActuator has no torque-speed line.",
         stribeck=True,
     ),
 }
+
+
+def _of_release_2_3(target: Target) -> Target:
+    """An export for Isaac Lab 3.0 with the names of limits in 2.3."""
+    words = target.parameters.replace("joint_effort_limit=", "effort_limit_sim=")
+    return replace(target, parameters=words.replace("actuator_", ""))
+
+
 _IDEAL_PD = Target(
     profile="mjlab",
     body=_mjlab,
     call="IdealPdActuatorCfg",
-    arguments=_GAINS | {n: n for n in ("frictionloss", "viscous_damping", "effort_limit")},
+    parameters=f"{_GAINS} frictionloss viscous_damping effort_limit",
     delay=("delay_min_lag", "delay_max_lag"),
     settings=f"{_STEP}. IdealPdActuator has no torque-speed line.",
 )
@@ -463,10 +445,7 @@ TARGETS: Mapping[str, Target] = {
     "mjlab": replace(
         _IDEAL_PD,
         call="DcMotorActuatorCfg",
-        arguments={
-            **_IDEAL_PD.arguments,
-            **{"saturation_effort": "stall_torque", "velocity_limit": "no_load_speed"},
-        },
+        parameters=f"{_IDEAL_PD.parameters} {_MOTOR} velocity_limit=no_load_speed",
         settings=f"{_STEP}.",
     ),
     "mjlab-idealpd": _IDEAL_PD,
@@ -477,32 +456,21 @@ TARGETS: Mapping[str, Target] = {
         settings=f"{_STEP}, the integrator to implicitfast.",
     ),
     **_PHYSX_TARGETS,
-    **{
-        f"{name}-2.3": replace(
-            one, arguments={_OLD_LIMITS.get(n, n): v for n, v in one.arguments.items()}
-        )
-        for name, one in _PHYSX_TARGETS.items()
-    },
+    **{f"{name}-2.3": _of_release_2_3(one) for name, one in _PHYSX_TARGETS.items()},
     "isaaclab-newton": Target(
         profile="isaaclab-newton",
         body=_isaaclab,
         call="ImplicitActuatorCfg",
-        arguments=_GAINS
-        | {"damping": "all_damping"}
-        | {"joint_effort_limit": "effort_limit", "friction": "frictionloss"},
+        parameters="stiffness damping=all_damping armature joint_effort_limit=effort_limit "
+        "friction=frictionloss",
         settings=f"Isaac Lab 3.0, physics=newton_mjwarp. {_STEP}, the integrator to implicitfast. "
         "Damping includes the viscous friction.",
     ),
     "newton-usd": Target(
         profile="isaaclab-explicit",
         body=_newton,
-        arguments={
-            "kp": "stiffness",
-            "kd": "damping",
-            "maxMotorEffort": "effort_limit",
-            "saturationEffort": "stall_torque",
-            "velocityLimit": "no_load_speed",
-        },
+        parameters="kp=stiffness kd=damping maxMotorEffort=effort_limit "
+        "saturationEffort=stall_torque velocityLimit=no_load_speed",
         delay=("newton:delaySteps",),
         settings="Replace /Robot/joints by the path of the joints. Actuators must step with the "
         "physics, each {timestep} s; commands are held for {decimation} steps. XPBD, VBD and "
@@ -511,44 +479,30 @@ TARGETS: Mapping[str, Target] = {
     "genesis": Target(
         profile="genesis",
         body=_genesis,
-        arguments={
-            "kp": "stiffness",
-            "kv": "damping",
-            "armature": "armature",
-            "frictionloss": "frictionloss",
-            "damping": "viscous_damping",
-            "force_range": "effort_limit",
-        },
+        parameters="kp=stiffness kv=damping armature frictionloss damping=viscous_damping "
+        "force_range=effort_limit",
         settings="Set SimOptions(dt={period}, substeps={decimation}), and command by "
         "control_dofs_position. Without apply() a URDF's joints have an armature of 0.1 kg m^2.",
     ),
     "playground": Target(
         profile="playground",
         body=_playground,
-        arguments={
-            "kp": "stiffness",
-            "damping": "all_damping",
-            "armature": "armature",
-            "frictionloss": "frictionloss",
-            "effort_limit": "effort_limit",
-        },
+        parameters="kp=stiffness damping=all_damping armature frictionloss effort_limit",
         settings="Set sim_dt to {timestep} s and ctrl_dt to {period} s. Joint damping is the "
         "derivative gain and the viscous friction.",
     ),
     "mjcf": Target(
         body=_mjcf,
-        delay_seconds=True,
+        xml=True,
         stribeck=True,
         settings="Step and integrator are those of the drive law (E needs Euler); commands are "
         "held for {substeps} steps. Joints that were not matched have the robot's published gains.",
-        comment=("<!--\n", "\n-->"),
     ),
     "mjcf-snippet": Target(
         body=_snippet,
-        delay_seconds=True,
+        xml=True,
         stribeck=True,
         settings="Put these attributes into your model; commands are held for {substeps} steps.",
-        comment=("<!--\n", "\n-->"),
     ),
 }
 """What `export_text` can write."""
@@ -561,13 +515,12 @@ def export_text(
 
     Raises:
         PronkError: The target is unknown or has another drive law or step than the gains, or the
-            gains hold no group or are not stable.
-        RobotError: The robot is unknown.
+            gains hold no group or are not stable, or the robot is unknown.
     """
     if target not in TARGETS:
         raise PronkError(f"no export to {target!r}; expected one of {', '.join(TARGETS)}.")
     chosen, holds = TARGETS[target], profile_held(gains)
-    check_target(target, holds)
+    _check_profile(target, holds)
     known = holds.robot(robot or robot_of(gains))
     drives = actuators(gains, known, per)
     share = require_stable(holds, known, drives)
@@ -575,22 +528,15 @@ def export_text(
         textwrap.fill(line, 98, break_long_words=False, break_on_hyphens=False)
         for line in _header(gains, chosen, holds, known, drives, share)
     )
-    begin, end = chosen.comment
-    if end:
-        head = f"{begin}{text.replace('--', '-')}{end}"
-    else:
-        head = "\n".join(f"{begin}{line}".rstrip() for line in text.splitlines())
+    text = text.replace("--", "-") if chosen.xml else textwrap.indent(text, "# ")
+    head = f"<!--\n{text}\n-->" if chosen.xml else text
     if target == "newton-usd":
         head = f"#usda 1.0\n{head}"
     return f"{head}\n\n{chosen.body(chosen, drives, holds, known)}"
 
 
 def profile_held(gains: MatchedGains) -> Profile:
-    """The profile that gains hold for.
-
-    Raises:
-        PronkError: They hold for a simulator without one.
-    """
+    """The profile that gains hold for; PronkError if their simulator has none."""
     try:
         return profile_of(gains.simulator)
     except PronkError:
@@ -601,11 +547,7 @@ def profile_held(gains: MatchedGains) -> Profile:
 
 
 def robot_of(gains: MatchedGains) -> RobotSpec:
-    """Load the robot of some gains by its name.
-
-    Raises:
-        PronkError: There is none of the name.
-    """
+    """Load the robot of some gains by its name; PronkError if there is none."""
     try:
         return load_robot(gains.robot)
     except RobotError:
@@ -615,12 +557,8 @@ def robot_of(gains: MatchedGains) -> RobotSpec:
         ) from None
 
 
-def check_target(target: str, holds: Profile) -> None:
-    """Refuse gains that hold for another joint than the target's.
-
-    Raises:
-        PronkError: Another drive law or step, with the way out.
-    """
+def _check_profile(target: str, holds: Profile) -> None:
+    """Refuse gains that hold for another drive law or step than the target's."""
     if not (name := TARGETS[target].profile) or name == holds.name:
         return
     wanted = profile(name)
@@ -669,7 +607,7 @@ def _header(
             f"{1000.0 * (delay - step * round(delay / step)):+.1f} ms"
             for name, delay in late.items()
         )
-    elif late and target.delay_seconds:
+    elif late and target.xml:
         yield "Commands before the first are 0 rad for the delay; mj_initCtrlHistory sets others."
     elif late:
         delays = ", ".join(
