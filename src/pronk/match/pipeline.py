@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -79,40 +79,9 @@ SPREAD_MAX = 0.05
 randomization is 2 N m/rad on 20 (D3), twice that."""
 
 
-def match_logs(
-    logs: Sequence[JointLog],
-    robot: RobotSpec,
-    *,
-    mode: Mode = "gains",
-    free: Sequence[str] = (),
-    drive_gains: DriveGains | None = None,
-    settings: MatchSettings | None = None,
-    progress: Progress | None = None,
-) -> MatchResult:
-    """Match every joint that was excited in some logs.
-
-    Sweeps of one joint at a time are matched in frequency; where several joints move at once the
-    whole arm is fitted in time.
-
-    Args:
-        logs: One or more logs of one robot; a joint may be excited in several.
-        robot: The robot.
-        mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
-            known and fits damping, armature, dry friction and delay, and by a torque channel
-            armature, friction and torque scale.
-        free: Parameters to fit in mode `drive` instead, out of `FREE`.
-        drive_gains: Gains that were on the real drives, where the logs do not have them.
-        settings: How to match; the fit in time if not given.
-        progress: Called with the stage and the share of it that is done, 0 to 1.
-
-    Raises:
-        LogError: No joint of the robot was excited, or a log cannot be used.
-        IdentifiabilityError: A joint's band is mostly incoherent or too short, or a parameter
-            cannot be identified.
-        PronkError: The device or simulator of the settings cannot be used here.
-    """
-    more: Any = {"mode": mode, "free": free, "drive_gains": drive_gains}
-    return match_frameworks(logs, robot, (), settings=settings, progress=progress, **more)[""]
+def match_logs(logs: Sequence[JointLog], robot: RobotSpec, **options: Any) -> MatchResult:
+    """Match every joint that was excited in some logs; options and errors of `match_frameworks`."""
+    return match_frameworks(logs, robot, (), **options)[""]
 
 
 def match_frameworks(
@@ -126,10 +95,31 @@ def match_frameworks(
     settings: MatchSettings | None = None,
     progress: Progress | None = None,
 ) -> dict[str, MatchResult]:
-    """Match for several frameworks from one set of logs; arguments and errors as of `match_logs`.
+    """Match for several frameworks from one set of logs.
 
-    `names` are profiles, as `pronk.simulators.profiles.profile` takes them, for mode `gains`.
-    Returns results by name; that of the robot's own simulator, where the logs are checked, by "".
+    Sweeps of one joint at a time are matched joint by joint; where several joints move at once the
+    whole arm is fitted in time.
+
+    Args:
+        logs: One or more logs of one robot; a joint may be excited in several.
+        robot: The robot.
+        names: Profiles, as `pronk.simulators.profiles.profile` takes them, for mode `gains`.
+        mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
+            known and fits damping, armature, dry friction and delay, and by a torque channel
+            armature, friction and torque scale.
+        free: Parameters to fit in mode `drive` instead, out of `FREE`.
+        drive_gains: Gains that were on the real drives, where the logs do not have them.
+        settings: How to match; the fit in time if not given.
+        progress: Called with the stage and the share of it that is done, 0 to 1.
+
+    Returns:
+        Results by name; that of the robot's own simulator, where the logs are checked, by "".
+
+    Raises:
+        LogError: No joint of the robot was excited, or a log cannot be used.
+        IdentifiabilityError: A joint's band is mostly incoherent or too short, or a parameter
+            cannot be identified.
+        PronkError: The device or simulator of the settings cannot be used here.
     """
     chosen, clock = settings or MatchSettings(), _Clock(progress)
     frameworks = {name: profile(name) for name in names}
@@ -147,54 +137,57 @@ def match_frameworks(
     drives, remarks = fit_drives(logs, robot) if mode == "drive" else ({}, {})
     logs, every = [log for log in logs if excited_joints(log)] or logs, logs
     if (drives or remarks) and not any(map(excited_joints, logs)):
-        if not (joints := joint_fits(robot, {}, drives, remarks)):
+        if not (by_torque := joint_fits(robot, {}, drives, remarks)):
             reasons = "; ".join(dict.fromkeys(remarks.values()))
             raise IdentifiabilityError(
                 f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
                 f"by torque: {reasons or 'record larger or faster motions'}."
             )
-        gains = {name: joint.gains() for name, joint in joints.items()}
-        found = matched_gains(robot, gains, logs, mujoco_info(robot))
-        return {"": MatchResult(gains=found, joints={})}
+        return {"": _result(robot, by_torque, logs, mujoco_info(robot))}
     require_plausible(logs_by_joint(logs, robot), robot)
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
     work = _Work(logs=logs, settings=chosen, mode=mode)
-    first: dict[tuple[object, ...], str] = {}
-    for name in names:
-        first.setdefault(_kind(robots[name]), name)
-    first.pop(_kind(robot), None)
-    clocks = {name: _Clock(progress, f"{name} ") for name in first.values()}
-    waiting: dict[tuple[object, ...], Future[_Matched]] = {}
+    own = _Match(work=work, robot=robot, fitted=fitted, clock=clock)
+    others: dict[tuple[object, ...], _Match] = {}
+    for name, framework in frameworks.items():
+        if (kind := _kind(robots[name])) not in (_kind(robot), *others):
+            dry = framework.friction == "N m"
+            others[kind] = _Match(
+                work=work,
+                robot=robots[name],
+                fitted=[n for n in fitted if dry or n != "frictionloss"],
+                clock=_Clock(progress, name),
+                base=own,
+            )
     # Simulations and products of large arrays leave the interpreter to the other threads.
     with ThreadPoolExecutor(chosen.threads) as pool:
+        waiting: dict[tuple[object, ...], Future[_Match]] = {}
 
-        def begin(base: _Base) -> None:
-            for kind, name in first.items():
+        def begin() -> None:
+            for kind, one in others.items():
                 if work.measured:
-                    work.found(robots[name], clock)
-                dry = frameworks[name].friction == "N m"
-                known = [n for n in fitted if dry or n != "frictionloss"]
-                waiting[kind] = pool.submit(
-                    _matched, work, robots[name], known, clocks[name], base=base
-                )
+                    work.found(one.robot, clock)
+                waiting[kind] = pool.submit(one.run)
 
         try:
-            own = _matched(work, robot, fitted, clock, ready=begin)
-            wrong = _wrong(work, own, clock)
+            own.ready = begin
+            own.run()
+            wrong = own.wrong()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-        joints = joint_fits(own.robot, own.joints, drives, remarks)
-        out = {"": replace(own, joints=joints).result(every, wrong, clock)}
-        done = {_kind(own.robot): out[""]}
-        for kind, one in waiting.items():
-            done[kind] = one.result().result(every, wrong, clocks[first[kind]])
+        own.joints = joint_fits(own.robot, own.joints, drives, remarks)
+        done = {_kind(own.robot): own.result(every, wrong)}
+        out = {"": done[_kind(own.robot)]}
+        for kind, future in waiting.items():
+            done[kind] = future.result().result(every, wrong)
     for name, framework in frameworks.items():
         kind = _kind(robots[name])
         info = replace(framework.info, decimation=robots[name].decimation)
         theirs = replace(done[kind].gains, simulator=info)
         require_stable(framework, robots[name], actuators(theirs, robots[name], "joint"))
-        seconds = done[kind].seconds if first.get(kind) == name else {}
+        timed = kind in others and others[kind].clock.name == name
+        seconds = done[kind].seconds if timed else {}
         out[name] = replace(done[kind], gains=theirs, seconds=seconds)
     return out
 
@@ -204,67 +197,50 @@ def _kind(robot: RobotSpec) -> tuple[object, ...]:
     return (robot.law, robot.timestep_s, robot.decimation, *(j.drive for j in robot.joints))
 
 
+def _result(
+    robot: RobotSpec,
+    joints: Mapping[str, JointFit],
+    logs: Sequence[JointLog],
+    info: SimulatorInfo,
+    **more: Any,
+) -> MatchResult:
+    """The result for one simulator; `more` are fields of `MatchResult`."""
+    gains = {name: joint.gains() for name, joint in joints.items()}
+    return MatchResult(
+        gains=matched_gains(robot, gains, logs, info),
+        joints={name: joint for name, joint in joints.items() if joint.responses},
+        **more,
+    )
+
+
+class _Clock:
+    """Wall time of each stage, and reports of progress."""
+
+    def __init__(self, progress: Progress | None, name: str = "") -> None:
+        self.seconds: dict[str, float] = {}
+        self.name = name
+        self._progress = progress or (lambda stage, share: None)
+        self._stage = ""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; report its begin and end."""
+        self._stage = f"{self.name} {name}".lstrip()
+        self.report(0.0)
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+        self.report(1.0)
+
+    def report(self, share: float) -> None:
+        """Report the share of the stage that is done."""
+        self._progress(self._stage, share)
+
+
+Found = Mapping[str, Sequence[MeasuredJoint]]
+"""Measured responses by joint; largest amplitude, the one that is matched, first."""
 Wrong = Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
 """What contradicts the logs of each joint, and what would leave no trace in them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Base:
-    """Joints in the robot's own simulator, at which those of other frameworks begin, by name."""
-
-    plants: Mapping[str, Plant] = field(default_factory=dict)
-    """Linearized."""
-    gains: Mapping[str, Pair] = field(default_factory=dict)
-    matched: Mapping[str, ComplexArray] = field(default_factory=dict)
-    """Simulated responses with these gains, shape (f,) each."""
-
-    def corrections(self, found: Found, robot: RobotSpec) -> list[Array]:
-        """Log gain of each joint simulated over linearized, shape (inside,), for another robot.
-
-        It is that of dry friction; without friction there is none.
-        """
-        out = []
-        for name, (goal, *_) in found.items():
-            amplitude = goal.trace.amplitude
-            closed = self.plants[name].response(*self.gains[name], amplitude=amplitude)[0]
-            out.append(np.log(np.abs(self.matched[name][goal.fit_mask] / closed)))
-            if robot.joint(name).drive.frictionloss == 0.0:
-                out[-1] = np.zeros_like(out[-1])
-        return out
-
-    def translated(self, name: str, other: Plant) -> Pair:
-        """Gains with which another joint responds like this one, both linearized."""
-        return translated(self.plants[name], other, self.gains[name]).after
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Matched:
-    """The joints of a robot in one simulator."""
-
-    robot: RobotSpec
-    """As it is simulated."""
-    info: SimulatorInfo
-    joints: dict[str, JointFit]
-    fits: Mapping[str, TimeFit]
-    """Those that were fitted in time."""
-    excluded: Mapping[str, str]
-    rate: float
-    """Physics steps per second of the grid search."""
-
-    def result(self, logs: Sequence[JointLog], wrong: Wrong, clock: _Clock) -> MatchResult:
-        """The result for the simulator with these joints."""
-        joints = {}
-        for name, fit in self.joints.items():
-            flags, unchecked = wrong.get(name, ((), ()))
-            joints[name] = replace(fit, flags=(*fit.flags, *flags), unchecked=unchecked)
-        gains = {name: joint.gains() for name, joint in joints.items()}
-        return MatchResult(
-            gains=matched_gains(self.robot, gains, logs, self.info),
-            joints={name: joint for name, joint in joints.items() if joint.responses},
-            seconds=clock.seconds,
-            grid_steps_per_second=self.rate,
-            excluded=self.excluded,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,218 +274,228 @@ class _Work:
             self.measured[timing] = found
         return self.measured[timing]
 
-    def fit_in_time(
-        self, rigs: JointRigs, name: str, fitted: Sequence[str], start: Pair | None = None
-    ) -> TimeFit:
-        """Fit one joint in time, from some gains or those that were on the drive."""
-        nominal = self.nominal(rigs.robot, name)
-        begin = nominal | dict(zip(GAINS, start or self.on_drive[name], strict=True))
-        sources = [log for log in self.logs if name in excited_joints(log)]
-        records = recorded(sources, name, rigs.robot)
-        return fit_joint(rigs, records, fitted, begin | {"delay": _START_S}, nominal)
 
-    def nominal(self, robot: RobotSpec, name: str) -> dict[str, float]:
-        """The published drive with the gains that were on it."""
-        return published(robot, name) | dict(zip(GAINS, self.on_drive[name], strict=True))
+@dataclass(kw_only=True)
+class _Match:
+    """The joints of a robot in one simulator, and the way to them."""
 
+    work: _Work
+    robot: RobotSpec
+    """As it is simulated."""
+    fitted: Sequence[str]
+    clock: _Clock
+    base: _Match | None = None
+    """That in the robot's own simulator, at which other frameworks begin."""
+    ready: Callable[[], None] = lambda: None
+    """Called as soon as other frameworks can begin at this one."""
+    joints: Mapping[str, JointFit] = field(default_factory=dict)
+    fits: dict[str, TimeFit] = field(default_factory=dict)
+    """Joints that were fitted in time."""
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    rate: float = float("nan")
+    """Physics steps per second of the grid search; NaN where it was not searched whole."""
+    plants: Mapping[str, Plant] = field(default_factory=dict)
+    """Linearized joints."""
+    gains: dict[str, Pair] = field(default_factory=dict)
+    matched: Mapping[str, ComplexArray] = field(default_factory=dict)
+    """Simulated responses with these gains, shape (f,) each."""
 
-def _matched(
-    work: _Work,
-    robot: RobotSpec,
-    fitted: Sequence[str],
-    clock: _Clock,
-    *,
-    base: _Base | None = None,
-    ready: Callable[[_Base], None] = lambda base: None,
-) -> _Matched:
-    """Match the joints in one simulator.
+    def __post_init__(self) -> None:
+        self.info = mujoco_info(self.robot)
 
-    In the robot's own, `ready` is called with the `base` of other frameworks as soon as it is
-    known.
-    """
-    logs, settings, mode = work.logs, work.settings, work.mode
-    excluded: Mapping[str, str] = {}
-    rate, info = float("nan"), mujoco_info(robot)
-    fits: Mapping[str, TimeFit] = {}
-    if any(moves_together(log) for log in logs):
-        if settings.simulator != "mujoco":
-            raise PronkError(
-                f"simulator {settings.simulator}: several joints of these logs move at once, "
-                "which only simulator mujoco matches; record one joint at a time."
-            )
-        ready(_Base())
-        with clock.stage("fit"):
-            joints, excluded = fit_together(
-                logs, robot, fitted, threads=settings.threads, progress=clock.report
-            )
-    else:
+    def run(self) -> _Match:
+        """Match the joints."""
+        logs, settings = self.work.logs, self.work.settings
+        if any(moves_together(log) for log in logs):
+            if settings.simulator != "mujoco":
+                raise PronkError(
+                    f"simulator {settings.simulator}: several joints of these logs move at once, "
+                    "which only simulator mujoco matches; record one joint at a time."
+                )
+            self.ready()
+            with self.clock.stage("fit"):
+                self.joints, self.excluded = fit_together(
+                    *(logs, self.robot, self.fitted),
+                    threads=settings.threads,
+                    progress=self.clock.report,
+                )
+            return self
         # The simulator first: a device that is missing must not cost the user an estimate.
         with joint_rigs(
             settings.simulator,
-            robot,
+            self.robot,
             threads=settings.threads,
             device=settings.device,
             python=settings.simulator_python,
         ) as rigs:
-            if mode == "gains" and "frictionloss" not in fitted:
+            if self.work.mode == "gains" and "frictionloss" not in self.fitted:
                 rigs.parameters -= {"frictionloss"}
-            robot, info = rigs.robot, rigs.info
-            found = work.found(robot, clock)
-            if mode == "drive":
-                joints, fits = _match_drives(work, rigs, found, fitted, clock)
-            else:
-                joints, fits, rate = _match_gains(work, rigs, found, clock, base, ready)
-    return _Matched(robot=robot, info=info, joints=joints, fits=fits, excluded=excluded, rate=rate)
+            self.robot, self.info = rigs.robot, rigs.info
+            found = self.work.found(self.robot, self.clock)
+            match = self._match_drives if self.work.mode == "drive" else self._match_gains
+            self.joints = match(rigs, found)
+        return self
 
-
-def _wrong(work: _Work, own: _Matched, clock: _Clock) -> Wrong:
-    """Causes that the joints in the robot's own simulator show."""
-    out = {}
-    with clock.stage("plausibility"):
-        for name, fit in own.joints.items():
-            time_fit = own.fits.get(name)
-            found, hidden = findings(work.logs, name, own.robot, fit=fit, time_fit=time_fit)
-            out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
-    return out
-
-
-class _Clock:
-    """Wall time of each stage, and reports of progress."""
-
-    def __init__(self, progress: Progress | None, prefix: str = "") -> None:
-        self.seconds: dict[str, float] = {}
-        self._progress = progress or (lambda stage, share: None)
-        self._prefix = prefix
-        self._stage = ""
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; report its begin and end."""
-        self._stage = name
-        self.report(0.0)
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - begin
-        self.report(1.0)
-
-    def report(self, share: float) -> None:
-        """Report the share of the stage that is done."""
-        self._progress(self._prefix + self._stage, share)
-
-
-Found = Mapping[str, Sequence[MeasuredJoint]]
-"""Measured responses by joint; largest amplitude, the one that is matched, first."""
-
-
-def _match_drives(
-    work: _Work, rigs: JointRigs, found: Found, fitted: Sequence[str], clock: _Clock
-) -> tuple[dict[str, JointFit], dict[str, TimeFit]]:
-    """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
-    for name, goals in found.items():
-        require_sweeps(rigs.robot, name, goals, fitted)
-    joints, fits = {}, {}
-    with clock.stage("time fit"):
-        for name, goals in found.items():
-            fit = fits[name] = work.fit_in_time(rigs, name, fitted)
-            if unknown := fit.estimate.unidentified:
-                raise IdentifiabilityError(
-                    f"{name}: these logs do not identify the {unknown[0]} (deviation "
-                    f"{fit.estimate.sd[unknown[0]]:.2g}); {PARAMETERS[unknown[0]].remedy}; or hold "
-                    "it at a known value."
+    def wrong(self) -> Wrong:
+        """Causes that the joints show where their logs are checked."""
+        out = {}
+        with self.clock.stage("plausibility"):
+            for name, fit in self.joints.items():
+                time_fit = self.fits.get(name)
+                found, hidden = findings(
+                    self.work.logs, name, self.robot, fit=fit, time_fit=time_fit
                 )
-            requests = [
-                SimRequest(goals[0], **_drive(rigs, fit.estimate.values)),
-                SimRequest(goals[0], **_drive(rigs, work.nominal(rigs.robot, name))),
-            ]
-            matched, naive = responses(rigs, requests, whole=True)
-            joints[name] = _time_joint_fit(rigs.robot, goals, fit, matched, naive)
-            clock.report(len(joints) / len(found))
-    return joints, fits
+                out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
+        return out
 
-
-def _match_gains(
-    work: _Work,
-    rigs: JointRigs,
-    found: Found,
-    clock: _Clock,
-    base: _Base | None,
-    ready: Callable[[_Base], None],
-) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
-    """Search by the paper's magnitude and, with method `time`, fit in time from there.
-
-    Other frameworks begin at the joints of the robot's own simulator, the `base`: the search with
-    what simulations correct there, the fit in time with its gains translated, without a search.
-    Also returns the fits in time by joint, and physics steps per second of the grid; NaN where it
-    was not searched whole.
-    """
-    settings, paper = work.settings, work.settings.method == "paper"
-    main = [goals[0] for goals in found.values()]
-    plants: dict[str, Plant] = {}
-    if isinstance(rigs, MujocoSimulator):
-        plants = {goal.joint: linearized(rigs, goal) for goal in main}
-    grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
-    grids: dict[str, GridSearch] = {}
-    by_amplitude: dict[str, list[Fit]] = {}
-    if paper or not base:
-        if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
-            with clock.stage("quick search"):
-                known = base.corrections(found, rigs.robot) if base else ()
-                searched, fits = quick_search(rigs, main, *grid, exact=paper, corrections=known)
-        else:
-            with clock.stage("grid"):
-                begin = time.perf_counter()
-                searched = search_all(rigs, main, *grid, clock.report)
-                # Everything the search does counts, not the simulator alone.
-                rate = rigs.steps / (time.perf_counter() - begin)
-            with clock.stage("refine"):
-                fits = refine(rigs, main, [one.gains for one in searched])
-        grids = dict(zip(found, searched, strict=True))
-        by_amplitude = {name: [fit] for name, fit in zip(found, fits, strict=True)}
-    gains = {name: fits[0].gains for name, fits in by_amplitude.items()}
-    if base and not paper:
-        gains = {name: base.translated(name, plants[name]) for name in found}
-    fitted: dict[str, TimeFit] = {}
-    if not paper:
-        with clock.stage("time fit"):
-            for name in found:
-                fitted[name] = work.fit_in_time(rigs, name, TIME_FIT, gains[name])
-                clock.report(len(fitted) / len(found))
-    with clock.stage("responses"):
-        requests = [
-            SimRequest(goal, **_drive(rigs, fitted[goal.joint].estimate.values))
-            if goal.joint in fitted
-            else SimRequest(goal, *gains[goal.joint])
-            for goal in main
-        ]
-        matched = responses(rigs, requests, whole=True)
-        naive = responses(
-            rigs, [SimRequest(goal, *work.on_drive[goal.joint]) for goal in main], whole=True
+    def result(self, logs: Sequence[JointLog], wrong: Wrong) -> MatchResult:
+        """The result for the simulator, with what is wrong about the logs."""
+        joints = {}
+        for name, fit in self.joints.items():
+            flags, unchecked = wrong.get(name, ((), ()))
+            joints[name] = replace(fit, flags=(*fit.flags, *flags), unchecked=unchecked)
+        return _result(
+            *(self.robot, joints, logs, self.info),
+            seconds=self.clock.seconds,
+            grid_steps_per_second=self.rate,
+            excluded=self.excluded,
         )
-    for name, time_fit in fitted.items():
-        gains[name] = time_fit.estimate.values["stiffness"], time_fit.estimate.values["damping"]
-    ready(_Base(plants=plants, gains=gains, matched=dict(zip(found, matched, strict=True))))
-    if paper and not base:
-        with clock.stage("amplitudes"):
-            others = [goal for goals in found.values() for goal in goals[1:]]
-            for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):
-                by_amplitude[fit.target.joint].append(fit)
-    zero: dict[str, tuple[float, ComplexArray]] = {}
-    wanted = settings.zero_armature and paper and not base
-    if wanted and "armature" in rigs.parameters:
-        with clock.stage("zero armature"):
-            zero = _without_armature(rigs, main, *grid, clock)
-    joints = {}
-    for (name, goals), match, nominal in zip(found.items(), matched, naive, strict=True):
-        if name in fitted:
-            joints[name] = _time_joint_fit(
-                rigs.robot, goals, fitted[name], match, nominal, grids.get(name)
-            )
+
+    def _nominal(self, name: str) -> dict[str, float]:
+        """The published drive with the gains that were on it."""
+        on_drive = zip(GAINS, self.work.on_drive[name], strict=True)
+        return published(self.robot, name) | dict(on_drive)
+
+    def _fit_in_time(
+        self, rigs: JointRigs, name: str, fitted: Sequence[str], start: Pair
+    ) -> TimeFit:
+        """Fit one joint in time, from some gains."""
+        nominal = self._nominal(name)
+        begin = nominal | dict(zip(GAINS, start, strict=True)) | {"delay": _START_S}
+        sources = [log for log in self.work.logs if name in excited_joints(log)]
+        fit = fit_joint(rigs, recorded(sources, name, rigs.robot), fitted, begin, nominal)
+        self.fits[name] = fit
+        return fit
+
+    def _match_drives(self, rigs: JointRigs, found: Found) -> dict[str, JointFit]:
+        """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
+        for name, goals in found.items():
+            require_sweeps(rigs.robot, name, goals, self.fitted)
+        joints = {}
+        with self.clock.stage("time fit"):
+            for name, goals in found.items():
+                fit = self._fit_in_time(rigs, name, self.fitted, self.work.on_drive[name])
+                if unknown := fit.estimate.unidentified:
+                    raise IdentifiabilityError(
+                        f"{name}: these logs do not identify the {unknown[0]} (deviation "
+                        f"{fit.estimate.sd[unknown[0]]:.2g}); {PARAMETERS[unknown[0]].remedy}; or "
+                        "hold it at a known value."
+                    )
+                drives = fit.estimate.values, self._nominal(name)
+                requests = [SimRequest(goals[0], **_drive(rigs, drive)) for drive in drives]
+                matched, naive = responses(rigs, requests, whole=True)
+                joints[name] = _time_joint_fit(rigs.robot, goals, fit, (matched, naive))
+                self.clock.report(len(joints) / len(found))
+        return joints
+
+    def _match_gains(self, rigs: JointRigs, found: Found) -> dict[str, JointFit]:
+        """Search by the paper's magnitude and, with method `time`, fit in time from there.
+
+        Other frameworks begin at the joints of the robot's own simulator: the search with what
+        simulations correct there, the fit in time with its gains translated, without a search.
+        """
+        paper, main = self.work.settings.method == "paper", [goals[0] for goals in found.values()]
+        if isinstance(rigs, MujocoSimulator):
+            self.plants = {goal.joint: linearized(rigs, goal) for goal in main}
+        grids: dict[str, GridSearch] = {}
+        fits: dict[str, list[Fit]] = {}
+        if self.base and not paper:
+            for name in found:
+                first = self.base.plants[name], self.plants[name], self.base.gains[name]
+                self.gains[name] = translated(*first).after
         else:
-            own = by_amplitude[name]
-            joints[name] = _joint_fit(
-                rigs.robot, goals, own, grids[name], match, nominal, zero.get(name)
+            for grid, fit in self._search(rigs, main):
+                grids[fit.target.joint], fits[fit.target.joint] = grid, [fit]
+                self.gains[fit.target.joint] = fit.gains
+        if not paper:
+            with self.clock.stage("time fit"):
+                for name in found:
+                    self._fit_in_time(rigs, name, TIME_FIT, self.gains[name])
+                    self.clock.report(len(self.fits) / len(found))
+        with self.clock.stage("responses"):
+            best = {name: dict(zip(GAINS, pair, strict=True)) for name, pair in self.gains.items()}
+            best |= {name: _drive(rigs, fit.estimate.values) for name, fit in self.fits.items()}
+            requests = [SimRequest(goal, **best[goal.joint]) for goal in main]
+            matched = responses(rigs, requests, whole=True)
+            requests = [SimRequest(goal, *self.work.on_drive[goal.joint]) for goal in main]
+            both = zip(matched, responses(rigs, requests, whole=True), strict=True)
+        self.gains = {name: (best[name]["stiffness"], best[name]["damping"]) for name in found}
+        self.matched = dict(zip(found, matched, strict=True))
+        self.ready()
+        zero: Mapping[str, tuple[float, ComplexArray]] = {}
+        if paper and not self.base:
+            with self.clock.stage("amplitudes"):
+                others = [goal for goals in found.values() for goal in goals[1:]]
+                for fit in refine(rigs, others, [self.gains[goal.joint] for goal in others]):
+                    fits[fit.target.joint].append(fit)
+            if self.work.settings.zero_armature and "armature" in rigs.parameters:
+                with self.clock.stage("zero armature"):
+                    zero = self._without_armature(rigs, main)
+        joints = {}
+        for (name, goals), own in zip(found.items(), both, strict=True):
+            joints[name] = (
+                _joint_fit(rigs.robot, goals, fits[name], own, grids[name], zero.get(name))
+                if paper
+                else _time_joint_fit(rigs.robot, goals, self.fits[name], own, grids.get(name))
             )
-    return joints, fitted, rate
+        return joints
+
+    def _search(
+        self, rigs: JointRigs, goals: Sequence[MeasuredJoint]
+    ) -> Iterable[tuple[GridSearch, Fit]]:
+        """The paper's search, whole or linearized, and the gains off its grid, one a joint."""
+        settings, corrections = self.work.settings, []
+        grid = axes(rigs.robot, settings.grid_points)
+        if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
+            with self.clock.stage("quick search"):
+                if self.base:
+                    corrections = [self.base._correction(goal, rigs.robot) for goal in goals]
+                exact = settings.method == "paper"
+                found = quick_search(rigs, goals, *grid, exact=exact, corrections=corrections)
+            return zip(*found, strict=True)
+        with self.clock.stage("grid"):
+            begin = time.perf_counter()
+            searched = search_all(rigs, goals, *grid, self.clock.report)
+            # Everything the search does counts, not the simulator alone.
+            self.rate = rigs.steps / (time.perf_counter() - begin)
+        with self.clock.stage("refine"):
+            return zip(searched, refine(rigs, goals, [one.gains for one in searched]), strict=True)
+
+    def _correction(self, goal: MeasuredJoint, robot: RobotSpec) -> Array:
+        """Log gain of a joint simulated over linearized, shape (inside,), for another robot.
+
+        It is that of dry friction; without friction there is none.
+        """
+        if robot.joint(goal.joint).drive.frictionloss == 0.0:
+            return np.zeros(len(goal.omega))
+        plant, gains = self.plants[goal.joint], self.gains[goal.joint]
+        closed = plant.response(*gains, amplitude=goal.trace.amplitude)[0]
+        return np.asarray(np.log(np.abs(self.matched[goal.joint][goal.fit_mask] / closed)))
+
+    def _without_armature(
+        self, rigs: JointRigs, goals: Sequence[MeasuredJoint]
+    ) -> dict[str, tuple[float, ComplexArray]]:
+        """The search without rotor inertia (F13): by joint, error [dB] and response at its best."""
+        grid, groups = axes(rigs.robot, self.work.settings.grid_points), alike(goals, rigs.robot)
+        errors, requests = [], []
+        for k, group in enumerate(groups):
+            searched = coarse_search(rigs, group, *grid, armature=0.0)
+            for goal, one in zip(group, searched, strict=True):
+                errors.append(one.error_db)
+                requests.append(SimRequest(goal, *one.gains, armature=0.0))
+            self.clock.report((k + 1) / len(groups))
+        found = zip(errors, responses(rigs, requests, whole=True), strict=True)
+        return dict(zip([one.target.joint for one in requests], found, strict=True))
 
 
 def _drive(rigs: JointRigs, values: Mapping[str, float]) -> dict[str, float]:
@@ -522,19 +508,19 @@ def _time_joint_fit(
     robot: RobotSpec,
     goals: Sequence[MeasuredJoint],
     fit: TimeFit,
-    matched: ComplexArray,
-    naive: ComplexArray,
+    both: tuple[ComplexArray, ComplexArray],
     grid: GridSearch | None = None,
 ) -> JointFit:
-    """Put the findings of one joint together that was fitted in time."""
-    goal, joint = goals[0], robot.joint(goals[0].joint)
-    error_db = goal.rms_db(matched[goal.fit_mask])
+    """Put the findings of one joint together that was fitted in time.
+
+    `both` are simulated responses, with the matched gains and with those of the real drive.
+    """
+    error_db = goals[0].rms_db(both[0][goals[0].fit_mask])
     return response_fit(
         robot,
         goals,
         fit.estimate,
-        matched,
-        naive,
+        *both,
         error_db=error_db,
         **_grid_fields(grid),
         total95=fit.total95,
@@ -542,16 +528,52 @@ def _time_joint_fit(
         amplitude_gains=fit.amplitude_gains,
         flags=(
             *held_out_flags(fit.held_out),
-            *_no_match(error_db, goal),
+            *_no_match(error_db, goals[0]),
             *_time_flags(fit),
             *fit.estimate.flags,
-            *_left_out(goal, joint.band_hz),
-            *goal.warnings,
+            *_goal_flags(goals[0], robot),
         ),
     )
 
 
-def _grid_fields(grid: GridSearch | None) -> dict[str, Array]:
+def _joint_fit(
+    robot: RobotSpec,
+    goals: Sequence[MeasuredJoint],
+    fits: Sequence[Fit],
+    both: tuple[ComplexArray, ComplexArray],
+    grid: GridSearch,
+    zero: tuple[float, ComplexArray] | None,
+) -> JointFit:
+    """The same for one joint by magnitude; `fits` are of each amplitude."""
+    fit, joint, rows = fits[0], robot.joint(goals[0].joint), amplitude_gains(fits)
+    held = {
+        "armature": joint.drive.armature,
+        "frictionloss": float("nan"),
+        "delay": command_delay(goals[0].measured, both[0], joint.band_hz),
+    }
+    found = gain_interval(goals[0], fit.solution, held)
+    zero_db, zero_response = zero or (float("nan"), None)
+    return response_fit(
+        robot,
+        goals,
+        found,
+        *both,
+        error_db=fit.error_db,
+        **_grid_fields(grid),
+        zero_armature_error_db=zero_db,
+        zero_armature=zero_response,
+        amplitude_gains=rows,
+        flags=(
+            *_search_flags(fit, grid),
+            *found.flags,
+            *amplitude_flags(rows),
+            *_goal_flags(goals[0], robot),
+            *_armature_flags(fit, zero_db),
+        ),
+    )
+
+
+def _grid_fields(grid: GridSearch | None) -> dict[str, Any]:
     """Fields of `JointFit` that hold a search of the grid."""
     return {} if grid is None else {f"grid_{name}": values for name, values in vars(grid).items()}
 
@@ -573,68 +595,6 @@ def _time_flags(fit: TimeFit) -> Iterator[str]:
     yield from amplitude_flags(fit.amplitude_gains)
 
 
-def _without_armature(
-    rigs: JointRigs,
-    targets: Sequence[MeasuredJoint],
-    stiffness: Array,
-    damping: Array,
-    clock: _Clock,
-) -> dict[str, tuple[float, ComplexArray]]:
-    """The search without rotor inertia (F13): by joint, error [dB] and response at its best."""
-    errors, requests = [], []
-    groups = alike(targets, rigs.robot)
-    for k, group in enumerate(groups):
-        for goal, grid in zip(
-            group, coarse_search(rigs, group, stiffness, damping, armature=0.0), strict=True
-        ):
-            errors.append(grid.error_db)
-            requests.append(SimRequest(goal, *grid.gains, armature=0.0))
-        clock.report((k + 1) / len(groups))
-    simulated = responses(rigs, requests, whole=True)
-    names = [request.target.joint for request in requests]
-    return dict(zip(names, zip(errors, simulated, strict=True), strict=True))
-
-
-def _joint_fit(
-    robot: RobotSpec,
-    goals: Sequence[MeasuredJoint],
-    fits: Sequence[Fit],
-    grid: GridSearch,
-    matched: ComplexArray,
-    naive: ComplexArray,
-    zero: tuple[float, ComplexArray] | None,
-) -> JointFit:
-    """Put one joint's findings together; `fits` are of each amplitude."""
-    goal, fit, joint = goals[0], fits[0], robot.joint(goals[0].joint)
-    held = {
-        "armature": joint.drive.armature,
-        "frictionloss": float("nan"),
-        "delay": command_delay(goal.measured, matched, joint.band_hz),
-    }
-    found, by_amplitude = gain_interval(goal, fit.solution, held), amplitude_gains(fits)
-    zero_db, zero_response = zero or (float("nan"), None)
-    return response_fit(
-        robot,
-        goals,
-        found,
-        matched,
-        naive,
-        error_db=fit.error_db,
-        **_grid_fields(grid),
-        zero_armature_error_db=zero_db,
-        zero_armature=zero_response,
-        amplitude_gains=by_amplitude,
-        flags=(
-            *_warnings(fit, grid),
-            *found.flags,
-            *amplitude_flags(by_amplitude),
-            *_left_out(goal, joint.band_hz),
-            *goal.warnings,
-            *_armature_flags(fit, zero_db),
-        ),
-    )
-
-
 def _no_match_db(goal: MeasuredJoint) -> float:
     """Error in the band above which gains are no match [dB]."""
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * goal.measurement_error_db())
@@ -650,7 +610,7 @@ def _no_match(error_db: float, goal: MeasuredJoint) -> Iterator[str]:
         )
 
 
-def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
+def _search_flags(fit: Fit, grid: GridSearch) -> Iterator[str]:
     """Flags of the optimum of the paper's search."""
     yield from _no_match(fit.error_db, fit.target)
     if grid.at_edge:
@@ -663,11 +623,12 @@ def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
         yield "the command does not change at the policy's rate; each physics step holds its own"
 
 
-def _left_out(goal: MeasuredJoint, band_hz: tuple[float, float]) -> Iterator[str]:
-    """Frequencies of the band that the fit did not use."""
-    whole = int(goal.measured.band(*band_hz).sum())
+def _goal_flags(goal: MeasuredJoint, robot: RobotSpec) -> Iterator[str]:
+    """Frequencies of the band that the fit did not use, and what could not be used beside them."""
+    whole = int(goal.measured.band(*robot.joint(goal.joint).band_hz).sum())
     if left := whole - int(goal.fit_mask.sum()):
         yield f"{left} of {whole} frequencies left out for low coherence"
+    yield from goal.warnings
 
 
 def _armature_flags(fit: Fit, zero_db: float) -> Iterator[str]:
