@@ -18,7 +18,7 @@ does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,19 +52,19 @@ def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str,
         group = {j.name: joints[j.name] for j in robot.group(name) if j.name in joints}
         if not group:
             continue
-        centre = _centre(robot, group)
-        bounds = np.array([_bounds(gains) for gains in group.values()])
-        needed = np.maximum(bounds.max(axis=(0, 2)) - centre, centre - bounds.min(axis=(0, 2)))
+        stiffness, damping = centre = _centre(robot, group)
+        low, high = _bounds(group.values()).T
+        needed = np.maximum(high - centre, centre - low).tolist()
         middle, shape = enclosing(np.concatenate([interval_points(g) for g in group.values()]))
         (a, b), (c, d) = shape.tolist()
         out[name] = GroupGains(
-            stiffness=centre[0],
-            damping=centre[1],
-            stiffness_range=_up(float(needed[0]), STIFFNESS_STEP),
-            damping_range=_up(float(needed[1]), DAMPING_STEP),
+            stiffness=stiffness,
+            damping=damping,
+            stiffness_range=_up(needed[0], STIFFNESS_STEP),
+            damping_range=_up(needed[1], DAMPING_STEP),
             frictionloss=float(np.mean([gains.frictionloss for gains in group.values()])),
             ellipsoid=((a, b), (c, d)),
-            ellipsoid_center=(float(middle[0]), float(middle[1])),
+            ellipsoid_center=tuple(middle.tolist()),
         )
     return out
 
@@ -75,7 +75,7 @@ def matched_gains(
     logs: Sequence[JointLog],
     info: SimulatorInfo,
 ) -> MatchedGains:
-    """Make the artefact of matched joints, the logs and the simulator that they hold for."""
+    """The artefact of matched joints, the logs and the simulator that they hold for."""
     return MatchedGains(
         robot=robot.name,
         simulator=info,
@@ -92,24 +92,21 @@ def characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) 
     return damping / (2.0 * inertia)
 
 
-def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Widest interval of each gain, the gain included; the bare gain where there is none."""
-
-    def about(value: float, *intervals: tuple[float, float]) -> tuple[float, float]:
-        ends = [value, *(end for one in intervals if np.isfinite(one).all() for end in one)]
-        return min(ends), max(ends)
-
-    return (
-        about(gains.stiffness, gains.stiffness_ci95, gains.stiffness_total95),
-        about(gains.damping, gains.damping_ci95, gains.damping_total95),
-    )
+def _bounds(joints: Collection[JointGains]) -> Array:
+    """Interval of stiffness and of damping that covers all joints and their known intervals."""
+    out = []
+    for name in ("stiffness", "damping"):
+        ends = [getattr(one, name) for one in joints]
+        for one in joints:
+            for interval in (getattr(one, f"{name}_ci95"), getattr(one, f"{name}_total95")):
+                ends += interval if np.isfinite(interval).all() else ()
+        out.append((min(ends), max(ends)))
+    return np.array(out)
 
 
 def _centre(robot: RobotSpec, group: Mapping[str, JointGains]) -> tuple[float, float]:
     """Training stiffness and damping of a group (steps 1 and 2)."""
-    bounds = [_bounds(gains) for gains in group.values()]
-    low, high = min(b[1][0] for b in bounds), max(b[1][1] for b in bounds)
-    damping = _nearest(0.5 * (low + high), DAMPING_STEP)
+    damping = _nearest(float(_bounds(group.values())[1].mean()), DAMPING_STEP)
     stiffnesses = np.array([gains.stiffness for gains in group.values()])
     dampings = np.array([gains.damping for gains in group.values()])
     omega = characteristic_frequency(robot, next(iter(group)), float(dampings.mean()))
@@ -131,10 +128,9 @@ def _up(value: float, step: float) -> float:
 
 
 def interval_points(gains: JointGains, level: float = 0.95) -> Array:
-    """Points on the ellipse that holds a joint's true gains with probability `level`.
+    """Points on the ellipse that holds a joint's true gains with probability `level`, (24, 2).
 
-    (stiffness, damping) [N m/rad, N m s/rad], shape (24, 2). Where the covariance is not finite,
-    as without repeats, the gains are taken for exact.
+    Where the covariance is not finite, as without repeats, the gains are taken for exact.
     """
     centre = np.array([gains.stiffness, gains.damping])
     covariance = np.array(gains.covariance, dtype=np.float64)
@@ -152,11 +148,8 @@ def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> 
 
     Khachiyan's algorithm (Todd and Yildirim, *On Khachiyan's algorithm for the computation of
     minimum-volume enclosing ellipsoids*, 2007) up to a relative excess of volume, then scaled so
-    that every point is inside.
-
-    Returns:
-        Centre c, shape (d,), and shape matrix E, shape (d, d), of
-        `{x : (x - c)^T E^-1 (x - c) <= 1}`.
+    that every point is inside. Returns centre c, shape (d,), and shape matrix E, shape (d, d), of
+    `{x : (x - c)^T E^-1 (x - c) <= 1}`.
     """
     n, d = points.shape
     # The ellipsoid moves and scales with the points; about their middle little is rounded away.

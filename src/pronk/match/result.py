@@ -21,53 +21,52 @@ from pronk.response.response import FrequencyResponse
 SCHEMA = "pronk/match/3"
 ZERO_ARMATURE = "zero armature: "
 """Beginning of the flag on the search without rotor inertia; it is no flag on the gains."""
-HELD_OUT = ("nominal", "nominal_delayed", "plain", "matched")
-"""Drives whose errors on what was kept aside are compared."""
 NOT_BETTER = "not better: "
 """Beginning of the flag on a match that is no better there than less fitting."""
 _NOT_BETTER = 1.02
 """Error kept aside over that of the best of the others from which on a match is not better: where
 the model's friction is right all fits are equal but for noise."""
+_OTHERS = {
+    "nominal": "the nominal gains",
+    "nominal_delayed": "the nominal gains with the best delay",
+    "plain": "a plain fit of stiffness, damping and delay",
+}
+HELD_OUT = (*_OTHERS, "matched")
+"""Drives whose errors on what was kept aside are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointFit:
-    """How one joint was matched. Responses share the frequencies of `responses[0]`."""
+    """How one joint was matched; what has no text here is as of `JointGains`.
+
+    Responses share the frequencies of `responses[0]`.
+    """
 
     joint: str
     responses: tuple[FrequencyResponse, ...] = ()
     """Measured, one per amplitude; the first (largest amplitude) is the one matched. Empty where
     several joints moved together and none could be estimated."""
     stiffness: float
-    """[N m/rad]"""
     damping: float
-    """[N m s/rad]"""
-    armature: float = float("nan")
-    """[kg m^2]"""
-    frictionloss: float = float("nan")
-    """Fitted dry friction [N m]; NaN: that of the robot's drive."""
+    armature: float = NAN
+    frictionloss: float = NAN
     stribeck: float = 0.0
-    """Share of the dry friction that motion takes away."""
     delay_s: float = 0.0
-    """Command delay [s]."""
     ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """95 % interval of each fitted parameter by the repeats alone."""
     total95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """The same with what the model does not explain: the change between amplitudes and between
     parts of the log."""
     held_out: Mapping[str, float] = field(default_factory=dict)
-    """RMSE [rad] on what was kept aside, each octave counting alike, with the drive `nominal`,
-    `nominal_delayed`, `plain` (stiffness, damping and delay fitted) and `matched`."""
+    """RMSE [rad] of `HELD_OUT` on what was kept aside, each octave counting alike."""
     covariance: Array
     """Of (stiffness, damping), shape (2, 2)."""
     held: tuple[str, ...] = ()
     """Parameters that were to be fitted but are held, because the logs do not identify them."""
-    band_hz: tuple[float, float] = (float("nan"), float("nan"))
-    error_db: float = float("nan")
-    """Root mean square of the gain error in the band at the optimum [dB]."""
-    naive_error_db: float = float("nan")
-    """The same with the gains of the real drive put into the simulator."""
-    coherence_min: float = float("nan")
+    band_hz: tuple[float, float] = (NAN, NAN)
+    error_db: float = NAN
+    naive_error_db: float = NAN
+    coherence_min: float = NAN
     matched: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
     """Simulated response with the matched gains, shape (f,)."""
     naive: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
@@ -78,7 +77,7 @@ class JointFit:
     """Axis of the grid [N m s/rad], shape (b,)."""
     grid_error: Array = field(default_factory=lambda: np.empty((0, 0)))
     """Mean squared magnitude error in the band [dB^2], shape (a, b)."""
-    zero_armature_error_db: float = float("nan")
+    zero_armature_error_db: float = NAN
     """Smallest error over the same grid with no rotor inertia (paper F13)."""
     zero_armature: ComplexArray | None = None
     """Simulated response at that point of the grid, shape (f,)."""
@@ -86,15 +85,13 @@ class JointFit:
     """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
     amplitude_gains: Array = field(default_factory=lambda: np.empty((0, 3)))
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
-    rmse: float = float("nan")
+    rmse: float = NAN
     """Simulated less recorded position where several joints moved together [rad]."""
-    published_rmse: float = float("nan")
+    published_rmse: float = NAN
     """The same with the robot's published parameters [rad]."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
-    """The drive by a torque channel: names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
-    """Errors of the logs that would leave no trace in them."""
 
     def __post_init__(self) -> None:
         """Refuse arrays of contradictory shapes."""
@@ -111,12 +108,10 @@ class JointFit:
     @classmethod
     def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:
         """A fit with the parameters and intervals of an estimate; `more` are the other fields."""
+        names = ("stiffness", "damping", "armature", "frictionloss")
         return cls(
             joint=joint,
-            stiffness=found.values["stiffness"],
-            damping=found.values["damping"],
-            armature=found.values["armature"],
-            frictionloss=found.values["frictionloss"],
+            **{name: found.values[name] for name in names},
             stribeck=found.values.get("stribeck", 0.0),
             delay_s=max(found.values["delay"], 0.0),
             ci95=found.ci95,
@@ -127,23 +122,22 @@ class JointFit:
 
     def gains(self) -> JointGains:
         """The part of the fit that training needs."""
-        best = (float("nan"), float("nan"))
+        best = NAN, NAN
         if self.grid_error.size:
             i, j = np.unravel_index(int(np.nanargmin(self.grid_error)), self.grid_error.shape)
             best = (float(self.grid_stiffness[i]), float(self.grid_damping[j]))
         (a, b), (c, d) = self.covariance.tolist()
-        shared = {f.name for f in fields(JointGains)} & {f.name for f in fields(JointFit)}
+        shared = {f.name for f in fields(JointGains)} & vars(self).keys()
         own = {
             "grid_stiffness": best[0],
             "grid_damping": best[1],
-            "stiffness_ci95": self.ci95.get("stiffness", (self.stiffness, self.stiffness)),
-            "damping_ci95": self.ci95.get("damping", (self.damping, self.damping)),
-            "stiffness_total95": self.total95.get("stiffness", (NAN, NAN)),
-            "damping_total95": self.total95.get("damping", (NAN, NAN)),
             "covariance": ((a, b), (c, d)),
             "amplitude_spread": amplitude_spread(self.amplitude_gains),
             "flags": tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),
         }
+        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
+            own[f"{name}_ci95"] = self.ci95.get(name, (value, value))
+            own[f"{name}_total95"] = self.total95.get(name, (NAN, NAN))
         return JointGains(**{name: getattr(self, name) for name in shared} | own)
 
 
@@ -154,7 +148,7 @@ class MatchDetails:
     joints: Mapping[str, JointFit]
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time of each stage [s]."""
-    grid_steps_per_second: float = float("nan")
+    grid_steps_per_second: float = NAN
     """Physics steps per second of the grid search, both cores together."""
     excluded: Mapping[str, str] = field(default_factory=dict)
     """Joints that moved and were not matched, and why."""
@@ -185,23 +179,18 @@ def amplitude_spread(gains: Array) -> float:
     Rows of `gains` are (amplitude, stiffness, damping), the matched amplitude first.
     """
     if len(gains) < 2:
-        return float("nan")
+        return NAN
     return float(np.abs(gains[1:, 1] / gains[0, 1] - 1.0).max())
 
 
 def held_out_flags(errors: Mapping[str, float]) -> tuple[str, ...]:
     """Flag a match that is no better on what was kept aside than with less or no fitting."""
-    words = {
-        "nominal": "the nominal gains",
-        "nominal_delayed": "the nominal gains with the best delay",
-        "plain": "a plain fit of stiffness, damping and delay",
-    }
     if not errors:
         return ()
-    best = min(words, key=errors.__getitem__)
+    best = min(_OTHERS, key=errors.__getitem__)
     if errors["matched"] <= _NOT_BETTER * errors[best]:
         return ()
     return (
         f"{NOT_BETTER}on what was kept aside it misses by {1e3 * errors['matched']:.2f} mrad, "
-        f"{words[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes",
+        f"{_OTHERS[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes",
     )

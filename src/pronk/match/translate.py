@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,12 +18,14 @@ from scipy.optimize import least_squares
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.match.export import actuators, profile_held, require_stable
-from pronk.match.gains import GroupGains, JointGains, MatchedGains
+from pronk.match.gains import NAN, GroupGains, JointGains, MatchedGains
 from pronk.match.measured_joint import DB, Pair, rms
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.profiles import Profile
+
+T = TypeVar("T", JointGains, GroupGains)
 
 LOW_HZ = 1.0
 """Lowest frequency compared: below it a joint follows its command in every drive law."""
@@ -59,7 +62,7 @@ def translate(
 
     Raises:
         PronkError: The gains hold for no profile, are of another robot or not stable there, or the
-            period of the robot's commands is no multiple of the profile's step.
+            robot cannot be commanded at the profile's step.
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
@@ -69,28 +72,22 @@ def translate(
     joints, found = {}, {}
     for name, joint in gains.joints.items():
         first, other = (_plant(one, name, joint) for one in (source, target))
-        found[name] = one = translated(
-            first, other, (joint.stiffness, joint.damping), joint.delay_s
-        )
+        pair = joint.stiffness, joint.damping
+        found[name] = one = translated(first, other, pair, joint.delay_s)
         flags = tuple(flag for flag in joint.flags if not flag.startswith(NOT_ALIKE))
         if one.after_db > NOT_ALIKE_DB:
             flags += (f"{NOT_ALIKE}: {one.after_db:.2f} dB from {begin.name}",)
-        kp, kd = one.after[0] / joint.stiffness, one.after[1] / joint.damping
-        drive = source.joint(name).drive
-        friction = drive.frictionloss if np.isnan(joint.frictionloss) else joint.frictionloss
-        (kk, kv), (vk, vv) = joint.covariance
+        friction = joint.frictionloss
+        if np.isnan(friction):
+            friction = source.joint(name).drive.frictionloss
+        scale = one.after[0] / pair[0], one.after[1] / pair[1]
         joints[name] = replace(
-            joint,
+            _scaled(joint, *scale),
             stiffness=one.after[0],
             damping=one.after[1],
-            stiffness_ci95=_scaled(joint.stiffness_ci95, kp),
-            damping_ci95=_scaled(joint.damping_ci95, kd),
-            stiffness_total95=_scaled(joint.stiffness_total95, kp),
-            damping_total95=_scaled(joint.damping_total95, kd),
-            covariance=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
-            grid_stiffness=float("nan"),
-            grid_damping=float("nan"),
-            frictionloss=kp * friction if dry else 0.0,
+            grid_stiffness=NAN,
+            grid_damping=NAN,
+            frictionloss=scale[0] * friction if dry else 0.0,
             stribeck=joint.stribeck if dry else 0.0,
             delay_s=max(joint.delay_s + one.lead_s, 0.0),
             flags=flags,
@@ -98,20 +95,11 @@ def translate(
     info = replace(to.info, decimation=target.decimation)
     groups = {}
     for name, group in gains.groups.items():
-        members = [joint for joint in robot.group(name) if joint.name in found]
-        own = [found[joint.name] for joint in members]
-        kp, kd = np.mean([np.divide(one.after, one.before) for one in own], axis=0).tolist()
-        (kk, kv), (vk, vv) = group.ellipsoid
-        groups[name] = replace(
-            group,
-            stiffness=kp * group.stiffness,
-            damping=kd * group.damping,
-            stiffness_range=kp * group.stiffness_range,
-            damping_range=kd * group.damping_range,
-            frictionloss=float(np.mean([joints[j.name].frictionloss for j in members])),
-            ellipsoid=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
-            ellipsoid_center=(kp * group.ellipsoid_center[0], kd * group.ellipsoid_center[1]),
-        )
+        members = [joint.name for joint in robot.group(name) if joint.name in found]
+        scales = [np.divide(found[one].after, found[one].before) for one in members]
+        friction = float(np.mean([joints[one].frictionloss for one in members]))
+        scaled = _scaled(group, *np.mean(scales, axis=0).tolist())
+        groups[name] = replace(scaled, frictionloss=friction)
     out = replace(gains, simulator=info, joints=joints, groups=groups)
     require_stable(to, target, actuators(out, target, "joint"))
     return out, found
@@ -154,14 +142,14 @@ def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile)
     }
     groups = {}
     for group in robot.groups:
-        pairs = [by_joint[one.name] for one in robot.group(group) if one.name in by_joint]
-        if pairs:
-            middle, spread = np.mean(pairs, axis=0), np.ptp(pairs, axis=0) / 2.0
+        if pairs := [by_joint[one.name] for one in robot.group(group) if one.name in by_joint]:
+            stiffness, damping = np.mean(pairs, axis=0).tolist()
+            spread = (np.ptp(pairs, axis=0) / 2.0).tolist()
             groups[group] = GroupGains(
-                stiffness=float(middle[0]),
-                damping=float(middle[1]),
-                stiffness_range=float(spread[0]),
-                damping_range=float(spread[1]),
+                stiffness=stiffness,
+                damping=damping,
+                stiffness_range=spread[0],
+                damping_range=spread[1],
             )
     info = replace(begin.info, decimation=known.decimation)
     return MatchedGains(robot=robot.name, simulator=info, joints=joints, groups=groups)
@@ -173,12 +161,8 @@ def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
     drive = replace(
         first.drive, rotor_inertia=gains.armature / first.drive.gear_ratio**2, frictionloss=0.0
     )
-    own = replace(
-        robot,
-        joints=tuple(
-            replace(one, drive=drive) if one.name == first.name else one for one in robot.joints
-        ),
-    )
+    changed = {first.name: replace(first, drive=drive)}
+    own = replace(robot, joints=tuple(changed.get(one.name, one) for one in robot.joints))
     low, high = gains.band_hz if np.isfinite(gains.band_hz).all() else first.band_hz
     hz = np.linspace(max(low, min(LOW_HZ, 0.5 * high)), high, POINTS)
     pose = np.array([robot.joint(joint).default_position for joint in first.chain])
@@ -187,5 +171,17 @@ def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
         return plant(rig, pose[order], 2.0 * np.pi * hz)
 
 
-def _scaled(interval: Pair, factor: float) -> Pair:
-    return factor * interval[0], factor * interval[1]
+def _scaled(gains: T, kp: float, kd: float) -> T:
+    """Gains of a joint or a group with the fields of stiffness and damping times two factors."""
+    out: dict[str, Any] = {}
+    for name, value in vars(gains).items():
+        if name.startswith(("stiffness", "damping")):
+            factor = kp if name.startswith("stiffness") else kd
+            scaled = (factor * np.array(value)).tolist()
+            out[name] = tuple(scaled) if isinstance(value, tuple) else scaled
+        elif name in ("covariance", "ellipsoid"):
+            (kk, kv), (vk, vv) = value
+            out[name] = (kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)
+        elif name == "ellipsoid_center":
+            out[name] = kp * value[0], kd * value[1]
+    return replace(gains, **out)
