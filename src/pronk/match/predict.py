@@ -21,17 +21,21 @@ from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import MatchedGains
-from pronk.match.measured_joint import DriveGains, gains_on_drive, with_drive_gains
+from pronk.match.measured_joint import DriveGains, gains_on_drive, rms, with_drive_gains
 from pronk.match.parameters import GAINS
 from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, branches, moves_together, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.load import joint_rigs
+from pronk.simulators.mujoco import Drives
 from pronk.simulators.profiles import profile_of
 from pronk.simulators.simulator import JointRigs
 
 SCHEMA = "pronk/prediction/2"
+_WITHOUT_GAINS = (
+    "{} is left out: the gains have no entry for it; match a log in which it is excited."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,15 +80,13 @@ class Prediction:
 
 def rmse(simulated: Array, measured: Array) -> float:
     """Root mean square difference."""
-    return float(np.sqrt(np.mean((simulated - measured) ** 2)))
+    return rms(simulated - measured)
 
 
 def r2(simulated: Array, measured: Array) -> float:
     """One less the share of the measured variance that is left over; NaN for a still joint."""
     spread = float(np.var(measured))
-    if spread == 0.0:
-        return float("nan")
-    return float(1.0 - np.mean((simulated - measured) ** 2) / spread)
+    return float(1.0 - np.mean((simulated - measured) ** 2) / spread) if spread else float("nan")
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
@@ -93,11 +95,7 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_prediction(path: Path) -> Prediction:
-    """Read what `save_prediction` wrote.
-
-    Raises:
-        ArtefactError: Missing, damaged or of another schema.
-    """
+    """Read what `save_prediction` wrote; ArtefactError for another file."""
     return load_artefact(path, Prediction, SCHEMA, what="a prediction", writer="pronk predict LOG")
 
 
@@ -131,10 +129,10 @@ def predict(
                 f"{log.source or 'log'}: several joints move at once, which only simulator mujoco "
                 f"replays, not {simulator}."
             )
-        joints, excluded = _together(log, robot, gains, threads)
+        joints, excluded = _together(log, robot, drives_of(robot, gains), threads)
     else:
         with joint_rigs(simulator, robot, threads=threads, python=simulator_python) as rigs:
-            joints, excluded = _joint_by_joint(log, rigs, gains)
+            joints, excluded = _joint_by_joint(log, rigs, drives_of(rigs.robot, gains))
     if not joints:
         reasons = " ".join(excluded.values()) or "no joint is excited in it."
         raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
@@ -147,16 +145,8 @@ def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, dict[str, floa
     """Parameters of the drives of the matched joints, as `published`."""
     out = {}
     for name, joint in gains.joints.items():
-        found = {
-            "stiffness": joint.stiffness,
-            "damping": joint.damping,
-            "armature": joint.armature,
-            "frictionloss": joint.frictionloss,
-            "stribeck": joint.stribeck,
-            "delay": joint.delay_s,
-        }
-        known = {n: value for n, value in found.items() if not np.isnan(value)}
-        out[name] = published(robot, name) | known
+        found, drive = vars(joint) | {"delay": joint.delay_s}, published(robot, name)
+        out[name] = drive | {n: found[n] for n in drive if not np.isnan(found.get(n, np.nan))}
     return out
 
 
@@ -166,17 +156,11 @@ def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:
     return published(robot, name) | dict(zip(GAINS, pair, strict=True))
 
 
-def _without_gains(name: str) -> str:
-    return (
-        f"{name} is left out: the gains have no entry for it; match a log in which it is excited."
-    )
-
-
 def _together(
-    log: JointLog, robot: RobotSpec, gains: MatchedGains, threads: int
+    log: JointLog, robot: RobotSpec, matched: Drives, threads: int
 ) -> tuple[list[JointPrediction], dict[str, str]]:
-    """Chain by chain; joints and the reasons why others are left out."""
-    matched, joints = drives_of(robot, gains), []
+    """Chain by chain; joints, and why others are left out."""
+    joints: list[JointPrediction] = []
     left_out: dict[str, str] = {}
     kinds = {name: s.kind for s in log.segments for name in s.joints}
     for branch in branches([log], robot):
@@ -188,42 +172,39 @@ def _together(
             }
             simulated = [positions for (positions,) in arm.run([naive, late, matched])]
         left_out |= arm.excluded
-        left_out |= {name: _without_gains(name) for name in arm.joints if name not in matched}
-        joints += [
-            JointPrediction(
-                joint=name,
-                time=log.time,
-                command=log.command[:, log.column(name)],
-                measured=log.position[:, log.column(name)],
-                naive=simulated[0][:, i],
-                naive_delayed=simulated[1][:, i],
-                matched=simulated[2][:, i],
-                signal=kinds.get(name, "unknown"),
+        for i, name in enumerate(arm.joints):
+            if name not in matched:
+                left_out[name] = _WITHOUT_GAINS.format(name)
+                continue
+            joints.append(
+                JointPrediction(
+                    joint=name,
+                    time=log.time,
+                    command=log.command[:, log.column(name)],
+                    measured=log.position[:, log.column(name)],
+                    naive=simulated[0][:, i],
+                    naive_delayed=simulated[1][:, i],
+                    matched=simulated[2][:, i],
+                    signal=kinds.get(name, "unknown"),
+                )
             )
-            for i, name in enumerate(arm.joints)
-            if name in matched
-        ]
     return joints, left_out
 
 
 def _joint_by_joint(
-    log: JointLog, rigs: JointRigs, gains: MatchedGains
+    log: JointLog, rigs: JointRigs, matched: Drives
 ) -> tuple[list[JointPrediction], dict[str, str]]:
-    """One joint after the other, segment by segment."""
-    matched, joints, missing = drives_of(rigs.robot, gains), [], {}
+    """One joint after the other, segment by segment; returns as `_together`."""
+    joints, left_out = [], {}
     for name in rigs.robot.joint_names:
-        mine = [segment for segment in log.segments if name in segment.joints]
+        mine = sorted((s for s in log.segments if name in s.joints), key=lambda s: s.start)
         if mine and name not in matched:
-            missing[name] = _without_gains(name)
+            left_out[name] = _WITHOUT_GAINS.format(name)
         elif mine:
-            parts = [
-                _replay(log.cut(one), one, name, rigs, matched[name])
-                for one in sorted(mine, key=lambda one: one.start)
-            ]
+            parts = [_replay(log.cut(one), one, name, rigs, matched[name]) for one in mine]
             columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-            one = JointPrediction(joint=name, **columns)  # type: ignore[arg-type]
-            joints.append(replace(one, signal=mine[0].kind))
-    return joints, missing
+            joints.append(JointPrediction(joint=name, signal=mine[0].kind, **columns))
+    return joints, left_out
 
 
 def _replay(
