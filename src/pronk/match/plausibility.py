@@ -37,7 +37,6 @@ on 109 of them); the range stands beside each.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -87,24 +86,18 @@ CAUSES: Mapping[str, tuple[str, str]] = {
 """Cause: what it is, and the way out."""
 
 
-@dataclass(frozen=True)
 class Finding:
     """One contradiction between a log and what it is said to be."""
 
-    seen: str
-    """What was seen."""
-    causes: tuple[str, ...]
-    """Keys of `CAUSES` that explain it alike."""
+    def __init__(self, seen: str, *causes: str) -> None:
+        """Say what was seen, and which keys of `CAUSES` explain it alike."""
+        self.seen, self.causes = seen, causes
 
     def __str__(self) -> str:
         """What was seen, what it probably is, and the way out."""
         what = ", or ".join(CAUSES[one][0] for one in self.causes)
         out = "; ".join(dict.fromkeys(CAUSES[one][1] for one in self.causes))
         return f"{self.seen}: {what}; {out}"
-
-
-def _finding(seen: str, *causes: str) -> Finding:
-    return Finding(seen, causes)
 
 
 LOW_HZ = 0.25
@@ -189,10 +182,8 @@ def require_plausible(logs: Mapping[str, Sequence[JointLog]], robot: RobotSpec) 
     Raises:
         LogError: A sign is flipped, angles are in degrees, or another joint moved.
     """
-    for joint, sources in logs.items():
-        for log in sources:
-            if log.unit(joint) != "rad":
-                continue
+    for joint, log in ((joint, log) for joint, sources in logs.items() for log in sources):
+        if log.unit(joint) == "rad":
             own = _Recorded.of(log, joint, robot)
             for one in (*_names(own), *_gross(own)):
                 raise LogError(f"{log.source or 'log'}: {joint}: {one}.")
@@ -208,15 +199,9 @@ def findings(
 ) -> tuple[list[Finding], tuple[str, ...]]:
     """Contradictions between the logs of a joint, the robot's model and fitted parameters.
 
-    Args:
-        logs: Logs that `require_plausible` has let pass; those that excite the joint are used.
-        joint: Its name.
-        robot: The robot.
-        fit: How it was matched; its dry friction is compared with the model's.
-        time_fit: Its fit in time; without it the response is not tested.
-
-    Returns:
-        The contradictions, and the causes out of `CAUSES` that would leave no trace in these logs.
+    Of logs that `require_plausible` has let pass those that excite the joint are used. The dry
+    friction of `fit` is compared with the model's; without `time_fit` the response is not tested.
+    Also returns the causes out of `CAUSES` that would leave no trace in these logs.
     """
     found: list[Finding] = []
     settled, logs = True, [log for log in logs if joint in excited_joints(log)]
@@ -238,17 +223,23 @@ def findings(
         ratio = dry / max(model, 1e-3)
         if ratio < FRICTION[0] or ratio > FRICTION[1]:
             what = f"friction: {dry:.2g} N m of dry friction fit where the model has {model:.2g}"
-            found.append(_finding(what, "friction"))
-    hidden = {
-        "drive gains": not settled,
-        "other leg": not all("excited" in log.metadata for log in logs),
-        "command delay": not settled and any(log.frequency is None for log in logs),
-        "position filter": not settled and not _counted(logs, joint),
-    }
-    return (
-        list({one.causes: one for one in reversed(found)}.values())[::-1],
-        tuple(cause for cause, leaves in hidden.items() if leaves and cause not in wrong),
+            found.append(Finding(what, "friction"))
+    hidden = _those(
+        {
+            "drive gains": not settled,
+            "other leg": not all("excited" in log.metadata for log in logs),
+            "command delay": not settled and any(log.frequency is None for log in logs),
+            "position filter": not settled and not _counted(logs, joint),
+        }
     )
+    # Of several findings of the same causes the first.
+    firsts = list({one.causes: one for one in reversed(found)}.values())[::-1]
+    return firsts, tuple(cause for cause in hidden if cause not in wrong)
+
+
+def _those(causes: Mapping[str, bool]) -> list[str]:
+    """The causes that are possible."""
+    return [cause for cause, possible in causes.items() if possible]
 
 
 def _names(own: _Recorded) -> Iterator[Finding]:
@@ -256,14 +247,14 @@ def _names(own: _Recorded) -> Iterator[Finding]:
     log, joint = own.log, own.joint.name
     stated = log.metadata.get("excited", joint)
     if stated != joint:
-        yield _finding(f"the log says that {stated} was excited, its columns {joint}", "other leg")
+        yield Finding(f"the log says that {stated} was excited, its columns {joint}", "other leg")
     for part in own.parts:
         travel, commanded = np.ptp(part.position, axis=0), np.ptp(part.command, axis=0)
         for i, name in enumerate(part.joints):
             if i == own.column or commanded[i] > 0.0 or log.unit(name) != "rad":
                 continue
             if travel[i] > max(0.5 * commanded[own.column], 2.0 * travel[own.column]):
-                yield _finding(
+                yield Finding(
                     f"{name} moved by {travel[i]:.2g} rad while {joint} was commanded", "other leg"
                 )
                 return
@@ -272,12 +263,11 @@ def _names(own: _Recorded) -> Iterator[Finding]:
 def _gross(own: _Recorded) -> Iterator[Finding]:
     """Sign and unit: phase and gain at low frequency, and the range of the joint."""
     low, high = own.joint.range
-    command = own.log.command[:, own.column]
+    command, degree = own.log.command[:, own.column], np.pi / 180.0
     least, most = float(command.min()), float(command.max())
-    degree = np.pi / 180.0
     inside = low <= degree * least and degree * most <= high
     if (least < low - 1.0 or most > high + 1.0) and inside:
-        yield _finding(
+        yield Finding(
             f"the command goes from {least:.3g} to {most:.3g}, the joint from {low:.3g} to "
             f"{high:.3g} rad",
             "degrees",
@@ -290,9 +280,9 @@ def _gross(own: _Recorded) -> Iterator[Finding]:
         return
     gain = abs(cross) / power[0]
     if 0.5 < gain * degree < 2.0 or 0.5 < gain / degree < 2.0:
-        yield _finding(f"at low frequency the position is {gain:.3g} times the command", "degrees")
+        yield Finding(f"at low frequency the position is {gain:.3g} times the command", "degrees")
     elif cross.real < -0.7 * abs(cross):
-        yield _finding("at low frequency the position moves against the command", "sign")
+        yield Finding("at low frequency the position moves against the command", "sign")
 
 
 def _spectra(own: _Recorded, top_hz: float) -> dict[str, ComplexArray]:
@@ -339,7 +329,7 @@ def _dead(own: _Recorded) -> Iterator[Finding]:
             travel = float(np.ptp(part.position[first:stop, column]))
             slow = crossings <= 2.0 * top and travel < STILL * float(np.ptp(command))
             if travel == 0.0 or slow:
-                yield _finding(
+                yield Finding(
                     f"{own.joint.name} stands still at {part.time[first]:.1f} s while its "
                     "command moves",
                     "dead joint",
@@ -351,7 +341,7 @@ def _clock(own: _Recorded, policy_rate_hz: float) -> Iterator[Finding]:
     """Sample rate; instants at which the command changes, its rate and the frequency column."""
     log, top = own.log, own.joint.band_hz[1]
     if log.rate_hz < RATE_MIN * top:
-        yield _finding(
+        yield Finding(
             f"{log.rate_hz:.3g} samples a second are {log.rate_hz / top:.2g} a period at {top:g} "
             f"Hz, fewer than {RATE_MIN:g}",
             "sample rate",
@@ -377,19 +367,19 @@ def _clock(own: _Recorded, policy_rate_hz: float) -> Iterator[Finding]:
     if sharp < SMEARED_MIN and not stated:
         return  # a command that changes with every sample
     if off > TICK_OFF and sharp > SHARP_MIN:
-        yield _finding(
+        yield Finding(
             f"the command changes every {1e3 * period:.2f} ms instead of {1e3 * tick:.2f}, "
             f"{period / tick:.4f} times",
             *(("time",) if stated else ("time", "command rate")),
         )
     elif sharp < SHARP_MIN and (stated or off < TICK_OFF):
-        yield _finding(
+        yield Finding(
             f"the command changes all the time instead of once in {1e3 * tick:.1f} ms",
             "command filter",
         )
         return
     if shifts and abs(shift := float(np.median(shifts))) > SHIFT_SAMPLES / log.rate_hz:
-        yield _finding(
+        yield Finding(
             f"the command changes {1e3 * shift:.1f} ms after the log's frequency column",
             "command delay",
         )
@@ -459,12 +449,11 @@ def _torque(own: _Recorded, stated: tuple[float, float]) -> list[Finding] | None
         return None
     found = []
     if wrong == "encoder scale" and abs(size) > LAW_SCALE:
-        what = f"the torque is that of the position {1.0 + size:.3f} times"
-        found.append(_finding(what, wrong))
+        found.append(Finding(f"the torque is that of the position {1.0 + size:.3f} times", wrong))
     elif "filter" in wrong and size > LAW_FILTER_S:
         name = wrong.split()[0]
         what = f"the torque is that of the {name} {1e3 * size:.1f} ms earlier"
-        found.append(_finding(what, f"{name} filter"))
+        found.append(Finding(what, f"{name} filter"))
     ratios = stiffness / stated[0], damping / max(stated[1], 1e-9)
     if max(abs(ratio - 1.0) for ratio in ratios) > LAW_GAINS:
         alike = abs(ratios[0] / ratios[1] - 1.0) < LAW_GAINS
@@ -473,10 +462,10 @@ def _torque(own: _Recorded, stated: tuple[float, float]) -> list[Finding] | None
             f"the torque is that of a drive with {stiffness:.3g} / {damping:.3g} instead of "
             f"{stated[0]:.3g} / {stated[1]:.3g} {whose}"
         )
-        found.append(_finding(what, *("drive gains", "torque column")[: 1 + alike]))
+        found.append(Finding(what, *("drive gains", "torque column")[: 1 + alike]))
     if delay < -LAW_LEAD_S:
         what = f"the torque follows the command before it was given ({1e3 * delay:.1f} ms)"
-        found.append(_finding(what, "command delay"))
+        found.append(Finding(what, "command delay"))
     return found
 
 
@@ -493,11 +482,8 @@ def _gravity(own: _Recorded, robot: RobotSpec) -> Iterator[Finding]:
         for name in names
     }
     needed = _holding_torques(robot, root, {name: q for name, (_, q) in mean.items()})
-    for name in needed:
-        if name not in mean:
-            continue
-        known = robot.joint(name)
-        stiffness, _ = gains_on_drive(log, name, robot)
+    for name in (name for name in needed if name in mean):
+        known, (stiffness, _) = robot.joint(name), gains_on_drive(log, name, robot)
         command, position = mean[name]
         torque = stiffness * (command - position)
         mirrored = any(
@@ -505,7 +491,7 @@ def _gravity(own: _Recorded, robot: RobotSpec) -> Iterator[Finding]:
             for other in robot.joints
         )
         if mirrored and abs(needed[name]) > 0.1 and torque / needed[name] < SIDE:
-            yield _finding(
+            yield Finding(
                 f"{name} is held by {torque:+.2f} N m, where the model needs {needed[name]:+.2f}",
                 "other side",
             )
@@ -517,10 +503,10 @@ def _gravity(own: _Recorded, robot: RobotSpec) -> Iterator[Finding]:
                     "encoder offset": True,
                     "drive gains": 0.5 < torque * needed[name] / max(needed[name] ** 2, 1e-9) < 2.0,
                 }
-                yield _finding(
+                yield Finding(
                     f"{name} moves about {position:.3f} rad, where its command and gravity leave "
                     f"it at {position - off:.3f}",
-                    *(cause for cause, possible in alike.items() if possible),
+                    *_those(alike),
                 )
 
 
@@ -600,20 +586,19 @@ def response_test(fit: TimeFit, robot: RobotSpec) -> tuple[float, float, float] 
 
 
 def _counted(logs: Sequence[JointLog], joint: str) -> bool:
-    """Whether all positions of a joint are in whole counts, which no filter leaves."""
-    return all(_in_counts(log.position[:, log.column(joint)]) for log in logs)
+    """Whether all positions of a joint are in whole counts of an encoder, which no filter leaves.
 
-
-def _in_counts(position: Array) -> bool:
-    """Whether a position moves by whole counts of an encoder; rounded decimals are none."""
-    moves = np.abs(np.diff(position))
-    count = float(moves[moves > 0.0].min(initial=np.inf))
-    few = moves[(moves > 0.0) & (moves < 20.0 * count)] / count
-    if len(few) < FEW:
-        return False
-    decimals = np.log10([count, np.rad2deg(count)])
-    whole = float(np.mean(np.abs(few - np.round(few)) < 0.05)) > 0.99
-    return whole and bool(np.abs(decimals - np.round(decimals)).min() > 1e-3)
+    Rounded decimals are none.
+    """
+    for log in logs:
+        moves = np.abs(np.diff(log.position[:, log.column(joint)]))
+        count = float(moves[moves > 0.0].min(initial=np.inf))
+        few = moves[(moves > 0.0) & (moves < 20.0 * count)] / count
+        whole = len(few) >= FEW and np.mean(np.abs(few - np.round(few)) < 0.05) > 0.99
+        decimals = np.log10([count, np.rad2deg(count)])
+        if not whole or np.abs(decimals - np.round(decimals)).min() <= 1e-3:
+            return False
+    return True
 
 
 def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Iterator[Finding]:
@@ -621,7 +606,7 @@ def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Itera
     values, joint = fit.estimate.values, fit.problem.records[0].trace.joint
     # Logs of 100 Hz may have their commands a sample late.
     if values["delay"] < -1.0 / min(log.rate_hz for log in logs):
-        yield _finding(
+        yield Finding(
             f"the position leads its command by {-1e3 * values['delay']:.1f} ms", "command delay"
         )
         return
@@ -639,14 +624,12 @@ def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Itera
                 "drive gains": "stiffness" not in fit.problem.fitted,
                 "torque constant": "stiffness" not in fit.problem.fitted,
             }
-            yield _finding(
+            yield Finding(
                 f"no joint of the model responds so (position {1.0 + scale:.3f} times, rotor "
                 f"{np.exp(rotor):.2g} times, belt compliance {compliance:.2g} times)",
-                *(cause for cause, possible in unlike.items() if possible),
+                *_those(unlike),
             )
     ratio = values["stiffness"] / gains_on_drive(logs[0], joint, robot)[0]
     if not STIFFNESS[0] <= ratio <= STIFFNESS[1]:
-        yield _finding(
-            f"the stiffness is {ratio:.2f} times that of the drive",
-            *("drive gains", "torque constant"),
-        )
+        what = f"the stiffness is {ratio:.2f} times that of the drive"
+        yield Finding(what, "drive gains", "torque constant")
