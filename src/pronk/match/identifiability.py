@@ -78,13 +78,10 @@ class Identifiability:
 def identifiability(
     parameters: Sequence[str], experiments: Sequence[Experiment], nominal: Mapping[str, float]
 ) -> Identifiability:
-    """Analyse what some experiments can determine of some parameters.
+    """Analyse what some experiments can determine of parameters out of `FREE`.
 
-    Args:
-        parameters: What is to be fitted, out of `FREE`.
-        experiments: What is, or would be, recorded, at least one.
-        nominal: Value of every parameter about which the response is linearized; stiffness and
-            damping are needed, the rest is 0 if not given. A fitted parameter must be positive.
+    The response is linearized about `nominal`: stiffness and damping are needed, the rest is 0 if
+    not given. A fitted parameter must be positive.
 
     Raises:
         PronkError: There is no experiment or parameter, or one is unknown or not positive.
@@ -106,7 +103,7 @@ def identifiability(
             for step in (_STEP, -_STEP)
         )
         columns.append((up - down) / (2.0 * _STEP))
-    _, singular, directions = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
+    _, singular, directions = np.linalg.svd(np.array(columns).T, full_matrices=False)
     blind = (singular <= singular[0] / CONDITION_MAX) | (singular <= 0.0)
     with np.errstate(divide="ignore"):
         length = np.where(blind, np.inf, 1.0 / singular)
@@ -127,19 +124,17 @@ def require_identifiable(
     result = identifiability(parameters, experiments, nominal)
     if not (confused := result.confused):
         return result
-    remedies = [
+    remedies = "; ".join(
         words
-        for words, then in _candidates(experiments)
+        for words, then in _candidates(experiments).items()
         if not identifiability(parameters, then, nominal).confused
-    ]
+    )
     known = "no single further experiment would: fit fewer parameters"
-    if remedies:
-        known = "any of these would: " + "; ".join(remedies)
-    one = len(confused) == 1
-    words = "do not identify" if one else "cannot separate"
     raise IdentifiabilityError(
-        f"these data {words} {', '.join(confused)} (condition {result.condition:.1e}; fitted: "
-        f"{', '.join(parameters)}); {known}; or hold one of them at a known value."
+        f"these data {'do not identify' if len(confused) == 1 else 'cannot separate'} "
+        f"{', '.join(confused)} (condition {result.condition:.1e}; fitted: "
+        f"{', '.join(parameters)}); {f'any of these would: {remedies}' if remedies else known}; "
+        "or hold one of them at a known value."
     )
 
 
@@ -149,8 +144,7 @@ def bench_inertia(robot: RobotSpec, joint: str) -> tuple[float, float]:
     At the default pose; the pull is how much gravity moves the joint back [N m/rad].
     """
     model = bench_spec(robot, joint).compile()
-    data = mujoco.MjData(model)
-    dof = int(model.jnt_dofadr[model.joint(joint).id])
+    data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     pull, step = [], 1e-3
     for shift in (step, -step, 0.0):
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -210,21 +204,19 @@ def _observed(experiments: Sequence[Experiment], values: Mapping[str, float]) ->
     return np.concatenate(parts)
 
 
-def _candidates(experiments: Sequence[Experiment]) -> list[tuple[str, list[Experiment]]]:
+def _candidates(experiments: Sequence[Experiment]) -> dict[str, list[Experiment]]:
     """Further experiments, in words and with what would then be known."""
     first = experiments[0]
-    heavy, quiet = 3.0 * first.inertia, 0.25 * first.amplitude
-    pull = "sweep a pose in which gravity pulls the joint back (m g l of 2 N m/rad)"
+    heavy, quiet = replace(first, inertia=3.0 * first.inertia), 0.25 * first.amplitude
+    pulled = replace(first, gravity=2.0)
     further = {
-        "sweep a second pose or a known payload (three times the inertia)": replace(
-            first, inertia=heavy
-        ),
-        pull: replace(first, gravity=2.0),
+        "sweep a second pose or a known payload (three times the inertia)": heavy,
+        "sweep a pose in which gravity pulls the joint back (m g l of 2 N m/rad)": pulled,
         "sweep again with half the stiffness on the drive": replace(first, gain_scale=0.5),
         "sweep again with half the damping on the drive": replace(first, damping_scale=0.5),
         "sweep again at a quarter of the amplitude": replace(first, amplitude=quiet),
     }
-    found = [(words, [*experiments, one]) for words, one in further.items()]
-    if not all(e.phase for e in experiments):
-        found.append(("use the phase as well", [replace(e, phase=True) for e in experiments]))
-    return found
+    out = {words: [*experiments, one] for words, one in further.items()}
+    if not all(one.phase for one in experiments):
+        out["use the phase as well"] = [replace(one, phase=True) for one in experiments]
+    return out

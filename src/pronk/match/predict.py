@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -202,8 +203,8 @@ def _joint_by_joint(
             left_out[name] = _WITHOUT_GAINS.format(name)
         elif mine:
             parts = [_replay(log.cut(one), one, name, rigs, matched[name]) for one in mine]
-            columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-            joints.append(JointPrediction(joint=name, signal=mine[0].kind, **columns))
+            rows: dict[str, Any] = {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
+            joints.append(JointPrediction(joint=name, signal=mine[0].kind, **rows))
     return joints, left_out
 
 

@@ -109,9 +109,9 @@ class JointFit:
     def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:
         """A fit with the parameters and intervals of an estimate; `more` are the other fields."""
         names = ("stiffness", "damping", "armature", "frictionloss")
+        more |= {name: found.values[name] for name in names}
         return cls(
             joint=joint,
-            **{name: found.values[name] for name in names},
             stribeck=found.values.get("stribeck", 0.0),
             delay_s=max(found.values["delay"], 0.0),
             ci95=found.ci95,

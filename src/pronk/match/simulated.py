@@ -41,11 +41,9 @@ def responses(
 ) -> list[ComplexArray]:
     """Simulate requests; those of one original joint share a rollout, equal ones a simulation.
 
-    Armature and friction are given for all requests of one original joint, or for none.
-
-    Returns:
-        One response a request, of shape (inside,), or at all frequencies of the target, (f,), if
-        `whole`; NaN where a simulation diverged.
+    Armature and friction are given for all requests of one original joint, or for none. A response
+    is of shape (inside,), or at all frequencies of its target, (f,), if `whole`; NaN where the
+    simulation diverged.
     """
     out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
     by_original: dict[str, list[int]] = {}

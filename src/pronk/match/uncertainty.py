@@ -84,15 +84,11 @@ def estimate(
     *,
     symmetric: bool = False,
 ) -> Estimate:
-    """Turn searched numbers into parameters with intervals.
+    """Turn searched numbers `x`, shape (p,), into parameters with intervals.
 
-    Args:
-        fitted: Names of the searched numbers.
-        x: The optimum, shape (p,).
-        covariance: Of the searched numbers, shape (p, p); of the parameters if `symmetric`.
-        freedom: Degrees of freedom of the covariance; with 0 there are no intervals.
-        held: Values of the parameters that were not fitted.
-        symmetric: Intervals are symmetric about the parameters, not about the searched numbers.
+    The covariance, shape (p, p), is that of the searched numbers, or of the parameters if
+    `symmetric`: intervals are then symmetric about the parameters. With 0 degrees of `freedom`
+    there are no intervals. `held` are the values of what was not fitted.
     """
     best = {name: PARAMETERS[name].unscaled(float(at)) for name, at in zip(fitted, x, strict=True)}
     sd, ci95 = np.sqrt(np.diag(covariance)), {}
@@ -110,11 +106,9 @@ def estimate(
         sd = sd / scale
     else:
         covariance = covariance * np.outer(scale, scale)
-    own = np.zeros((2, 2))
-    places = [(k, fitted.index(name)) for k, name in enumerate(GAINS) if name in fitted]
-    for k, i in places:
-        for n, j in places:
-            own[k, n] = covariance[i, j]
+    own, rows = np.zeros((2, 2)), [k for k, name in enumerate(GAINS) if name in fitted]
+    columns = [fitted.index(GAINS[k]) for k in rows]
+    own[np.ix_(rows, rows)] = covariance[np.ix_(columns, columns)]
     return Estimate(
         values={**held, **best},
         covariance=own,
@@ -123,7 +117,7 @@ def estimate(
     )
 
 
-def repeat_moves(goal: MeasuredJoint, solution: Solution) -> Array:
+def _repeat_moves(goal: MeasuredJoint, solution: Solution) -> Array:
     """Where each repeat would move the optimum of a fit by magnitude, shape (repeats, p).
 
     By one Gauss-Newton step with the simulator's own derivatives at the common optimum,
@@ -157,7 +151,7 @@ def gain_interval(
         gains, freedom = optimum[None, :], np.inf
         flags = ("one repeat: the interval assumes white noise",)
     else:
-        gains = optimum * np.exp(repeat_moves(goal, solution))
+        gains = optimum * np.exp(_repeat_moves(goal, solution))
         covariance = jackknife(gains / (count - 1))
         if count == 2:
             flags = ("two repeats: the interval is wide, three or more narrow it",)
