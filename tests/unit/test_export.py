@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -15,11 +16,13 @@ from pronk.arrays import Array
 from pronk.cli.export import Target
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
-from pronk.match.export import TARGETS, Per, actuators, export_text, stability_share
+from pronk.match.export import TARGETS, Actuator, actuators, export_text, stability_share
 from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.parameters import GAINS
 from pronk.match.predict import drives_of
 from pronk.match.randomization import group_gains
 from pronk.robots import load_robot
+from pronk.robots.model import free_spec
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation
 from pronk.simulators.mujoco import Chain
@@ -46,18 +49,16 @@ def matched(
     robot = load_robot(robot_name)
     joints = {}
     for i, joint in enumerate(robot.joints):
-        if only and not joint.name.endswith(only):
-            continue
         kp, kd = joint.stiffness + 0.3 * i, joint.damping + 0.004 * i
-        joints[joint.name] = JointGains(
-            stiffness=kp,
-            damping=kd,
-            stiffness_ci95=(kp - 0.3, kp + 0.3),
-            damping_ci95=(kd - 0.02, kd + 0.02),
-            covariance=((0.02, 0.0), (0.0, 1e-4)),
-            armature=joint.drive.armature,
-            **extra,
-        )
+        if joint.name.endswith(only):
+            joints[joint.name] = JointGains(
+                stiffness=kp,
+                damping=kd,
+                stiffness_ci95=(kp - 0.3, kp + 0.3),
+                damping_ci95=(kd - 0.02, kd + 0.02),
+                armature=joint.drive.armature,
+                **extra,
+            )
     return MatchedGains(
         robot=robot.name,
         simulator=profile(simulator).info,
@@ -78,17 +79,30 @@ def for_target(target: str, **extra: Any) -> MatchedGains:
     return matched(simulator=TARGETS[target].profile or "isaaclab-implicit", **extra)
 
 
+def entity_model(robot: RobotSpec, text: str) -> mujoco.MjModel:
+    """The robot with the actuators that mjlab makes of an export."""
+    pytest.importorskip("mjlab")
+    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+    from mjlab.entity.entity import Entity
+
+    articulation = EntityArticulationInfoCfg(actuators=evaluated(text)["ACTUATORS"])
+    entity = Entity(EntityCfg(spec_fn=lambda: free_spec(robot), articulation=articulation))
+    return entity.spec.compile()
+
+
+def driven_joints(model: mujoco.MjModel) -> list[str]:
+    return [model.actuator(i).name.split("/")[-1] for i in range(model.nu)]
+
+
 @pytest.mark.train
 @pytest.mark.parametrize("target", ["mjlab", "mjlab-idealpd", "mjlab-builtin"])
 def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
-    pytest.importorskip("mjlab")
     gains = for_target(target, frictionloss=0.15, delay_s=0.011)
-    space = evaluated(export_text(gains, target))
-    found, events = space["ACTUATORS"], space["EVENTS"]
-    assert len(found) == len(events) == len(gains.groups)
-    for i, (cfg, event, (name, group)) in enumerate(
-        zip(found, events.values(), gains.groups.items(), strict=True)
-    ):
+    text = export_text(gains, target)
+    assert {*driven_joints(entity_model(ROBOT, text))} == {*ROBOT.joint_names}
+    space = evaluated(text)
+    rows = zip(space["ACTUATORS"], space["EVENTS"].values(), gains.groups.items(), strict=True)
+    for i, (cfg, event, (name, group)) in enumerate(rows):
         drive = ROBOT.group(name)[0].drive
         assert type(cfg).__name__ == TARGETS[target].call
         assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
@@ -102,43 +116,16 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
         assert (cfg.delay_min_lag, cfg.delay_max_lag) == (2, 2)
         assert event.params["asset_cfg"].actuator_ids == [i]
         assert event.params["operation"] == "abs"
-        low, high = event.params["kp_range"]
-        assert (low + high) / 2 == pytest.approx(group.stiffness)
-        assert high - low == pytest.approx(2 * group.stiffness_range)
-
-
-@pytest.mark.train
-@pytest.mark.parametrize("per", get_args(Per))
-@pytest.mark.parametrize("target", ["mjlab", "mjlab-idealpd", "mjlab-builtin"])
-def test_mjlab_actuators_attach_to_the_robot(target: str, per: Per) -> None:
-    pytest.importorskip("mjlab")
-    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
-    from mjlab.entity.entity import Entity
-
-    from pronk.robots.model import free_spec
-
-    gains = for_target(target)
-    found = evaluated(export_text(gains, target, per=per))["ACTUATORS"]
-    articulation = EntityArticulationInfoCfg(actuators=found)
-    entity = Entity(EntityCfg(spec_fn=lambda: free_spec(ROBOT), articulation=articulation))
-    model = entity.spec.compile()
-    assert {model.actuator(i).name.split("/")[-1] for i in range(model.nu)} == {*ROBOT.joint_names}
-    if per == "joint" and target == "mjlab-builtin":
-        for i in range(model.nu):
-            own = gains.joints[model.actuator(i).name.split("/")[-1]]
-            assert model.actuator_gainprm[i, 0] == pytest.approx(own.stiffness)
-            assert model.actuator_biasprm[i, 2] == pytest.approx(-own.damping)
+        ends = group.stiffness - group.stiffness_range, group.stiffness + group.stiffness_range
+        assert event.params["kp_range"] == pytest.approx(ends)
 
 
 @pytest.mark.parametrize("target", [name for name in TARGETS if name.startswith("isaaclab")])
 def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
     gains = for_target(target, frictionloss=0.15, delay_s=0.011)
     text = export_text(gains, target)
-    calls = [
-        node
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-    ]
+    nodes = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
+    calls = [node for node in nodes if isinstance(node.func, ast.Name)]
     assert len(calls) == len(gains.groups)
     for call, group in zip(calls, gains.groups.values(), strict=True):
         values = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
@@ -168,13 +155,13 @@ def test_genesis_text_sets_every_parameter_of_every_joint() -> None:
 
     space["apply"](Robot())
     robot = load_robot("go2")
-    order = [gains.joints[name] for name in robot.joint_names]
     assert list(space["JOINTS"])[:3] == ["FR_hip_joint", "FL_hip_joint", "RR_hip_joint"]
     assert called["set_dofs_kp"][1] == list(range(6, 18))
     names = [f"{leg}_{part}" for part in robot.groups for leg in robot.legs]
-    expected = [gains.joints[name].stiffness for name in names]
-    assert called["set_dofs_kp"][0] == pytest.approx(expected)
-    assert called["set_dofs_armature"][0][0] == pytest.approx(order[0].armature)
+    for argument in ("kp", "armature"):
+        field = TARGETS["genesis"].arguments[argument]
+        expected = [getattr(gains.joints[name], field) for name in names]
+        assert called[f"set_dofs_{argument}"][0] == pytest.approx(expected)
     low, high, _ = called["set_dofs_force_range"]
     assert high == [-value for value in low]
     assert {*called} == {f"set_dofs_{name}" for name in TARGETS["genesis"].arguments}
@@ -221,12 +208,10 @@ def test_newton_text_is_a_usd_layer_in_radians_and_degrees(tmp_path: Any) -> Non
     assert prim.typeName == "NewtonActuator"
 
 
-@pytest.mark.parametrize("robot", ["mini_cheetah", "so101"])
-def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
-    gains = matched(robot)
-    machine = load_robot(robot)
+def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law() -> None:
+    gains = matched()
     model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
-    assert model.opt.timestep == machine.timestep_s
+    assert model.opt.timestep == ROBOT.timestep_s
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     data = mujoco.MjData(model)
     random = np.random.default_rng(0)
@@ -235,7 +220,7 @@ def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
         data.qvel[:] = random.normal(0.0, 3.0 * scale, model.nv)
         data.ctrl[:] = random.normal(0.0, scale, model.nu)
         mujoco.mj_forward(model, data)
-        for joint in machine.joints:
+        for joint in ROBOT.joints:
             group = gains.groups[joint.group]
             at = model.joint(joint.name)
             q, speed = data.qpos[at.qposadr[0]], data.qvel[at.dofadr[0]]
@@ -274,6 +259,29 @@ def motion(
         return command, chain.run([drives])[0][0]
 
 
+def assert_moves(
+    model: mujoco.MjModel,
+    command: Array,
+    expected: Array,
+    *,
+    steps: int = 1,
+    columns: Sequence[int] = range(6),
+    within: float = 1e-6,
+) -> None:
+    """Hold each command for some steps; the positions before it are those expected."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = expected[0]
+    if model.nhistory:
+        length = int(model.actuator_history[0, 0])
+        past = model.opt.timestep * np.arange(-length, 0)
+        for i in range(model.nu):
+            mujoco.mj_initCtrlHistory(model, data, i, past, np.full(length, command[0, i]))
+    for target, position in zip(command, expected, strict=True):
+        assert data.qpos == pytest.approx(position, abs=within)
+        data.ctrl[:] = target[columns]
+        mujoco.mj_step(model, data, steps)
+
+
 @pytest.mark.parametrize("name", list(profiles()))
 def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     holds, arm = profile(name), smooth_arm()
@@ -283,47 +291,33 @@ def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
     snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
     assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
-    known = profile(name).robot(arm)
-    command, expected = motion(known, drives_of(known, gains))
-    data = mujoco.MjData(model)
-    data.qpos[:] = expected[0]
-    length = int(model.actuator_history[0, 0])
-    past = model.opt.timestep * np.arange(-length, 0)
-    for i in range(model.nu):
-        mujoco.mj_initCtrlHistory(model, data, i, past, np.full(length, command[0, i]))
-    for target, position in zip(command, expected, strict=True):
-        assert data.qpos == pytest.approx(position, abs=1e-6)
-        data.ctrl[:] = target
-        mujoco.mj_step(model, data, holds.iterations)
+    known = holds.robot(arm)
+    assert_moves(model, *motion(known, drives_of(known, gains)), steps=holds.iterations)
 
 
 @pytest.mark.train
 def test_joints_of_mjlab_move_as_its_profile_does() -> None:
-    pytest.importorskip("mjlab")
-    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
-    from mjlab.entity.entity import Entity
-
-    from pronk.robots.model import free_spec
-
     arm, name = smooth_arm(), "mjlab-builtin"
-    gains = matched("so101", name)
-    found = evaluated(export_text(gains, name, arm, per="joint"))["ACTUATORS"]
-    articulation = EntityArticulationInfoCfg(actuators=found)
-    entity = Entity(EntityCfg(spec_fn=lambda: free_spec(arm), articulation=articulation))
-    model = entity.spec.compile()
+    gains, known = matched("so101", name), profile(name).robot(arm)
+    model = entity_model(arm, export_text(gains, name, arm, per="joint"))
     # As mjlab's SimulationCfg sets them.
-    model.opt.timestep = profile(name).timestep_s
+    model.opt.timestep = known.timestep_s
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    known = profile(name).robot(arm)
-    command, expected = motion(known, drives_of(known, gains))
-    data = mujoco.MjData(model)
-    data.qpos[:] = expected[0]
-    order = [model.actuator(i).name.split("/")[-1] for i in range(model.nu)]
-    columns = [arm.joint_names.index(joint) for joint in order]
-    for target, position in zip(command, expected, strict=True):
-        assert data.qpos == pytest.approx(position, abs=1e-6)
-        data.ctrl[:] = target[columns]
-        mujoco.mj_step(model, data)
+    columns = [arm.joint_names.index(joint) for joint in driven_joints(model)]
+    assert_moves(model, *motion(known, drives_of(known, gains)), columns=columns)
+
+
+def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
+    arm, gains = load_robot("so101"), matched("so101", frictionloss=0.2, stribeck=0.6)
+    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
+    drives = drives_of(arm, gains)
+    for name, group in gains.groups.items():
+        drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
+    assert_moves(model, *motion(arm, drives, 400), within=1e-5)
+    assert "elbow_flex 0.6" in export_text(gains, "mjlab").replace("\n# ", " ")
+    assert "elbow_flex" not in export_text(matched("so101"), "mjlab").partition("import")[0]
+    static = export_text(gains, "isaaclab-dcmotor")
+    assert "friction=0.2,\n        dynamic_friction=0.08," in static
 
 
 @pytest.mark.parametrize("target", list(TARGETS))
@@ -351,54 +345,44 @@ def test_gains_of_another_drive_law_are_refused() -> None:
         with pytest.raises(PronkError, match=r"pronk translate GAINS --to"):
             export_text(matched(simulator=name), target)
     assert "DCMotorCfg" in export_text(matched(simulator="mjlab"), "isaaclab-dcmotor")
-    assert "ImplicitActuatorCfg" in export_text(
-        matched(simulator="mjlab-builtin"), "isaaclab-newton"
-    )
 
 
 @pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin", "newton-featherstone"])
 def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     arm = load_robot("so101")
     loss = {"frictionloss": 0.0, "stribeck_speed": 0.0, "effort_limit": 1e6, "stall_torque": 1e6}
-    joints = [
-        replace(one, drive=replace(one.drive, **loss, no_load_speed=1e6)) for one in arm.joints
-    ]
+    free = [replace(joint.drive, **loss, no_load_speed=1e6) for joint in arm.joints]
+    joints = [replace(a, drive=b) for a, b in zip(arm.joints, free, strict=True)]
     robot = replace(profile(name).robot(arm), joints=tuple(joints))
     drives = actuators(matched("so101", name), robot, "joint")
     # Only a large stiffness makes the law with implicit damping diverge.
     field = "stiffness" if name == "mjlab-builtin" else "damping"
+
+    def scaled(scale: float) -> list[Actuator]:
+        return [replace(one, **{field: scale * getattr(one, field)}) for one in drives]
+
     low, high = 0.1, 1e3
     while high / low > 1.001:
         scale = np.sqrt(low * high)
-        scaled = [replace(one, **{field: scale * getattr(one, field)}) for one in drives]
-        low, high = (low, scale) if stability_share(robot, scaled) > 1.0 else (scale, high)
-    rest = np.array([joint.default_position for joint in joints])
+        low, high = (low, scale) if stability_share(robot, scaled(scale)) > 1 else (scale, high)
+    rest = {joint.name: joint.default_position for joint in joints}
     with Chain(robot, "gripper", threads=1) as chain:
-        order = [arm.joint_names.index(joint) for joint in chain.joints]
-        sets = [
-            {one.name: {"stiffness": one.stiffness, "damping": one.damping} for one in drives}
-            for _ in range(2)
-        ]
-        for part, share in zip(sets, (0.97, 1.03), strict=True):
-            for values in part.values():
-                values[field] *= share * low
-        start = np.stack(
-            [
-                chain.rest_position(
-                    rest[order], np.array([part[joint]["stiffness"] for joint in chain.joints])
-                )
-                for part in sets
-            ]
-        )
-        command = np.broadcast_to(rest[order], (2, 400, len(order)))
-        moved = chain.rollout(command, sets, start + 1e-7) - start[:, None]
+        pose = np.array([rest[joint] for joint in chain.joints])
+        sets, start = [], []
+        for share in (0.97, 1.03):
+            by_name = {one.name: one for one in scaled(share * low)}
+            sets.append({n: {k: getattr(v, k) for k in GAINS} for n, v in by_name.items()})
+            stiffness = np.array([by_name[joint].stiffness for joint in chain.joints])
+            start.append(chain.rest_position(pose, stiffness))
+        command = np.broadcast_to(pose, (2, 400, len(pose)))
+        moved = chain.rollout(command, sets, np.array(start) + 1e-7) - np.array(start)[:, None]
     assert np.abs(moved[0, -1]).max() < 1e-6
     assert not np.abs(moved[1, -1]).max() < 1e-5
 
 
 def test_unstable_gains_are_refused() -> None:
     gains = matched("go2")
-    joints = {n: JointGains(**(vars(one) | {"damping": 25.0})) for n, one in gains.joints.items()}
+    joints = {name: replace(one, damping=25.0) for name, one in gains.joints.items()}
     groups = group_gains(load_robot("go2"), joints)
     with pytest.raises(PronkError, match="times the limit of drive law E"):
         export_text(replace(gains, joints=joints, groups=groups), "mjlab")
@@ -415,22 +399,3 @@ def test_unknown_target_and_foreign_robot_are_refused() -> None:
         export_text(replace(matched(), simulator=own), "mjlab")
     with pytest.raises(PronkError, match="--robot PATH"):
         export_text(replace(matched(), robot="mine"), "mjlab")
-
-
-def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
-    arm, gains = load_robot("so101"), matched("so101", frictionloss=0.2, stribeck=0.6)
-    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
-    drives = drives_of(arm, gains)
-    for name, group in gains.groups.items():
-        drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
-    command, expected = motion(arm, drives, 400)
-    data = mujoco.MjData(model)
-    data.qpos[:] = command[0]
-    for target, position in zip(command, expected, strict=True):
-        assert data.qpos == pytest.approx(position, abs=1e-5)
-        data.ctrl[:] = target
-        mujoco.mj_step(model, data)
-    assert "elbow_flex 0.6" in export_text(gains, "mjlab").replace("\n# ", " ")
-    assert "elbow_flex" not in export_text(matched("so101"), "mjlab").partition("import")[0]
-    static = export_text(gains, "isaaclab-dcmotor")
-    assert "friction=0.2,\n        dynamic_friction=0.08," in static

@@ -86,7 +86,7 @@ def matched_gains(
     )
 
 
-def characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) -> float:
+def _characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) -> float:
     """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s], armature included."""
     inertia, _ = bench_inertia(robot, robot.joint(joint_name).original[0])
     return damping / (2.0 * inertia)
@@ -109,7 +109,7 @@ def _centre(robot: RobotSpec, group: Mapping[str, JointGains]) -> tuple[float, f
     damping = _nearest(float(_bounds(group.values())[1].mean()), DAMPING_STEP)
     stiffnesses = np.array([gains.stiffness for gains in group.values()])
     dampings = np.array([gains.damping for gains in group.values()])
-    omega = characteristic_frequency(robot, next(iter(group)), float(dampings.mean()))
+    omega = _characteristic_frequency(robot, next(iter(group)), float(dampings.mean()))
     square = np.mean(stiffnesses**2) + omega**2 * (np.mean(dampings**2) - damping**2)
     # A damping far off the lattice must not carry the stiffness away from the joints.
     least, most = stiffnesses.min() - STIFFNESS_STEP, stiffnesses.max() + STIFFNESS_STEP
