@@ -36,9 +36,8 @@ def sweep(amplitudes: tuple[float, ...] = (0.25, 0.125)) -> JointLog:
 def test_the_drive_is_found_again() -> None:
     found = match_logs([sweep()], ROBOT, mode="drive").gains.joints["FR_knee"]
     assert found.stiffness == 17.0
-    assert found.damping == pytest.approx(KNOWN["damping"], rel=0.02)
-    assert found.armature == pytest.approx(KNOWN["armature"], rel=0.02)
-    assert found.frictionloss == pytest.approx(KNOWN["frictionloss"], rel=0.05)
+    for name, rel in (("damping", 0.02), ("armature", 0.02), ("frictionloss", 0.05)):
+        assert getattr(found, name) == pytest.approx(KNOWN[name], rel=rel)
     assert found.delay_s == pytest.approx(LATE_S, abs=2e-4)
     assert found.damping_ci95[0] < found.damping < found.damping_ci95[1]
     assert found.error_db < 0.05 < 0.2 * found.naive_error_db
