@@ -10,10 +10,9 @@ import pytest
 
 from benchmarks import match, random_robots
 from benchmarks.random_robots import HELD_OUT, Recorded, Steps, draw
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from benchmarks.time_fit import fit_plain, recordings
+from chirp_logs import chirp_log
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
 from pronk.robots import load_robot
 from pronk.simulators.load import joint_rigs
@@ -25,9 +24,7 @@ JOINT, KNOWN, DELAY = "FR_knee", (21.8, 0.541), 0.007
 
 def synthetic(*amplitudes: float) -> JointLog:
     """A log of the training simulator with the gains `KNOWN` and a delay."""
-    signals = [Chirp(length_s=8.0, amplitude=amplitude) for amplitude in amplitudes]
-    chirps = [Excitation(offsets=one.samples(), repeats=2) for one in signals]
-    return synthetic_log(ROBOT, JOINT, chirps, *KNOWN, delay_s=DELAY, threads=1)
+    return chirp_log(ROBOT, JOINT, KNOWN, amplitudes, repeats=2, delay_s=DELAY, threads=1)
 
 
 def test_robots_are_the_same_for_the_same_seed_and_within_their_ranges() -> None:

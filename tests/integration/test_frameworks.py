@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
+from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import ArtefactError, PronkError
-from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import load, save
 from pronk.match.pipeline import match_frameworks
@@ -28,11 +26,8 @@ CHOSEN = ("mjlab-builtin", "isaaclab-implicit", "drake,timestep_s=0.004")
 
 def recorded(name: str) -> JointLog:
     """A knee that a framework simulates, two amplitudes, two repeats, 0.1 mrad of noise."""
-    rng, robot = np.random.default_rng(3), profile(name).robot(ROBOT)
-    signals = [Chirp(length_s=8.0, amplitude=amplitude).samples() for amplitude in (0.25, 0.125)]
-    excitations = [Excitation(offsets=one, repeats=2) for one in signals]
-    noise = [1e-4 * rng.standard_normal(40000) for _ in range(4)]
-    log = synthetic_log(robot, "FR_knee", excitations, *GAINS, noise=noise)
+    robot = profile(name).robot(ROBOT)
+    log = chirp_log(robot, "FR_knee", GAINS, repeats=2, noise_rad=1e-4, seed=3)
     return replace(log, source="a.csv")
 
 

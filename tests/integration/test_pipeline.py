@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
+from chirp_logs import chirp_log
 from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
-from pronk.excitation.signals import Chirp, Multisine
+from pronk.excitation.signals import Multisine
 from pronk.logs.joint_log import JointLog
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -29,14 +31,8 @@ QUICK = MatchSettings(
 KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
 
 
-def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: object) -> JointLog:
-    rng = np.random.default_rng(seed)
-    chirps = [
-        Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=3)
-        for a in (0.25, 0.125)
-    ]
-    noise = list(0.001 * rng.standard_normal((6, 6000)))
-    log = synthetic_log(ROBOT, joint, chirps, *known, noise=noise, **more)  # type: ignore[arg-type]
+def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: Any) -> JointLog:
+    log = chirp_log(ROBOT, joint, known, repeats=3, noise_rad=0.001, seed=seed, **more)
     return replace(log, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
 
 
@@ -141,10 +137,10 @@ def test_a_joint_of_another_kind_is_no_match() -> None:
 
 
 def test_a_small_amplitude_that_noise_drowns_is_left_out() -> None:
-    rng = np.random.default_rng(0)
-    chirps = [Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.01)]
-    noise = [np.zeros(6000), 0.1 * rng.standard_normal(6000)]
-    found = joint_of(synthetic_log(ROBOT, "FR_knee", chirps, 20.0, 0.5, noise=noise))
+    log = chirp_log(ROBOT, "FR_knee", (20.0, 0.5), (0.25, 0.01))
+    small = log.time >= log.segments[1].start
+    noise = 0.1 * np.random.default_rng(0).standard_normal(len(small)) * small
+    found = joint_of(replace(log, position=log.position + noise[:, None]))
     assert any(f.startswith("the response at 0.01 rad is left out") for f in found.flags)
     assert np.isnan(found.amplitude_spread)
     assert found.stiffness == pytest.approx(20.0, rel=2e-3)
@@ -188,3 +184,48 @@ def test_bad_logs_are_refused() -> None:
 def test_settings_that_cannot_work_are_refused(field: str, value: object) -> None:
     with pytest.raises(PronkError, match=f"{field} .*expected"):
         MatchSettings(**{field: value})  # type: ignore[arg-type]
+
+
+# --- Mode drive: damping, armature, friction and delay with the stiffness known ---
+
+DRIVE = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}
+LATE_S = 0.004
+
+
+def late_sweep(*amplitudes: float) -> JointLog:
+    """Known drive of FR_knee, three repeats an amplitude, 0.2 mrad of noise, 4 ms late."""
+    how = {"repeats": 3, "length_s": 12.0, "noise_rad": 2e-4, "delay_s": LATE_S}
+    other = {"armature": DRIVE["armature"], "frictionloss": DRIVE["frictionloss"]}
+    return chirp_log(ROBOT, "FR_knee", (17.0, DRIVE["damping"]), amplitudes, **how, **other)
+
+
+def test_the_drive_is_found_again() -> None:
+    found = match_logs([late_sweep(0.25, 0.125)], ROBOT, mode="drive").gains.joints["FR_knee"]
+    assert found.stiffness == 17.0
+    for name, rel in (("damping", 0.02), ("armature", 0.02), ("frictionloss", 0.05)):
+        assert getattr(found, name) == pytest.approx(DRIVE[name], rel=rel)
+    assert found.delay_s == pytest.approx(LATE_S, abs=2e-4)
+    assert found.damping_ci95[0] < found.damping < found.damping_ci95[1]
+    assert found.error_db < 0.05 < 0.2 * found.naive_error_db
+    assert found.flags == ()
+
+
+def test_what_magnitude_and_phase_cannot_tell_apart_is_refused() -> None:
+    everything = ("stiffness", "damping", "armature", "frictionloss", "delay")
+    with pytest.raises(IdentifiabilityError, match=r"FR_knee.*stiffness.*armature.*payload"):
+        match_logs([late_sweep(0.25)], ROBOT, mode="drive", free=everything)
+
+
+@pytest.mark.parametrize(
+    ("mode", "free", "message"),
+    [
+        ("drive", ("damping", "inertia"), r"inertia.*stiffness"),
+        ("gains", ("damping",), "mode drive"),
+        ("both", (), "gains or drive"),
+    ],
+)
+def test_unknown_parameters_and_modes_are_refused(
+    mode: str, free: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(PronkError, match=message):
+        match_logs([late_sweep(0.25)], ROBOT, mode=mode, free=free)  # type: ignore[arg-type]

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
+from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
 from pronk.match.gains import load, save
 from pronk.match.translate import stated_gains, translate
 from pronk.response.estimate import estimate
@@ -80,11 +79,11 @@ def test_the_simulated_joints_respond_alike() -> None:
     robot, hz = load_robot("mini_cheetah"), (1.0, 12.0)
     first = stated_gains(robot, {"FR_knee": (17.0, 0.4)}, profile("isaaclab-implicit"))
     found = translate(first, robot, profile("mjlab"))[0].joints["FR_knee"]
-    signals = [Excitation(offsets=Chirp(length_s=12.0, amplitude=a).samples()) for a in (0.2, 0.1)]
 
     def gain_db(target: str, kp: float, kd: float, friction: float) -> np.ndarray:
         known = profile(target).robot(robot)
-        log = synthetic_log(known, "FR_knee", signals, kp, kd, frictionloss=friction)
+        how = {"length_s": 12.0, "frictionloss": friction}
+        log = chirp_log(known, "FR_knee", (kp, kd), (0.2, 0.1), **how)
         found = [one.gain[one.band(*hz)] for one in estimate(log, "FR_knee")]
         return 20.0 * np.log10(np.concatenate(found))
 

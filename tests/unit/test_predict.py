@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
+from chirp_logs import chirp_log
 from pronk.errors import LogError
-from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import predict, r2, rmse
@@ -28,11 +27,10 @@ def gains(*names: str, **extra: float) -> MatchedGains:
     return MatchedGains(robot=ROBOT.name, simulator=SimulatorInfo(), joints=joints, groups={})
 
 
-def chirp_log(delay_s: float = 0.0) -> JointLog:
+def two_joints(delay_s: float = 0.0) -> JointLog:
     """Two joints, one after the other, recorded in the training simulator."""
-    chirp = Excitation(offsets=Chirp(length_s=4.0, amplitude=0.2, stop_hz=12.0).samples())
     one, two = (
-        synthetic_log(ROBOT, name, [chirp], *pair, delay_s=delay_s)
+        chirp_log(ROBOT, name, pair, (0.2,), length_s=4.0, delay_s=delay_s)
         for name, pair in MADE_WITH.items()
     )
     later = one.time[-1] + 0.002
@@ -53,7 +51,7 @@ def chirp_log(delay_s: float = 0.0) -> JointLog:
 
 
 def test_gains_that_made_the_log_replay_it_and_naive_ones_do_not() -> None:
-    found = predict(chirp_log(), ROBOT, gains())
+    found = predict(two_joints(), ROBOT, gains())
     assert found.virtual
     assert [one.joint for one in found.joints] == list(MADE_WITH)
     for one in found.joints:
@@ -65,7 +63,7 @@ def test_gains_that_made_the_log_replay_it_and_naive_ones_do_not() -> None:
 
 
 def test_matched_delay_is_applied_to_the_command() -> None:
-    log = chirp_log(delay_s=0.02)
+    log = two_joints(delay_s=0.02)
     late = predict(log, ROBOT, gains(delay_s=0.02))
     without = predict(log, ROBOT, gains())
     for delayed, prompt in zip(late.joints, without.joints, strict=True):
@@ -76,20 +74,20 @@ def test_matched_delay_is_applied_to_the_command() -> None:
 
 
 def test_friction_of_the_gains_is_used() -> None:
-    more = predict(chirp_log(), ROBOT, gains("HR_knee", frictionloss=1.5)).joints[0]
-    same = predict(chirp_log(), ROBOT, gains("HR_knee")).joints[0]
+    more = predict(two_joints(), ROBOT, gains("HR_knee", frictionloss=1.5)).joints[0]
+    same = predict(two_joints(), ROBOT, gains("HR_knee")).joints[0]
     assert more.rmse_matched > 10 * same.rmse_matched
     assert more.rmse_naive == same.rmse_naive
 
 
 def test_joint_without_gains_is_left_out_with_a_reason() -> None:
-    found = predict(chirp_log(), ROBOT, gains("HR_knee"))
+    found = predict(two_joints(), ROBOT, gains("HR_knee"))
     assert [one.joint for one in found.joints] == ["HR_knee"]
     assert "FL_hip_roll" in found.excluded["FL_hip_roll"]
     with pytest.raises(LogError, match="nothing to replay"):
-        predict(chirp_log(), ROBOT, replace(gains(), joints={}))
+        predict(two_joints(), ROBOT, replace(gains(), joints={}))
     with pytest.raises(LogError, match=r"mini_cheetah.*so101"):
-        predict(chirp_log(), load_robot("so101"), gains("HR_knee"))
+        predict(two_joints(), load_robot("so101"), gains("HR_knee"))
 
 
 def test_rmse_and_r2_by_hand() -> None:
