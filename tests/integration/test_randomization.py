@@ -64,10 +64,9 @@ def test_draws_are_uniform_and_independent(env: Any) -> None:
     joints = np.hstack([found["stiffness"], found["damping"]])
     for i, joint in enumerate(ROBOT.joints):
         g = MATCHED.groups[joint.group]
-        assert_uniform(
-            joints[:, i], g.stiffness - g.stiffness_range, g.stiffness + g.stiffness_range
-        )
-        assert_uniform(joints[:, 12 + i], g.damping - g.damping_range, g.damping + g.damping_range)
+        pairs = (g.stiffness, g.stiffness_range), (g.damping, g.damping_range)
+        for column, (middle, half) in zip((i, 12 + i), pairs, strict=True):
+            assert_uniform(joints[:, column], middle - half, middle + half)
     everything = np.hstack([joints, *(found[name] for name in ranges)])
     correlation = np.corrcoef(everything, rowvar=False)
     upper = np.triu_indices(len(correlation), 1)
@@ -116,25 +115,24 @@ def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
 
 def test_shank_length_moves_foot_and_capsule(env: Any) -> None:
     data, model = env.sim.data, env.sim.model
-    robot = env.scene["robot"].data
-    data.qpos[:, 3:] = torch.cat([torch.tensor([1.0, 0.0, 0.0, 0.0]), robot.default_joint_pos[0]])
+    data.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    data.qpos[:, 7:] = env.scene["robot"].data.default_joint_pos[0]
     env.sim.forward()
     for leg, length in zip(BODY.legs, drawn(env)["shank_length"].T, strict=True):
         thigh, shank = (index(env, "body", f"{leg}_{part}") for part in ("thigh", "shank"))
         foot, capsule = (index(env, "geom", f"{leg}_{p}_collision") for p in ("foot", "shank"))
         site = data.site_xpos[:, index(env, "site", f"{leg}_foot")]
+        torch.testing.assert_close(site, data.geom_xpos[:, foot], atol=1e-6, rtol=0.0)
         # Default pose: thigh .8 rad back, shank .8 rad forward, both from the vertical.
         drop = data.xpos[:, thigh, 2] - data.geom_xpos[:, foot, 2]
-        torch.testing.assert_close(
-            drop, (BODY.thigh_length + length) * math.cos(0.8), atol=1e-5, rtol=0.0
-        )
-        torch.testing.assert_close(site, data.geom_xpos[:, foot], atol=1e-6, rtol=0.0)
+        legs = (BODY.thigh_length + length) * math.cos(0.8)
         # The capsule begins 2 cm below the knee and ends 3 cm above the foot; its bounds follow.
         centre = (data.geom_xpos[:, capsule] - data.xpos[:, shank]).norm(dim=-1)
         half = model.geom_size[:, capsule, 1]
         bounds = model.geom_rbound[:, capsule], model.geom_aabb[:, capsule, 1, 2]
-        found = torch.stack([centre - half, centre + half - length, *(b - half for b in bounds)])
-        expected = torch.tensor([0.02, -0.03, 0.01, 0.01])[:, None].expand(4, MANY)
+        ends = centre - half, centre + half - length
+        found = torch.stack([drop - legs, *ends, *(b - half for b in bounds)])
+        expected = torch.tensor([0.0, 0.02, -0.03, 0.01, 0.01])[:, None].expand(5, MANY)
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
 
 
@@ -152,9 +150,8 @@ def test_episodes_begin_about_the_initial_state(env: Any) -> None:
     np.testing.assert_array_equal(start[:, [4, 5, *range(21, 37)]], 0.0)
     np.testing.assert_allclose(np.linalg.norm(start[:, 3:7], axis=1), 1.0, rtol=1e-6)
     assert_uniform(2.0 * np.arctan2(start[:, 6], start[:, 3]), -math.pi, math.pi)
-    for axes, half in (((0, 1), 0.5), ((19, 20), 0.3)):
-        for axis in axes:
-            assert_uniform(start[:, axis], -half, half)
+    for axis, half in ((0, 0.5), (1, 0.5), (19, 0.3), (20, 0.3)):
+        assert_uniform(start[:, axis], -half, half)
     assert_uniform(start[:, 7:19] - robot.default_joint_pos[0].numpy(), -0.1, 0.1)
     before = data.qpos.clone()
     reset_state(env, ALL[::2], **how)
@@ -171,9 +168,6 @@ def test_length_of_the_policy_step_is_drawn_each_step(env: Any) -> None:
     planned = env.cfg.decimation
     randomize_decimation(env, None, **env.event_manager.get_term_cfg("decimation").params)
     assert env.cfg.decimation == planned
-
-
-# --- Delay ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("delay", [(0, 0), (0, 2), (1, 3), (2, 7)])
@@ -223,9 +217,6 @@ def test_delays_are_drawn_per_episode_and_torques_follow_the_drawn_gains(env: An
     second = drawn(env)["delay"]
     assert torch.equal(second[1::2], first["delay"][1::2])
     assert 0.4 < (second[::2] != first["delay"][::2]).float().mean() < 0.95
-
-
-# --- Battery -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
