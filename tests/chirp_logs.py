@@ -27,6 +27,6 @@ def chirp_log(
     """Chirps of some amplitudes [rad], white noise on the position; `more` of `synthetic_log`."""
     chirps = [Chirp(length_s=length_s, amplitude=amplitude).samples() for amplitude in amplitudes]
     excitations = [Excitation(offsets=one, repeats=repeats) for one in chirps]
-    rows = repeats * len(amplitudes), round(700.0 * length_s)
+    rows = repeats * len(amplitudes), 500 * round(length_s + 2.0)
     noise = noise_rad * np.random.default_rng(seed).standard_normal(rows)
     return synthetic_log(robot, joint, excitations, *gains, noise=list(noise), **more)

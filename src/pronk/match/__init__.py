@@ -1,10 +1,10 @@
 """Find the parameters with which a simulated joint responds as the measured one does.
 
-Start at `pipeline.match_logs`. In order: `measured_joint` (responses ready to be compared),
+Start at `pipeline.match_frameworks`. In order: `measured_joint` (responses ready to be compared),
 `simulated` (the same of the simulator), `grid` (the paper's search, whole or linearized),
 `response_fit` (off the grid, and mode drive) or `arm` (joints that moved together), `result`,
-`ranges` (what training randomizes), `gains`. The one list of parameters is `parameters`; problems
-and solvers are in `fit`, confidence intervals in `uncertainty`.
+`randomization` (what training randomizes), `gains`. The one list of parameters is `parameters`;
+problems and solvers are in `fit`, confidence intervals in `uncertainty`.
 """
 
 from __future__ import annotations
