@@ -24,6 +24,7 @@ from pronk.errors import IdentifiabilityError, PronkError
 from pronk.match.parameters import FREE, GAINS, checked_names
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
+from pronk.simulators.chain import published
 
 SD_MAX = 0.3
 """Relative standard deviation beyond which a parameter counts as unknown: at 95 % it would reach
@@ -167,13 +168,7 @@ def bench_experiment(robot: RobotSpec, joint_name: str) -> tuple[Experiment, dic
         viscous=joint.drive.viscous_damping,
         frequency_hz=np.geomspace(*joint.band_hz, 60),
     )
-    return experiment, {
-        "stiffness": joint.stiffness,
-        "damping": joint.damping,
-        "armature": joint.drive.armature,
-        "frictionloss": joint.drive.frictionloss,
-        "delay": robot.timestep_s,
-    }
+    return experiment, published(robot, joint_name) | {"delay": robot.timestep_s}
 
 
 def response(experiment: Experiment, values: Mapping[str, float]) -> ComplexArray:
