@@ -13,9 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -64,35 +63,38 @@ def rests(command: Array, rate_hz: float) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where the segments of one excitation lie on its grid."""
+    """Where the segments of one excitation lie on its analysis grid."""
 
+    grid: Grid
     starts: NDArray[np.intp]
-    """First sample of each segment; negative or beyond the end where padded, shape (k,)."""
+    """First sample of each segment, increasing; negative or beyond the end where padded, (k,)."""
     window: Array
     """Shape (samples,)."""
-    omega: Array
-    """Frequencies reported [rad/s], shape (f,)."""
     bins: NDArray[np.intp]
-    """Their numbers in the transform of a segment, shape (f,)."""
-    rate_hz: float
-    count: int
-    """Samples of the excitation, without padding."""
-    transform: ShortTimeFFT
-    slices: tuple[int, int]
-    """First and one-past-last slice of the transform."""
+    """Numbers of the frequencies in the transform of a segment, shape (f,)."""
 
-    def measured(self, segment: int) -> Array:
-        """The window of a segment, zero where it lies in the padding, shape (samples,)."""
-        sample = self.starts[segment] + np.arange(len(self.window))
-        return np.where((sample >= 0) & (sample < self.count), self.window, 0.0)
+    @property
+    def omega(self) -> Array:
+        """The frequencies [rad/s], shape (f,)."""
+        hz = fft.rfftfreq(len(self.window), 1.0 / self.grid.rate_hz)
+        return np.asarray(2.0 * np.pi * hz[self.bins])
+
+    @property
+    def padding(self) -> tuple[int, int]:
+        """Samples that segments reach over the first and over the last."""
+        last = int(self.starts[-1]) + len(self.window)
+        return max(0, -int(self.starts[0])), max(0, last - self.grid.count)
 
     def spectra(self, values: Array) -> ComplexArray:
-        """Windowed transform of each segment, mean taken away, shape (k, f).
+        """Windowed transform of each segment, its mean taken away, shape (k, f).
 
-        The phase counts from the first sample of each segment.
+        The first and the last value, shape (grid.count,), are repeated in the padding. The phase
+        counts from the first sample of each segment.
         """
-        found = self.transform.stft_detrend(values, "constant", *self.slices, padding="edge")
-        return np.asarray(found[self.bins].T)
+        padded = np.pad(values, self.padding, mode="edge")
+        parts = sliding_window_view(padded, len(self.window))[self.starts + self.padding[0]]
+        parts = (parts - parts.mean(axis=1, keepdims=True)) * self.window
+        return np.asarray(fft.rfft(parts)[:, self.bins])
 
 
 def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
@@ -104,8 +106,9 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
             f"an excitation of {span:.2f} s ({grid.count} samples at {rate_hz:g} Hz) does not "
             f"fill a segment of {estimator.segment_s:g} s; choose a shorter Estimator.segment_s."
         )
+    window = get_window(estimator.window, samples, fftbins=True)
     transform = ShortTimeFFT(
-        get_window(estimator.window, samples, fftbins=True),
+        window,
         hop=max(1, round(samples * (1.0 - estimator.overlap))),
         fs=rate_hz,
         phase_shift=None,
@@ -129,14 +132,10 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
             f"{estimator.segment_s:g} s at {rate_hz:g} Hz."
         )
     return Layout(
+        grid=grid,
         starts=np.arange(*slices) * transform.hop - transform.m_num_mid,
-        window=np.asarray(transform.win, dtype=np.float64),
-        omega=np.asarray(2.0 * np.pi * hz[chosen]),
+        window=window,
         bins=np.flatnonzero(chosen),
-        rate_hz=rate_hz,
-        count=grid.count,
-        transform=transform,
-        slices=slices,
     )
 
 
@@ -189,10 +188,12 @@ class Sums:
 def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
     """Sum the spectra of one excitation (`Layout.spectra`, shape (k, f)) over its segments."""
     # Phase from a common instant, in which the noise of two segments correlates by their overlap.
-    aligned = command * np.exp(-1j * np.outer(where.starts / where.rate_hz, where.omega))
-    power = float(where.window @ where.window)
-    windows = [where.measured(i) for i in range(len(where.starts))]
-    segments, spread = 0.0, np.zeros(len(where.omega))
+    turn = np.exp(-1j * np.outer(where.starts / where.grid.rate_hz, where.omega))
+    aligned, power = command * turn, float(where.window @ where.window)
+    # The windows are zero in the padding.
+    samples = where.starts[:, None] + np.arange(len(where.window))
+    windows = np.where((samples >= 0) & (samples < where.grid.count), where.window, 0.0)
+    segments, spread = 0.0, np.zeros(len(where.bins))
     for i, start in enumerate(where.starts):
         own = float(windows[i] @ windows[i]) / power
         segments += own
@@ -216,8 +217,7 @@ def estimate_averaged(
     parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
     """H1 over the segments of all repeats, one log each (`JointLog.cut`)."""
-    each: list[Sums] = []
-    padded = []
+    each, padded = [], []
     for part in parts:
         column = part.column(joint)
         grid = grid_over(part.time, rate_hz)
@@ -249,26 +249,15 @@ def estimate_averaged(
 class H1Operator:
     """Linear map from the positions of one excitation to its response.
 
-    On the analysis grid it is the sum over segments of `scale * transform(window * segment)`, the
-    mean of the segment taken away; samples beyond the ends repeat the first and the last.
+    On the analysis grid it is the sum over segments of `scale * transform(window * segment)`
+    (`Layout.spectra`).
     """
 
-    omega: Array
-    """[rad/s], shape (f,)."""
     time: Array
     """Measured timestamps of the log it was built for [s], shape (n,)."""
-    grid: Grid
-    """The analysis grid."""
-    starts: NDArray[np.intp]
-    """First sample of each segment, increasing, shape (k,)."""
-    window: Array
-    """Shape (samples,)."""
-    bins: NDArray[np.intp]
-    """Numbers of the frequencies in the transform of a segment, shape (f,)."""
-    scale: ComplexArray
-    """What the transform of each segment counts in the response, shape (k, f)."""
-    excitation: Array
-    """Sum of |U|^2: the weight of this excitation among repeats, shape (f,)."""
+    layout: Layout
+    command: ComplexArray
+    """Transforms of the command, shape (k, f)."""
 
     @classmethod
     def build(
@@ -282,43 +271,36 @@ class H1Operator:
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
         where = layout(grid, estimator, padded=rests(held, grid.rate_hz))
-        return cls.of(
-            time,
-            grid,
-            where.spectra(held),
-            omega=where.omega,
-            starts=where.starts,
-            window=where.window,
-            bins=where.bins,
-        )
-
-    @classmethod
-    def of(cls, time: Array, grid: Grid, excited: ComplexArray, **layout: Any) -> H1Operator:
-        """Make the map from the transforms of the command, shape (k, f), and the other fields."""
-        uu = np.asarray((np.abs(excited) ** 2).sum(axis=0))
-        scale = np.conj(excited) / (np.maximum(uu, _TINY) * hold(layout["omega"], grid.rate_hz))
-        times = np.asarray(time, dtype=np.float64)
-        return cls(time=times, grid=grid, scale=scale, excitation=uu, **layout)
+        return cls(time=time, layout=where, command=where.spectra(held))
 
     @property
-    def _padding(self) -> tuple[int, int]:
-        """Samples that segments reach over the first and over the last."""
-        last = int(self.starts[-1]) + len(self.window)
-        return max(0, -int(self.starts[0])), max(0, last - self.grid.count)
+    def omega(self) -> Array:
+        """[rad/s], shape (f,)."""
+        return self.layout.omega
+
+    @property
+    def excitation(self) -> Array:
+        """Sum of |U|^2: the weight of this excitation among repeats, shape (f,)."""
+        return np.asarray((np.abs(self.command) ** 2).sum(axis=0))
+
+    @cached_property
+    def scale(self) -> ComplexArray:
+        """What the transform of each segment counts in the response, shape (k, f)."""
+        factor = hold(self.omega, self.layout.grid.rate_hz)
+        return np.conj(self.command) / (np.maximum(self.excitation, _TINY) * factor)
 
     def weights(self, chosen: Mask | slice = slice(None)) -> ComplexArray:
         """Map from positions on the grid to the chosen frequencies, shape (grid.count, chosen)."""
-        samples = np.arange(len(self.window))
+        where, samples = self.layout, np.arange(len(self.layout.window))
         turn = np.exp(-2j * np.pi * samples / len(samples))
-        kernel = self.window[:, None] * turn[np.outer(samples, self.bins[chosen]) % len(samples)]
+        kernel = where.window[:, None] * turn[np.outer(samples, where.bins[chosen]) % len(samples)]
         # Taking the mean of a segment away is taking the mean of the kernel away.
         kernel -= kernel.mean(axis=0)
         # Padding repeats the first and last sample; its weights gather on them.
-        before, after = self._padding
-        count = self.grid.count
+        (before, after), count = where.padding, where.grid.count
         spread = np.zeros((before + count + after, kernel.shape[1]), dtype=np.complex128)
         term = np.empty_like(kernel)
-        for start, row in zip(self.starts + before, self.scale[:, chosen], strict=True):
+        for start, row in zip(where.starts + before, self.scale[:, chosen], strict=True):
             spread[start : start + len(kernel)] += np.multiply(kernel, row, out=term)
         out = spread[before : before + count]
         out[0] += spread[:before].sum(axis=0)
@@ -332,18 +314,13 @@ class H1Operator:
         interpolation onto the analysis grid is included. LogError if they do not span the
         excitation.
         """
-        return pull_back(
-            self.weights(chosen), np.asarray(sample_times, dtype=np.float64), self.grid
-        )
+        return pull_back(self.weights(chosen), sample_times, self.layout.grid)
 
     def response(self, sample_times: Array, position: Array) -> ComplexArray:
         """`position @ matrix(sample_times)`, shape (f,), by transforms: faster for a few positions.
 
         Shapes (m,); LogError as of `matrix`.
         """
-        require_span(sample_times, self.grid)
-        values = np.pad(interpolate(sample_times, position, self.grid), self._padding, mode="edge")
-        first = self.starts + self._padding[0]
-        parts = sliding_window_view(values, len(self.window))[first]
-        parts = (parts - parts.mean(axis=1, keepdims=True)) * self.window
-        return np.asarray((self.scale * fft.rfft(parts)[:, self.bins]).sum(axis=0))
+        require_span(sample_times, self.layout.grid)
+        found = self.layout.spectra(interpolate(sample_times, position, self.layout.grid))
+        return np.asarray((self.scale * found).sum(axis=0))

@@ -11,19 +11,18 @@ own frequency, and at three times it, after the joint has settled.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import get_window
 
 from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.response.grid import Grid, held_mean, hold, interpolate
-from pronk.response.h1 import H1Operator
+from pronk.response.grid import Grid, grid_over, held_mean, hold, interpolate
+from pronk.response.h1 import H1Operator, Layout
 from pronk.response.response import Estimator, FrequencyResponse
 
 _EXCITED = 0.02
@@ -59,40 +58,22 @@ class Spectra:
     """Shape (p, f)."""
     factor: ComplexArray
     """Grid factor of each line (`grid.hold`), shape (f,)."""
-    third: Array
-    """Position at three times a step's frequency over that at it, shape (f,); else NaN."""
+    third: Array = field(default_factory=lambda: np.empty(0))
+    """Of steps: position at three times the frequency over that at it, shape (f,)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Lines:
-    """The excited lines of a periodic command, over its steady periods."""
-
-    grid: Grid
-    samples: int
-    """Samples in a period."""
-    numbers: NDArray[np.intp]
-    """Of the lines; 1 is the inverse of the period."""
-    command: ComplexArray
-    """Shape (p, lines)."""
-
-    @property
-    def omega(self) -> Array:
-        return np.asarray(2.0 * np.pi * self.numbers * self.grid.rate_hz / self.samples)
-
-
-def _lines(
+def _periods(
     time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
-) -> _Lines:
-    """Find the periods that count and the lines excited in them.
+) -> tuple[Layout, ComplexArray]:
+    """Lay a segment over each period that counts; also the command at the lines excited in them.
 
     The periods are those in which the command repeats the period before; ramps fall out by
     themselves, and the first steady period is dropped as the transient.
     """
     samples = max(round(period_s * rate_hz), 1)
     fine = samples / period_s
-    count = int(np.floor((time[-1] - time[0]) * fine + 0.01)) + 1
-    start = float(time[0])
-    held = held_mean(time, command, Grid(start=start, rate_hz=fine, count=count).edges)
+    whole = grid_over(time, fine)
+    held = held_mean(time, command, whole.edges)
     first, stop = _steady_periods(held, samples)
     if stop - first < 3:
         raise LogError(
@@ -100,7 +81,9 @@ def _lines(
             f"{time[-1] - time[0]:.2f} s; 3 equal periods are needed (1 to settle, 2 to compare)."
         )
     grid = Grid(
-        start=start + (first + 1) * period_s, rate_hz=fine, count=(stop - first - 1) * samples
+        start=whole.start + (first + 1) * period_s,
+        rate_hz=fine,
+        count=(stop - first - 1) * samples,
     )
     numbers = np.arange(1, samples // 2)
     hz = numbers * fine / samples
@@ -110,14 +93,16 @@ def _lines(
             f"a signal of period {period_s:g} s has no line between {estimator.min_hz:g} and "
             f"{estimator.top_hz(fine):g} Hz."
         )
-    u = _at_lines(held_mean(time, command, grid.edges), samples, numbers)
+    where = Layout(
+        grid=grid,
+        starts=np.arange(0, grid.count, samples),
+        window=np.full(samples, 1.0 / samples),
+        bins=numbers,
+    )
+    u = where.spectra(held_mean(time, command, grid.edges))
     size = np.abs(u).mean(axis=0)
     excited = size >= _EXCITED * size.max()
-    return _Lines(grid=grid, samples=samples, numbers=numbers[excited], command=u[:, excited])
-
-
-def _at_lines(values: Array, samples: int, numbers: NDArray[np.intp]) -> ComplexArray:
-    return np.asarray(np.fft.rfft(values.reshape(-1, samples), axis=1)[:, numbers] / samples)
+    return replace(where, bins=numbers[excited]), u[:, excited]
 
 
 def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
@@ -147,14 +132,13 @@ def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float
             "name it, or call the segment `unknown` to have it averaged by segments."
         )
     column = log.column(joint)
-    found = _lines(log.time, log.command[:, column], period, estimator, rate_hz)
-    position = interpolate(log.time, log.position[:, column], found.grid)
+    where, command = _periods(log.time, log.command[:, column], period, estimator, rate_hz)
+    position = interpolate(log.time, log.position[:, column], where.grid)
     return Spectra(
-        omega=found.omega,
-        command=found.command,
-        position=_at_lines(position, found.samples, found.numbers),
-        factor=hold(found.omega, found.grid.rate_hz),
-        third=np.full(len(found.omega), np.nan),
+        omega=where.omega,
+        command=command,
+        position=where.spectra(position),
+        factor=hold(where.omega, where.grid.rate_hz),
     )
 
 
@@ -162,17 +146,8 @@ def multisine_operator(
     time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
 ) -> H1Operator:
     """`estimate_periodic` of one multisine as a matrix, for a fixed command."""
-    found = _lines(time, command, period_s, estimator, rate_hz)
-    samples = found.samples
-    return H1Operator.of(
-        time,
-        found.grid,
-        found.command,
-        omega=found.omega,
-        starts=samples * np.arange(len(found.command)),
-        window=np.full(samples, 1.0 / samples),
-        bins=found.numbers,
-    )
+    where, u = _periods(time, command, period_s, estimator, rate_hz)
+    return H1Operator(time=time, layout=where, command=u)
 
 
 def _runs(frequency: Array) -> list[tuple[int, int]]:
