@@ -57,7 +57,7 @@ class SweepPlan:
     damping: Array
     """Gains on the drives [N m s/rad], shape (joints,)."""
     uncertainty: Uncertainty
-    forecasts: tuple[Forecast, ...]
+    forecasts: tuple[Forecast, ...] = ()
     """Worst case of the loudest excitation of each joint, for it and its neighbours, over every
     corner of the uncertainty; quieter ones of the same signal stay inside."""
 
@@ -126,10 +126,9 @@ class SweepPlan:
         fits, too_much = 0.0, 1.0
         for _ in range(_BISECTIONS):
             share = 0.5 * (fits + too_much)
-            quieter = replace(excitation, signal=excitation.signal.scaled(share))
-            gains = (self.stiffness, self.damping)
-            ends = _forecasts(self.robot, quieter, self.rate_hz, *gains, self.uncertainty, {})
-            if any(f.breaches() for f in ends):
+            amplitude = share * excitation.signal.amplitude
+            quieter = replace(excitation, signal=replace(excitation.signal, amplitude=amplitude))
+            if any(f.breaches() for f in self._worst(quieter, {})):
                 too_much = share
             else:
                 fits = share
@@ -137,6 +136,37 @@ class SweepPlan:
         # Three significant digits.
         scale = 10.0 ** (np.floor(np.log10(amplitude or 1.0)) - 2)
         return float(np.floor(amplitude / scale * (1.0 + 1e-12)) * scale)
+
+    def _worst(
+        self, excitation: Excitation, cache: dict[tuple[object, ...], list[Forecast]]
+    ) -> list[Forecast]:
+        """Forecasts of every joint of the chain; mirror-image legs are simulated once."""
+        robot, joint = self.robot, self.robot.joint(excitation.joint)
+        original, sign = joint.original
+        own = joint.chain or (joint.name,)
+        firsts = robot.joint(original).chain or (original,)
+        columns = [robot.joint_names.index(name) for name in own]
+        stiffness, damping = (
+            dict(zip(firsts, gains[columns].tolist(), strict=True))
+            for gains in (self.stiffness, self.damping)
+        )
+        offsets = sign * robot.joint(original).original[1] * excitation.offsets(self.rate_hz)
+        key = original, str((stiffness, damping)), offsets.tobytes()
+        if key not in cache:
+            cache[key] = forecast(
+                robot,
+                original,
+                offsets,
+                rate_hz=self.rate_hz,
+                stiffness=stiffness,
+                damping=damping,
+                uncertainty=self.uncertainty,
+            )
+        names = dict(zip(firsts, own, strict=True))
+        return [
+            replace(found.mirrored(robot, names[found.joint]), excited=excitation.joint)
+            for found in cache[key]
+        ]
 
 
 def make_plan(
@@ -194,63 +224,15 @@ def make_plan(
         for amplitude, count in dict(times).items()
         for repeat in range(count)
     )
-    rate, unsure = robot.policy_rate_hz, uncertainty or Uncertainty()
-    cache: dict[str, list[Forecast]] = {}
-    forecasts = [
-        f
-        for each in excitations
-        if each.repeat == 0 and each.signal.amplitude == max(amplitudes)
-        for f in _forecasts(robot, each, rate, kp, kd, unsure, cache)
-    ]
-    return SweepPlan(
+    plan = SweepPlan(
         robot=robot,
         excitations=excitations,
-        rate_hz=rate,
+        rate_hz=robot.policy_rate_hz,
         settle_s=settle_s,
         stiffness=kp,
         damping=kd,
-        uncertainty=unsure,
-        forecasts=tuple(forecasts),
+        uncertainty=uncertainty or Uncertainty(),
     )
-
-
-def _forecasts(
-    robot: RobotSpec,
-    excitation: Excitation,
-    rate_hz: float,
-    stiffness: Array,
-    damping: Array,
-    uncertainty: Uncertainty,
-    cache: dict[str, list[Forecast]],
-) -> list[Forecast]:
-    """Forecasts of every joint of the chain; mirror-image legs are simulated once."""
-    joint = robot.joint(excitation.joint)
-    original, mirrored = joint.original
-    own = joint.chain or (joint.name,)
-    firsts = robot.joint(original).chain or (original,)
-    signs = [
-        robot.joint(name).original[1] * robot.joint(first).original[1]
-        for name, first in zip(own, firsts, strict=True)
-    ]
-    names = robot.joint_names
-    kp, kd = (
-        {first: float(g[names.index(name)]) for name, first in zip(own, firsts, strict=True)}
-        for g in (stiffness, damping)
-    )
-    sign = mirrored * robot.joint(original).original[1]
-    offsets = sign * excitation.offsets(rate_hz)
-    key = f"{original} {kp} {kd} {offsets.tobytes().hex()}"
-    if key not in cache:
-        cache[key] = forecast(
-            robot,
-            original,
-            offsets,
-            rate_hz=rate_hz,
-            stiffness=kp,
-            damping=kd,
-            uncertainty=uncertainty,
-        )
-    back = {first: (name, s) for name, first, s in zip(own, firsts, signs, strict=True)}
-    return [
-        replace(f.mirrored(robot, *back[f.joint]), excited=excitation.joint) for f in cache[key]
-    ]
+    cache: dict[tuple[object, ...], list[Forecast]] = {}
+    loudest = [e for e in excitations if e.repeat == 0 and e.signal.amplitude == max(amplitudes)]
+    return replace(plan, forecasts=tuple(f for e in loudest for f in plan._worst(e, cache)))

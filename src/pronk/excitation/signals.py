@@ -7,8 +7,8 @@ tick. Every signal is ramped in and out by half a cosine and its last sample is 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -76,9 +76,9 @@ class Signal(ABC):
         """Time from the first tick to the end of the last one [s]."""
         return len(self.frequency(rate_hz)) / rate_hz
 
-    def scaled(self, share: float) -> Self:
-        """The same signal with this share of the amplitude."""
-        return replace(self, amplitude=share * self.amplitude)
+    def _ramp(self, rate_hz: float) -> int:
+        """Ticks in a ramp."""
+        return round(self.ramp_s * rate_hz)
 
     def _ordered(self, low: float, high: float) -> None:
         if not (np.isfinite(low) and np.isfinite(high) and 0.0 < low < high):
@@ -133,7 +133,7 @@ class Chirp(Signal):
         # Integral of the frequency. A sine: it begins at zero.
         cycles = self._cycles(time / self.length_s) * self.length_s
         wave = np.sin(2.0 * np.pi * cycles)
-        return np.asarray(self.amplitude * wave * ramps(len(time), round(self.ramp_s * rate_hz)))
+        return np.asarray(self.amplitude * wave * ramps(len(time), self._ramp(rate_hz)))
 
     def _cycles(self, share: Array) -> Array:
         """Integral of the frequency over the share of the length [Hz]."""
@@ -224,19 +224,19 @@ class Multisine(Signal):
         """Period between the ramps [s]."""
         return self.length_s
 
-    def _ticks(self, rate_hz: float) -> tuple[int, int]:
-        """Ticks in a period and in a ramp."""
+    def _period(self, rate_hz: float) -> int:
+        """Ticks in a period."""
         exact = self.length_s * rate_hz
         if abs(exact - round(exact)) > 1e-6:
             raise PlanError(
                 f"Multisine.length_s is {self.length_s} s, {exact:.3f} ticks at {rate_hz:g} Hz; "
                 f"a period must be whole ticks, for instance {round(exact) / rate_hz:g} s."
             )
-        return round(exact), round(self.ramp_s * rate_hz)
+        return round(exact)
 
     def one_period(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """One period at the ticks, scaled to the amplitude [rad], shape (length_s * rate_hz,)."""
-        ticks, _ = self._ticks(rate_hz)
+        ticks = self._period(rate_hz)
         numbers = np.array(self.harmonic_numbers)
         if 2 * numbers[-1] >= ticks:
             raise PlanError(
@@ -254,16 +254,15 @@ class Multisine(Signal):
         return np.asarray(self.amplitude * best / np.abs(best).max())
 
     def _samples(self, rate_hz: float) -> Array:
-        ticks, ramp = self._ticks(rate_hz)
-        count = self.periods * ticks
+        period, ramp = self.one_period(rate_hz), self._ramp(rate_hz)
         # Run the period on into both ramps, so that no phase jumps where they meet.
-        index = np.arange(-ramp, count + max(ramp, 1)) % ticks
-        return np.asarray(self.one_period(rate_hz)[index] * ramps(len(index), ramp))
+        index = np.arange(-ramp, len(self.frequency(rate_hz)) - ramp) % len(period)
+        return np.asarray(period[index] * ramps(len(index), ramp))
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
-        ticks, ramp = self._ticks(rate_hz)
-        return np.full(self.periods * ticks + ramp + max(ramp, 1), np.nan)
+        ramp = self._ramp(rate_hz)
+        return np.full(self.periods * self._period(rate_hz) + ramp + max(ramp, 1), np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +308,7 @@ class SineSteps(Signal):
                 f"SineSteps goes up to {max(self.frequencies_hz):g} Hz, but commands at "
                 f"{rate_hz:g} Hz stay below {0.5 * rate_hz:g} Hz; lower the highest frequency."
             )
-        windows, tick = [], round(self.ramp_s * rate_hz)
+        windows, tick = [], self._ramp(rate_hz)
         for wanted in self.frequencies_hz:
             cycles = max(self.measure_cycles, int(np.ceil(self.measure_s * wanted)))
             measured = round(cycles * rate_hz / wanted)
@@ -321,10 +320,8 @@ class SineSteps(Signal):
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
-        windows = self.windows(rate_hz)
-        ramp = round(self.ramp_s * rate_hz)
-        frequency = np.full(windows[-1][1] + max(ramp, 1), np.nan)
-        begin = ramp
+        windows, begin = self.windows(rate_hz), self._ramp(rate_hz)
+        frequency = np.full(windows[-1][1] + max(begin, 1), np.nan)
         for _, end, exact in windows:
             frequency[begin:end] = exact
             begin = end
@@ -336,5 +333,5 @@ class SineSteps(Signal):
         frequency[: windows[0][0]] = windows[0][2]
         frequency[windows[-1][1] :] = windows[-1][2]
         turns = np.concatenate(([0.0], np.cumsum(frequency)[:-1] / rate_hz))
-        window = ramps(len(turns), round(self.ramp_s * rate_hz))
-        return np.asarray(self.amplitude * np.sin(2.0 * np.pi * turns) * window)
+        wave = np.sin(2.0 * np.pi * turns)
+        return np.asarray(self.amplitude * wave * ramps(len(wave), self._ramp(rate_hz)))

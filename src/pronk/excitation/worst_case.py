@@ -101,10 +101,11 @@ class Forecast:
             )
         return found
 
-    def mirrored(self, robot: RobotSpec, joint: str, sign: float) -> Forecast:
-        """The same for the joint that mirrors this one, `sign` between their coordinates."""
-        ends = sorted((sign * self.lowest, sign * self.highest))
+    def mirrored(self, robot: RobotSpec, joint: str) -> Forecast:
+        """The same for a joint that mirrors this one."""
         own = robot.joint(joint)
+        sign = own.original[1] * robot.joint(self.joint).original[1]
+        ends = sorted((sign * self.lowest, sign * self.highest))
         return replace(self, joint=joint, lowest=ends[0], highest=ends[1], range=own.range)
 
 

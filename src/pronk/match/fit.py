@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -34,13 +35,10 @@ class Problem(ABC):
         *,
         refitted: Collection[str] = (),
     ) -> None:
-        """Choose what is searched.
+        """Choose what is searched: the `fitted` parameters, from where `start` has them, by joint.
 
-        Args:
-            start: Parameters by joint; of the fitted ones, where to begin.
-            fitted: Names of the parameters to fit, by joint.
-            refitted: Joints whose values come from an earlier fit; published values may be a bad
-                place to begin (`Parameter.start`).
+        Published values may be a bad place to begin (`Parameter.start`); those of the `refitted`
+        joints come from an earlier fit.
         """
         self.start = start
         self.slots = [(joint, name) for joint, names in fitted.items() for name in names]
@@ -50,9 +48,8 @@ class Problem(ABC):
         self.high = np.array([kind.scaled(kind.high) for kind in kinds])
         begin = []
         for (joint, name), kind in zip(self.slots, kinds, strict=True):
-            value = start[joint][name]
             least = kind.low if joint in refitted else max(kind.start, kind.low)
-            begin.append(kind.scaled(max(value, least)))
+            begin.append(kind.scaled(max(start[joint][name], least)))
         margin = 1e-3 * (self.high - self.low)
         self.begin: Array = np.clip(begin, self.low + margin, self.high - margin)
 
@@ -70,6 +67,32 @@ class Problem(ABC):
     @abstractmethod
     def jacobian(self, x: Array) -> Array:
         """Derivative of `residual`, shape (m, p)."""
+
+
+class CachedProblem(Problem):
+    """A problem whose residual and Jacobian are found together, once for each point."""
+
+    @cached_property
+    def known(self) -> dict[bytes, tuple[Array, Array]]:
+        """Residual and Jacobian by the bytes of a point."""
+        return {}
+
+    @abstractmethod
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Find residual and Jacobian."""
+
+    def residual(self, x: Array) -> Array:
+        """Weighted simulated less measured values, shape (m,)."""
+        return self._both(x)[0]
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivative of `residual`, shape (m, p)."""
+        return self._both(x)[1]
+
+    def _both(self, x: Array) -> tuple[Array, Array]:
+        if x.tobytes() not in self.known:
+            self.known[x.tobytes()] = self.evaluate(x)
+        return self.known[x.tobytes()]
 
 
 @dataclass(frozen=True, kw_only=True)

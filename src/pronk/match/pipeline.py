@@ -590,7 +590,7 @@ def _time_flags(fit: TimeFit) -> Iterator[str]:
                 f"{name} is not identified (deviation {fit.estimate.sd[name]:.2g}); "
                 f"{PARAMETERS[name].remedy}"
             )
-    if not fit.settled:
+    if not fit.solution.settled:
         yield "the fit in time did not settle"
     yield from amplitude_flags(fit.amplitude_gains)
 

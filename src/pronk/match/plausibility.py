@@ -545,16 +545,15 @@ def response_test(fit: TimeFit, robot: RobotSpec) -> tuple[float, float, float] 
     problem, solution = fit.problem, fit.solution
     if "damping" not in problem.fitted:
         return None
-    joint, drive = robot.joint(problem.records[0].trace.joint), problem.drive(solution.x)
+    joint, drive = robot.joint(problem.simulations.joint), problem.drive(solution.x)
     armature = max(joint.drive.armature, 1e-4)
     inertia, gravity = bench_inertia(robot, joint.original[0])
     top_hz = min(1.5 * joint.band_hz[1], HIGHEST_HZ)
-    repeats = [repeat for one in problem.records for repeat in one.repeats]
     changes = np.column_stack([solution.residual, solution.jacobian])
-    parts = np.split(changes, np.cumsum([len(repeat.time) for repeat in repeats])[:-1])
+    parts = np.split(changes, np.cumsum([len(repeat.time) for repeat in problem.repeats])[:-1])
     rows, names = [], ["scale", "compliance", "armature", "stiffness"]
     names += [name for name in problem.fitted if name not in names]
-    for repeat, own in zip(repeats, parts, strict=True):
+    for repeat, own in zip(problem.repeats, parts, strict=True):
         columns = [*(own / repeat.weight[:, None]).T, repeat.position]
         spectra = _transformed(repeat.time, columns, top_hz)
         s, residual, *fitted, q = spectra[:, : spectra.shape[1] // GROUP * GROUP]
@@ -603,7 +602,7 @@ def _counted(logs: Sequence[JointLog], joint: str) -> bool:
 
 def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Iterator[Finding]:
     """What the response says of scale, filters, delay and gains; a torque column says it better."""
-    values, joint = fit.estimate.values, fit.problem.records[0].trace.joint
+    values, joint = fit.estimate.values, fit.problem.simulations.joint
     # Logs of 100 Hz may have their commands a sample late.
     if values["delay"] < -1.0 / min(log.rate_hz for log in logs):
         yield Finding(

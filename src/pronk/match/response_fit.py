@@ -13,7 +13,7 @@ import numpy as np
 
 from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError
-from pronk.match.fit import Problem, Solution, solve_together
+from pronk.match.fit import CachedProblem, Solution, solve_together
 from pronk.match.identifiability import bench_experiment, require_identifiable
 from pronk.match.measured_joint import DB, MeasuredJoint, Pair, rms
 from pronk.match.parameters import GAINS, PARAMETERS
@@ -28,7 +28,7 @@ _NOISE_MIN = 0.01
 """Least standard deviation of the log response to plan with: no model is better than 1 %."""
 
 
-class ResponseProblem(Problem):
+class ResponseProblem(CachedProblem):
     """Weighted gain of one joint's simulated response over the measured one, by its gains."""
 
     def __init__(
@@ -50,7 +50,6 @@ class ResponseProblem(Problem):
         self.low, self.high = np.full(2, -np.inf), np.full(2, np.inf)
         self.goal, self._rigs, self._linear, self._correction = goal, rigs, linear, correction
         self._steps = np.array([PARAMETERS[name].step for name in GAINS])
-        self._cache: dict[bytes, tuple[Array, Array]] = {}
 
     def requests(self, x: Array) -> list[SimRequest]:
         """What to simulate for residual and Jacobian at a point."""
@@ -59,8 +58,8 @@ class ResponseProblem(Problem):
         points = np.exp([x] if self._linear else [x, *(x + np.diag(self._steps))])
         return [SimRequest(self.goal, *pair) for pair in points.tolist()]
 
-    def take(self, x: Array, simulated: Sequence[ComplexArray]) -> None:
-        """Make residual and Jacobian at a point of the responses to `requests`."""
+    def compared(self, x: Array, simulated: Sequence[ComplexArray]) -> tuple[Array, Array]:
+        """Residual and Jacobian at a point, shapes (m,) and (m, 2), of responses to `requests`."""
         deviation, amplitude = self.goal.deviation_db(), self.goal.trace.amplitude
         if self._linear and self._correction is not None:
             closed = self._linear.response(*np.exp(x), amplitude=amplitude)
@@ -71,30 +70,19 @@ class ResponseProblem(Problem):
             jacobian = DB * slope / deviation[:, None]
         else:
             jacobian = (weighted[1:] - weighted[0]).T / self._steps
-        self._cache[x.tobytes()] = weighted[0], jacobian
+        return weighted[0], jacobian
 
-    def residual(self, x: Array) -> Array:
-        """Weighted gain of the simulated over the measured response, shape (m,)."""
-        return self._at(x)[0]
-
-    def jacobian(self, x: Array) -> Array:
-        """Derivative of `residual` by forward differences, shape (m, 2)."""
-        return self._at(x)[1]
-
-    def _at(self, x: Array) -> tuple[Array, Array]:
-        if x.tobytes() not in self._cache:
-            evaluate(self._rigs, [(self, x)])
-        return self._cache[x.tobytes()]
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Find residual and Jacobian."""
+        return self.compared(x, responses(self._rigs, self.requests(x)))
 
 
 def evaluate(rigs: JointRigs, points: Sequence[tuple[ResponseProblem, Array]]) -> None:
     """Simulate all problems at their points in one go."""
     requests = [problem.requests(x) for problem, x in points]
-    simulated = responses(rigs, [one for own in requests for one in own])
-    first = 0
+    simulated = iter(responses(rigs, [one for own in requests for one in own]))
     for (problem, x), own in zip(points, requests, strict=True):
-        problem.take(x, simulated[first : first + len(own)])
-        first += len(own)
+        problem.known[x.tobytes()] = problem.compared(x, [next(simulated) for _ in own])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,9 @@ delay. The result is fitted to everything.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +25,14 @@ from scipy.interpolate import CubicSpline
 
 from pronk.arrays import Array, Mask
 from pronk.logs.joint_log import JointLog
-from pronk.match.fit import Problem, Solution, solve_together
+from pronk.match.fit import CachedProblem, Solution, solve_together
 from pronk.match.parameters import GAINS, PARAMETERS
+from pronk.match.simulated import grouped
 from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import excitations
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs
-
-Masks = Sequence[Sequence[Mask]]
-"""Samples of each repeat of each excitation."""
 
 TIME_FIT = ("stiffness", "damping", "frictionloss", "delay")
 """What is fitted where the armature is known."""
@@ -52,9 +50,14 @@ _OVERSAMPLED = 2.0
 """Samples a physics step from which on only some of them are used."""
 
 
-class Repeat(NamedTuple):
-    """One recording of a command."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Repeat:
+    """One recording of a command to a joint."""
 
+    trace: CommandTrace
+    """The command, that of the first repeat."""
+    excitation: int
+    """Number of the command, from 0; repeats have the same."""
     time: Array
     """Timestamps after the first step of the command [s], shape (n,)."""
     position: Array
@@ -62,20 +65,14 @@ class Repeat(NamedTuple):
     weight: Array
     """Of each residual [1/rad], shape (n,)."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """One command to one joint, and what its repeats recorded."""
-
-    trace: CommandTrace
-    amplitude: float
-    """[rad]"""
-    repeats: tuple[Repeat, ...]
-
-    def at(self, time: Array, delay: float) -> Array:
-        """Instants of the simulation that some timestamps show with a delay [s], shape (n,)."""
+    def at(self, mask: Mask, delay: float) -> Array:
+        """Instants of the simulation that some timestamps show with a delay [s]."""
         last = (len(self.trace.command) - 1) * self.trace.timestep
-        return np.clip(time - delay, 0.0, last)
+        return np.clip(self.time[mask] - delay, 0.0, last)
+
+    def part(self) -> NDArray[np.int64]:
+        """Number of the part of the excitation that each sample is in, shape (n,)."""
+        return (_BLOCKS * np.arange(len(self.time)) // len(self.time)).astype(np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +88,6 @@ class TimeFit:
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
     held_out: Mapping[str, float]
     """RMSE [rad] on what was kept aside: `nominal`, `nominal_delayed`, `plain`, `matched`."""
-    settled: bool
     at_bound: tuple[str, ...]
     """Fitted parameters that ended at a bound of the search."""
     problem: TimeProblem
@@ -100,62 +96,59 @@ class TimeFit:
     """Its optimum, with residuals and Jacobian."""
 
 
-def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Recorded]:
+def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Repeat]:
     """Every excitation of one joint in some logs, repeats together, largest amplitude first.
 
     Raises:
         LogError: The joint was not excited, or its unit is not radians.
     """
-    found: list[Recorded] = []
-    for log in logs:
-        for part in (part for group in excitations(log, joint) for part in group):
-            trace = command_trace(part, part.segments[0], joint, robot)
-            repeat = _repeat(part, trace)
-            for i, known in enumerate(found):
-                if known.trace.same_as(trace, robot):
-                    found[i] = replace(known, repeats=(*known.repeats, repeat))
-                    break
-            else:
-                amplitude = part.segments[0].amplitude
-                found.append(Recorded(trace=trace, amplitude=amplitude, repeats=(repeat,)))
-    return sorted(found, key=lambda one: -one.amplitude)
-
-
-def _repeat(part: JointLog, trace: CommandTrace) -> Repeat:
-    """Samples of one excitation, with the weight of each."""
-    every = max(1, int(part.rate_hz * trace.timestep / _OVERSAMPLED + 1e-6))
-    inside = np.flatnonzero((part.time >= trace.time[0]) & (part.time <= trace.time[-1]))[::every]
-    weight = np.full(len(inside), 1.0 / part.segments[0].amplitude)
-    if part.frequency is not None:
-        # Between excitations the joint is at rest, which holds nothing of its dynamics.
-        hz = np.nan_to_num(part.frequency[inside], nan=np.inf)
-        weight = weight / np.sqrt(np.maximum(hz, _LOWEST_HZ))
-    return Repeat(
-        time=part.time[inside] - trace.start,
-        position=part.position[inside, part.column(trace.joint)],
-        weight=weight,
-    )
+    parts = [part for log in logs for group in excitations(log, joint) for part in group]
+    pairs = [(part, command_trace(part, part.segments[0], joint, robot)) for part in parts]
+    groups = grouped(pairs, lambda one, other: one[1].same_as(other[1], robot))
+    groups.sort(key=lambda group: -group[0][1].amplitude)
+    found = []
+    for number, group in enumerate(groups):
+        for part, trace in group:
+            every = max(1, int(part.rate_hz * trace.timestep / _OVERSAMPLED + 1e-6))
+            during = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
+            inside = np.flatnonzero(during)[::every]
+            weight = np.full(len(inside), 1.0 / trace.amplitude)
+            if part.frequency is not None:
+                # Between excitations the joint is at rest, which holds nothing of its dynamics.
+                hz = np.nan_to_num(part.frequency[inside], nan=np.inf)
+                weight = weight / np.sqrt(np.maximum(hz, _LOWEST_HZ))
+            found.append(
+                Repeat(
+                    trace=group[0][1],
+                    excitation=number,
+                    time=part.time[inside] - trace.start,
+                    position=part.position[inside, part.column(joint)],
+                    weight=weight,
+                )
+            )
+    return found
 
 
 class Simulations:
     """What was recorded of one joint, and its simulations so far."""
 
-    def __init__(self, rigs: JointRigs, records: Sequence[Recorded]) -> None:
-        self.records = records
-        self.joint = records[0].trace.joint
+    def __init__(self, rigs: JointRigs, repeats: Sequence[Repeat]) -> None:
+        self.repeats, self.joint = repeats, repeats[0].trace.joint
+        self.traces = list({one.excitation: one.trace for one in repeats}.values())
+        """Commands by the number of the excitation."""
         self._rigs = rigs
         self._names = [n for n in PARAMETERS if n in rigs.parameters - {"delay"}]
         self._known: dict[tuple[float, ...], list[CubicSpline]] = {}
 
     def tracks(self, drives: Sequence[Mapping[str, float]]) -> list[list[CubicSpline]]:
-        """Position over time after the first step, of each drive and record, without delay [rad].
+        """Position over time after the first step, of each drive and command, without delay [rad].
 
         A joint begins at rest and does not change with time, so a delay of its command is the same
         delay of its position, and needs no simulation of its own. Pi where it diverged.
         """
         keys = [tuple(drive[name] for name in self._names) for drive in drives]
         if new := [key for key in dict.fromkeys(keys) if key not in self._known]:
-            rigs, traces = self._rigs, [one.trace for one in self.records]
+            rigs, traces = self._rigs, self.traces
             centre = traces[0].pose[rigs.robot.joint_names.index(self.joint)]
             sign = rigs.robot.joint(self.joint).original[1]
             values = dict(zip(self._names, np.repeat(new, len(traces), axis=0).T, strict=True))
@@ -172,84 +165,72 @@ class Simulations:
                 ]
         return [self._known[key] for key in keys]
 
-    def rmse(self, drive: Mapping[str, float], masks: Masks) -> float:
+    def rmse(self, drive: Mapping[str, float], masks: Sequence[Mask]) -> float:
         """Root mean square of simulated less measured position, each octave counting alike [rad].
 
-        Over some samples; the mean of each repeat is left out.
+        Over some samples of each repeat, the mean of which is left out.
         """
         squares, weights = 0.0, 0.0
-        for one, track, own in zip(self.records, self.tracks([drive])[0], masks, strict=True):
-            for repeat, mask in zip(one.repeats, own, strict=True):
-                if mask.any():
-                    at = one.at(repeat.time[mask], drive["delay"])
-                    wrong, weight = track(at) - repeat.position[mask], repeat.weight[mask] ** 2
-                    squares += float(weight @ (wrong - wrong.mean()) ** 2)
-                    weights += float(weight.sum())
+        (tracks,) = self.tracks([drive])
+        for one, mask in zip(self.repeats, masks, strict=True):
+            if mask.any():
+                simulated = tracks[one.excitation](one.at(mask, drive["delay"]))
+                wrong, weight = simulated - one.position[mask], one.weight[mask] ** 2
+                squares += float(weight @ (wrong - wrong.mean()) ** 2)
+                weights += float(weight.sum())
         return float(np.sqrt(squares / weights))
 
 
-class TimeProblem(Problem):
-    """Residuals of the drive of one joint in time."""
+class TimeProblem(CachedProblem):
+    """Residuals of the drive of one joint in time: weighted, less the mean of each repeat."""
 
     def __init__(
         self,
         simulations: Simulations,
         fitted: Sequence[str],
         start: Mapping[str, float],
-        masks: Masks | None = None,
+        masks: Sequence[Mask] = (),
     ) -> None:
-        """Fit some parameters; `start` has all of them, `masks` the samples used, all if None."""
+        """Fit some parameters.
+
+        `start` has all of them, `masks` the samples of each repeat, all if empty.
+        """
         joint = simulations.joint
         super().__init__({joint: start}, {joint: fitted}, refitted=(joint,))
-        self.simulations, self.records, self.fitted = simulations, simulations.records, fitted
-        self._masks = masks or [
-            [np.ones(len(repeat.time), dtype=bool) for repeat in one.repeats]
-            for one in self.records
-        ]
-        self._cache: dict[bytes, tuple[Array, Array]] = {}
+        self.simulations, self.repeats, self.fitted = simulations, simulations.repeats, fitted
+        self._masks = masks or [np.ones(len(one.time), dtype=bool) for one in self.repeats]
 
     def drive(self, x: Array) -> dict[str, float]:
         """All parameters of the joint that some searched numbers stand for."""
         return self.values(x)[self.simulations.joint]
 
-    def residual(self, x: Array) -> Array:
-        """Weighted simulated less measured position, means removed, shape (m,)."""
-        return self._at(x)[0]
-
-    def jacobian(self, x: Array) -> Array:
-        """Derivative of `residual`, by forward differences; of the delay exact, shape (m, p)."""
-        return self._at(x)[1]
-
-    def _at(self, x: Array) -> tuple[Array, Array]:
-        if x.tobytes() not in self._cache:
-            steps = np.array([PARAMETERS[name].step for name in self.fitted])
-            steps = np.where(x + steps <= self.high, steps, -steps)
-            moved = [i for i, name in enumerate(self.fitted) if name != "delay"]
-            points = [x, *(x + np.where(np.arange(len(x)) == i, steps, 0.0) for i in moved)]
-            tracks = self.simulations.tracks([self.drive(point) for point in points])
-            delay, rows, slopes = self.drive(x)["delay"], [], []
-            for n, (one, masks) in enumerate(zip(self.records, self._masks, strict=True)):
-                for repeat, mask in zip(one.repeats, masks, strict=True):
-                    if not mask.any():
-                        continue
-                    at = one.at(repeat.time[mask], delay)
-                    simulated = [track[n](at) for track in tracks]
-                    both = np.empty((1 + len(x), len(at)))
-                    both[0] = simulated[0] - repeat.position[mask]
-                    for i, row in zip(moved, simulated[1:], strict=True):
-                        both[1 + i] = (row - simulated[0]) / steps[i]
-                    if "delay" in self.fitted:
-                        both[1 + self.fitted.index("delay")] = -tracks[0][n](at, 1)
-                    both = (both - both.mean(axis=1, keepdims=True)) * repeat.weight[mask]
-                    rows.append(both[0])
-                    slopes.append(both[1:])
-            self._cache[x.tobytes()] = np.concatenate(rows), np.hstack(slopes).T
-        return self._cache[x.tobytes()]
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Residual and Jacobian, by forward differences but for the delay, whose is exact."""
+        steps = np.array([PARAMETERS[name].step for name in self.fitted])
+        steps = np.where(x + steps <= self.high, steps, -steps)
+        moved = [i for i, name in enumerate(self.fitted) if name != "delay"]
+        points = [x, *(x + np.where(np.arange(len(x)) == i, steps, 0.0) for i in moved)]
+        tracks = self.simulations.tracks([self.drive(point) for point in points])
+        delay, columns = self.drive(x)["delay"], []
+        for one, mask in zip(self.repeats, self._masks, strict=True):
+            if not mask.any():
+                continue
+            at, own = one.at(mask, delay), [track[one.excitation] for track in tracks]
+            simulated = own[0](at)
+            both = np.empty((1 + len(x), len(at)))
+            both[0] = simulated - one.position[mask]
+            for i, track in zip(moved, own[1:], strict=True):
+                both[1 + i] = (track(at) - simulated) / steps[i]
+            if "delay" in self.fitted:
+                both[1 + self.fitted.index("delay")] = -own[0](at, 1)
+            columns.append((both - both.mean(axis=1, keepdims=True)) * one.weight[mask])
+        residual, *slopes = np.hstack(columns)
+        return residual, np.array(slopes).T
 
 
 def fit_joint(
     rigs: JointRigs,
-    records: Sequence[Recorded],
+    repeats: Sequence[Repeat],
     fitted: Sequence[str],
     start: Mapping[str, float],
     nominal: Mapping[str, float],
@@ -260,8 +241,8 @@ def fit_joint(
     with the gains that were on it.
     """
     fitted = [n for n in fitted if n == "delay" or n in rigs.parameters]
-    kept, aside = _split(records)
-    simulations = Simulations(rigs, records)
+    kept = _kept(repeats)
+    simulations = Simulations(rigs, repeats)
 
     def fit(names: Sequence[str], begin: Mapping[str, float]) -> dict[str, float]:
         if not names:
@@ -276,6 +257,7 @@ def fit_joint(
         "plain": fit(plain, {**nominal, **{name: trained[name] for name in plain}}),
         "matched": trained,
     }
+    aside = [~mask for mask in kept]
     errors = {name: simulations.rmse(drive, aside) for name, drive in drives.items()}
     problem = TimeProblem(simulations, fitted, trained)
     solution = _solved(problem)
@@ -285,7 +267,6 @@ def fit_joint(
         total95=_total(problem, solution, found, by_amplitude),
         amplitude_gains=by_amplitude,
         held_out=errors,
-        settled=solution.settled,
         at_bound=tuple(n for n, at in zip(fitted, solution.at_bound, strict=True) if at),
         problem=problem,
         solution=solution,
@@ -296,39 +277,30 @@ def _solved(problem: TimeProblem) -> Solution:
     return solve_together([problem], tolerance=_SETTLED, longest=_LONGEST)[0]
 
 
-def _split(records: Sequence[Recorded]) -> tuple[list[list[Mask]], list[list[Mask]]]:
-    """Samples to fit and to keep aside: the last repeat, or every fourth part without repeats."""
-    kept = []
-    for one in records:
-        count = len(one.repeats)
-        if count > 1:
-            row = [np.full(len(r.time), k < count - 1) for k, r in enumerate(one.repeats)]
-        else:
-            row = [_part(one.repeats[0]) % 4 != 3]
-        kept.append(row)
-    return kept, [[~mask for mask in row] for row in kept]
-
-
-def _part(repeat: Repeat) -> NDArray[np.int64]:
-    """Number of the part of an excitation that each sample is in, shape (n,)."""
-    return (_BLOCKS * np.arange(len(repeat.time)) // len(repeat.time)).astype(np.int64)
-
-
-def _numbers(records: Sequence[Recorded]) -> tuple[NDArray[np.int64], ...]:
-    """Excitation, repeat and part of each residual, counted through, shapes (m,)."""
-    rows = [
-        (np.full(len(r.time), i), np.full(len(r.time), k), _part(r))
-        for i, one in enumerate(records)
-        for k, r in enumerate(one.repeats)
+def _kept(repeats: Sequence[Repeat]) -> list[Mask]:
+    """Samples to fit: all but the last repeat, or but every fourth part without repeats."""
+    count = Counter(one.excitation for one in repeats)
+    last = {one.excitation: one for one in repeats}
+    return [
+        one.part() % 4 != 3
+        if count[one.excitation] == 1
+        else np.full(len(one.time), one is not last[one.excitation])
+        for one in repeats
     ]
-    excitation, repeat, part = (np.concatenate(column) for column in zip(*rows, strict=True))
-    most = max(len(one.repeats) for one in records)
-    return excitation, excitation * most + repeat, excitation * _BLOCKS + part
+
+
+def _numbers(repeats: Sequence[Repeat]) -> tuple[NDArray[np.int64], ...]:
+    """Excitation, repeat and part of each residual, counted through, shapes (m,)."""
+    lengths = [len(one.time) for one in repeats]
+    excitation = np.repeat([one.excitation for one in repeats], lengths)
+    part = np.concatenate([one.part() for one in repeats])
+    repeat = np.repeat(np.arange(len(repeats)), lengths)
+    return excitation, repeat, excitation * _BLOCKS + part
 
 
 def _estimate(problem: TimeProblem, solution: Solution) -> Estimate:
     """Parameters with intervals by the repeats of each excitation; by parts without repeats."""
-    excitation, repeat, part = _numbers(problem.records)
+    excitation, repeat, part = _numbers(problem.repeats)
     size, freedom = len(solution.x), 0
     covariance = np.zeros((size, size))
     whole = np.linalg.pinv(solution.jacobian)
@@ -349,8 +321,8 @@ def _by_amplitude(problem: TimeProblem, solution: Solution) -> Array:
 
     To first order about the common optimum, friction and delay held.
     """
-    excitation = _numbers(problem.records)[0]
-    amplitudes = np.array([one.amplitude for one in problem.records])
+    excitation = _numbers(problem.repeats)[0]
+    amplitudes = np.array([trace.amplitude for trace in problem.simulations.traces])
     columns = [problem.fitted.index(name) for name in GAINS if name in problem.fitted]
     out = []
     for amplitude in dict.fromkeys(amplitudes.tolist()):
@@ -371,7 +343,7 @@ def _total(
     better than the parts, which then count with their deviation alone; no interval is narrower
     than the change between amplitudes.
     """
-    part = _numbers(problem.records)[2]
+    part = _numbers(problem.repeats)[2]
     moves = block_moves(solution.jacobian, solution.residual, part)
     spread = np.sqrt(np.diag(jackknife(moves)))
     out = {}
