@@ -158,7 +158,7 @@ def fitted(fit: TorqueFit) -> Pendulum:
     first, second = at(bent, (1.0, 0.0)) - at(bent), at(bent, (0.0, 1.0)) - at(bent)
     coupling = -UPPER_M / GRAVITY * weight[1].imag  # with the elbow at a right angle
     terms = {
-        term: np.array([fit.coefficients[fit.model.names.index((joint, term))] for joint in JOINTS])
+        term: np.array([fit.coefficients[fit.model.columns[joint, term]] for joint in JOINTS])
         for term in ("viscous", "dry", "stribeck")
     }
     return Pendulum(

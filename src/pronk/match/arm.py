@@ -71,13 +71,13 @@ class ArmProblem(Problem):
     def __init__(
         self,
         arm: ChainSimulation,
-        masks: Sequence[Mask],
+        used: Mask,
         fitted: Mapping[str, Sequence[str]],
         nominal: Drives,
         found: Drives,
         progress: Callable[[int], None],
     ) -> None:
-        """Take the recordings and the samples of them to use, shape (n, joints) each.
+        """Take the recordings and which of their samples to use, shape (rows, joints).
 
         `found` holds drives from an earlier fit, the `nominal` ones where a joint is missing;
         `progress` is called with the number of simulations done.
@@ -92,8 +92,9 @@ class ArmProblem(Problem):
             },
             refitted=found,
         )
-        self.arm, self.fitted, self.masks, self.nominal = arm, fitted, masks, nominal
-        self.measured = arm.measured()
+        self.arm, self.fitted, self.used, self.nominal = arm, fitted, used, nominal
+        self.measured = np.concatenate(arm.measured())
+        """Shape (rows, joints) [rad]; NaN where a recording does not excite a joint."""
         self._progress = progress
         self._last: tuple[Array, Array] | None = None
 
@@ -134,18 +135,15 @@ class ArmProblem(Problem):
 
     def block(self, joint: str) -> slice:
         """Rows of the residual that are a joint's."""
-        rows = sum(len(part) for part in self.measured)
-        first = self.arm.joints.index(joint) * rows
-        return slice(first, first + rows)
+        rows, i = len(self.measured), self.arm.joints.index(joint)
+        return slice(i * rows, (i + 1) * rows)
 
     def residuals(self, positions: Sequence[Array]) -> Array:
         """Residuals of simulated positions, one array a recording."""
-        parts = []
-        for position, measured, mask in zip(positions, self.measured, self.masks, strict=True):
-            # What diverged is as wrong as a joint can be, not undefined.
-            wrong = np.clip(np.nan_to_num(position - measured, nan=np.pi), -np.pi, np.pi)
-            parts.append(np.where(mask, wrong, 0.0))
-        return np.asarray(np.concatenate(parts).T.ravel())
+        wrong = np.concatenate(positions) - self.measured
+        # What diverged is as wrong as a joint can be, not undefined.
+        wrong = np.clip(np.nan_to_num(wrong, nan=np.pi), -np.pi, np.pi)
+        return np.asarray(np.where(self.used, wrong, 0.0).T.ravel())
 
     def _simulated(self, sets: Sequence[Drives]) -> list[Array]:
         out = [self.residuals(positions) for positions in self.arm.run(sets)]
@@ -204,7 +202,7 @@ def _fit_chain(
     arm: ChainSimulation, names: Sequence[str], most_held: int, progress: Callable[[float], None]
 ) -> dict[str, JointFit]:
     """Fit the joints of one chain: first without every fourth block, then to everything."""
-    masks, limit_hz = trusted(arm)
+    used, limit_hz = trusted(arm)
     blocks = _blocks(arm.logs)
     if (count := len(np.unique(blocks))) < MIN_BLOCKS:
         raise LogError(
@@ -226,12 +224,10 @@ def _fit_chain(
     aside = blocks % 4 == 3
     if not aside.any():
         aside = blocks == blocks.max()
-    parts = np.split(aside, np.cumsum([len(mask) for mask in masks])[:-1])
-    kept = [mask & ~part[:, None] for mask, part in zip(masks, parts, strict=True)]
-    left = [mask & part[:, None] for mask, part in zip(masks, parts, strict=True)]
+    kept, left = used & ~aside[:, None], used & aside[:, None]
 
     def fit(
-        names: Mapping[str, Sequence[str]], begin: Drives, used: Sequence[Mask]
+        names: Mapping[str, Sequence[str]], begin: Drives, used: Mask
     ) -> tuple[ArmProblem, Solution]:
         problem = ArmProblem(arm, used, names, nominal, begin, count_runs)
         return problem, solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
@@ -242,25 +238,14 @@ def _fit_chain(
     found: dict[str, dict[str, float]] = {}
     while True:
         fitted = {j: tuple(n for n in free[j] if n not in held[j]) for j in arm.joints}
-        problem, solution = fit(fitted, found, masks)
+        problem, solution = fit(fitted, found, used)
         estimates = _estimates(problem, solution, blocks)
-        unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
-        lost_delay = most_held and any("delay" in lost for lost in unknown.values())
-        none_late = any(map(_may_be_none, estimates.values()))
         found = problem.values(solution.x)
-        if (lost_delay or none_late) and all(len(fitted[j]) > 1 for j in problem.late):
-            for joint in problem.late:
-                held[joint] = (*held[joint], "delay")
-                found[joint]["delay"] = nominal[joint]["delay"]
-            continue
-        if not unknown:
+        if not (lost := _lost(problem, estimates, held, most_held)):
             break
-        for joint, lost in unknown.items():
-            if len({*held[joint]} - {"delay"}) >= most_held or len(fitted[joint]) == 1:
-                _refuse(unknown)
-            worst = min(lost, key=_HOLD_FIRST.index)
-            held[joint] = (*held[joint], worst)
-            found[joint][worst] = nominal[joint][worst]
+        for joint, name in lost:
+            held[joint] = (*held[joint], name)
+            found[joint][name] = nominal[joint][name]
     drives: list[Drives] = [nominal]
     for few in (("delay",), _PLAIN, tuple(PARAMETERS)):
         some = {j: [n for n in fitted[j] if n in few] for j in arm.joints}
@@ -270,20 +255,48 @@ def _fit_chain(
             begin = trial.values(best.x)
         drives.append(begin)
     judge = ArmProblem(arm, left, fitted, nominal, found, count_runs)
-    used = np.concatenate(left)
-    errors = [judge.residuals(positions) for positions in arm.run(drives)]
+    errors = dict(zip(HELD_OUT, map(judge.residuals, arm.run(drives)), strict=True))
     held_out = {
-        joint: dict(
-            zip(
-                HELD_OUT,
-                (rms(error[judge.block(joint)][used[:, i]]) for error in errors),
-                strict=True,
-            )
-        )
-        for i, joint in enumerate(arm.joints)
-        if used[:, i].any()
+        joint: {name: rms(error[judge.block(joint)][own]) for name, error in errors.items()}
+        for joint, own in zip(arm.joints, left.T, strict=True)
+        if own.any()
     }
     return _joint_fits(problem, solution, estimates, held, limit_hz, held_out)
+
+
+def _lost(
+    problem: ArmProblem,
+    estimates: Mapping[str, Estimate],
+    held: Mapping[str, Sequence[str]],
+    most_held: int,
+) -> list[tuple[str, str]]:
+    """Joints and parameters to hold because the recordings do not identify them.
+
+    Raises:
+        IdentifiabilityError: More than `most_held` of a joint, or all, would be held.
+    """
+    unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
+    lost_delay = most_held and any("delay" in lost for lost in unknown.values())
+    # No simulator has a delay below zero.
+    none_late = any(
+        e.ci95["delay"][0] < e.values["delay"] < 0.0 < e.ci95["delay"][1]
+        for e in estimates.values()
+        if "delay" in e.ci95
+    )
+    if (lost_delay or none_late) and all(len(problem.fitted[j]) > 1 for j in problem.late):
+        return [(joint, "delay") for joint in problem.late]
+    if any(
+        len({*held[joint]} - {"delay"}) >= most_held or len(problem.fitted[joint]) == 1
+        for joint in unknown
+    ):
+        words = "; ".join(f"{joint}: {', '.join(names)}" for joint, names in unknown.items())
+        wanted = {name for names in unknown.values() for name in names}
+        remedies = "; ".join(PARAMETERS[name].remedy for name in PARAMETERS if name in wanted)
+        raise IdentifiabilityError(
+            f"these recordings do not identify {words}; fit fewer parameters, or record more: "
+            f"{remedies}."
+        )
+    return [(joint, min(lost, key=_HOLD_FIRST.index)) for joint, lost in unknown.items()]
 
 
 def trusted_frequency(time: Array, command: Array, position: Array) -> float:
@@ -329,8 +342,8 @@ def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
     return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit
 
 
-def trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
-    """Samples to use, shape (n, joints) a recording, and each joint's trusted frequency [Hz].
+def trusted(arm: ChainSimulation) -> tuple[Mask, dict[str, float]]:
+    """Samples to use, shape (rows, joints), and each joint's trusted frequency [Hz].
 
     The frequency is infinite where no recording ran out of coherence.
     """
@@ -343,7 +356,7 @@ def trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
             if not own.all():
                 limit[joint] = min(limit[joint], highest)
         masks.append(mask)
-    return masks, limit
+    return np.concatenate(masks), limit
 
 
 def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
@@ -366,7 +379,7 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Values and intervals of every joint; those at a bound are flagged."""
     out, values = {}, problem.values(solution.x)
-    used = np.concatenate(problem.masks).T.ravel()
+    used = problem.used.T.ravel()
     numbers = np.tile(blocks, len(problem.arm.joints))[used]
     moves = block_moves(solution.jacobian[used], solution.residual[used], numbers)
     covariance = jackknife(moves)
@@ -385,23 +398,6 @@ def _estimates(
     return out
 
 
-def _may_be_none(found: Estimate) -> bool:
-    """True for a delay below zero, which no simulator has, whose interval reaches zero."""
-    low, high = found.ci95.get("delay", (0.0, 0.0))
-    return low < 0.0 < high and found.values["delay"] < 0.0
-
-
-def _refuse(unknown: Mapping[str, tuple[str, ...]]) -> None:
-    """Raise for parameters that are not identified."""
-    words = "; ".join(f"{joint}: {', '.join(names)}" for joint, names in unknown.items())
-    wanted = {name for names in unknown.values() for name in names}
-    remedies = "; ".join(PARAMETERS[name].remedy for name in PARAMETERS if name in wanted)
-    raise IdentifiabilityError(
-        f"these recordings do not identify {words}; fit fewer parameters, or record more: "
-        f"{remedies}."
-    )
-
-
 def _joint_fits(
     problem: ArmProblem,
     solution: Solution,
@@ -415,8 +411,7 @@ def _joint_fits(
     matched, naive = arm.run([problem.values(solution.x), problem.nominal])
     naive_residual = problem.residuals(naive)
     for i, (name, found) in enumerate(estimates.items()):
-        rows = problem.block(name)
-        mask = np.concatenate(problem.masks)[:, i]
+        rows, mask = problem.block(name), problem.used[:, i]
         flags = [
             f"{one} held at {found.values[one]:.4g}: these recordings do not identify it; "
             f"{PARAMETERS[one].remedy}"
@@ -428,7 +423,7 @@ def _joint_fits(
                 "the drive had it; 0 in the gains, which hold for earlier commands"
             )
         if np.isfinite(limit_hz[name]):
-            share = mask.sum() / sum(len(p) for p in problem.measured if np.isfinite(p[0, i]))
+            share = mask.sum() / np.isfinite(problem.measured[:, i]).sum()
             flags.append(
                 f"used up to {limit_hz[name]:.2g} Hz, where the coherence falls "
                 f"({100 * share:.0f} % of the samples)"

@@ -26,6 +26,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -189,56 +190,41 @@ class TorqueModel:
         self.model = bench_spec(robot, joint).compile()
         self.joints = tuple(self.model.joint(i).name for i in range(self.model.njnt))
         self.links_known = links_known
-        groups = {name: tuple(group) for group in shared for name in group}
-        self.armature_of = {name: groups.get(name, (name,)) for name in self.joints}
-        self.names: list[tuple[str, str]] = []
-        """Joint (or body) and parameter of each column."""
-        if links_known:
-            self.names += [(name, "scale") for name in self.joints]
-        else:
-            for body in range(1, self.model.nbody):
-                if self.model.body_weldid[body] != 0:
-                    self.names += [
-                        (self.model.body(body).name, f"mass_{k}") for k in range(len(_PLACES))
-                    ]
-        for term in DRIVE_TERMS:
-            for name in self.joints:
-                owner = self.armature_of[name][0] if term == "armature" else name
-                if (owner, term) not in self.names:
-                    self.names.append((owner, term))
+        self._bodies = [
+            body for body in range(1, self.model.nbody) if self.model.body_weldid[body] != 0
+        ]
+        scales = self.joints if links_known else ()
+        self.columns = {(name, "scale"): column for column, name in enumerate(scales)}
+        """Column of each joint and parameter, after those of links; a shared armature has one."""
+        self.count = len(scales) or len(self._bodies) * len(_PLACES)
+        groups = {name: group for group in shared for name in group}
+        for term, name in product(DRIVE_TERMS, self.joints):
+            alike = groups.get(name, ()) if term == "armature" else ()
+            known = [self.columns[one, term] for one in alike if (one, term) in self.columns]
+            self.columns[name, term] = known[0] if known else self.count
+            self.count += not known
 
     def regressor(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Torque of each joint for a unit of each parameter, shape (n, joints, p).
 
         With the links known the columns of `armature` and friction carry the scale as well.
         """
-        out = np.zeros((*position.shape, len(self.names)))
+        out = np.zeros((*position.shape, self.count))
         own = copy.copy(self.model)
         if self.links_known:
-            rigid = self._rne(own, position, velocity, acceleration)
-            for j in range(len(self.joints)):
-                out[:, j, j] = rigid[:, j]
+            joints = np.arange(len(self.joints))
+            out[:, joints, joints] = self._rne(own, position, velocity, acceleration)
         else:
-            column, places = 0, own.body_ipos.copy()
-            for body in range(1, own.nbody):
-                if own.body_weldid[body] == 0:
-                    continue
-                for place in _PLACES:
-                    own.body_mass[:], own.body_inertia[:] = 0.0, 0.0
-                    own.body_mass[body], own.body_ipos[body] = 1.0, place * places[body]
-                    out[:, :, column] = self._rne(own, position, velocity, acceleration)
-                    column += 1
+            places = own.body_ipos.copy()
+            for column, (body, place) in enumerate(product(self._bodies, _PLACES)):
+                own.body_mass[:], own.body_inertia[:] = 0.0, 0.0
+                own.body_mass[body], own.body_ipos[body] = 1.0, place * places[body]
+                out[:, :, column] = self._rne(own, position, velocity, acceleration)
         sign = np.tanh(velocity / SIGN_RAD_S)
-        terms = {
-            "armature": acceleration,
-            "viscous": velocity,
-            "dry": sign,
-            "stribeck": sign * np.exp(-((velocity / STRIBECK_RAD_S) ** 2)),
-        }
-        for term, values in terms.items():
+        falling = sign * np.exp(-((velocity / STRIBECK_RAD_S) ** 2))
+        for term, values in zip(DRIVE_TERMS, (acceleration, velocity, sign, falling), strict=True):
             for j, name in enumerate(self.joints):
-                owner = self.armature_of[name][0] if term == "armature" else name
-                out[:, j, self.names.index((owner, term))] = values[:, j]
+                out[:, j, self.columns[name, term]] = values[:, j]
         return out
 
     def _rne(
@@ -266,7 +252,7 @@ def fit_torque(
     shared: Sequence[Sequence[str]] = (),
     most_s: float = np.inf,
 ) -> TorqueFit:
-    """Fit armature and friction, and the torque scale or the links.
+    """Fit armature and friction of the chain of a joint, and the torque scale or the links.
 
     Each joint counts by the inverse of its own residual (`_PASSES` passes). Blocks are
     `BLOCK_S` of a recording.
@@ -423,97 +409,92 @@ def _unusable(log: JointLog, chain: Sequence[str]) -> str:
 def _solve(model: TorqueModel, design: Array, goal: Array, blocks: NDArray[np.int64]) -> TorqueFit:
     """Least squares, each joint weighted by its residual."""
     weight, counts = np.ones(goal.shape[1]), design.any(axis=2).sum(axis=0)
-    at = {name: k for k, name in enumerate(model.names)}
-    prior = np.zeros((0, design.shape[2]))
+    columns, prior = model.columns, np.zeros((0, model.count))
     for _ in range(_PASSES):
-        rows = np.vstack([(design * weight[:, None]).reshape(-1, design.shape[2]), prior])
+        rows = np.vstack([(design * weight[:, None]).reshape(-1, model.count), prior])
         sought = np.concatenate([(goal * weight).ravel(), np.zeros(len(prior))])
         size = np.linalg.norm(rows, axis=0)
         size[size == 0.0] = 1.0
         left, singular, right = np.linalg.svd(rows / size, full_matrices=False)
         rank = int((singular > _RANK * singular[0]).sum())
-        reduced = left[:, :rank] * singular[:rank]
-        best = (left[:, :rank].T @ sought) / singular[:rank]
-        x = right[:rank].T @ best / size
+        left, singular, right = left[:, :rank], singular[:rank], right[:rank]
+        best = (left.T @ sought) / singular
+        x = right.T @ best / size
         rms = np.sqrt(np.sum((design @ x - goal) ** 2, axis=0) / np.maximum(counts, 1))
         weight = 1.0 / np.maximum(rms, 1e-9)
         deviation = {}
         for j, name in enumerate(model.joints):
-            terms = [at[name, term] for term in ("viscous", "dry", "stribeck")]
+            terms = [columns[name, term] for term in ("viscous", "dry", "stribeck")]
             friction = np.linalg.norm(design[:, j, terms] @ x[terms])
             for term, share in _PRIOR.items():
-                unit = np.linalg.norm(design[:, j, at[name, "dry" if term == "stribeck" else term]])
+                alike = columns[name, "dry" if term == "stribeck" else term]
+                unit = np.linalg.norm(design[:, j, alike])
                 if unit > 0.0 and friction > 0.0:
-                    deviation[at[name, term]] = share * friction / unit
+                    deviation[columns[name, term]] = share * friction / unit
         prior = np.eye(len(x))[list(deviation)] / np.array([*deviation.values()])[:, None]
-    known = len(rows) - goal.size
+    reduced, known = left * singular, len(rows) - goal.size
     moves = block_moves(reduced, reduced @ best - sought, np.append(blocks, np.full(known, -1)))
     moves = moves[min(known, 1) :]
     # An optimum moves by this when the truth is one deviation of its prior from zero.
-    drawn = reduced[goal.size :] / singular[:rank] ** 2
-    spread = jackknife(moves) + drawn.T @ drawn
-    spread = right[:rank].T @ spread @ right[:rank] / np.outer(size, size)
+    drawn = reduced[goal.size :] / singular**2
+    spread = right.T @ (jackknife(moves) + drawn.T @ drawn) @ right / np.outer(size, size)
     # Share of each (scaled) parameter that moves along combinations without effect.
-    open_share = np.sqrt(np.maximum(1.0 - np.sum(right[:rank] ** 2, axis=0), 0.0))
-    joints = {}
+    hidden = np.sqrt(np.maximum(1.0 - np.sum(right**2, axis=0), 0.0))
+    quantile, joints = float(stats.t.ppf(0.975, len(moves) - 1)), {}
     for j, name in enumerate(model.joints):
-        # Known links fill one column a joint, the first ones.
-        own = design[:, j, [c for c in range(len(x)) if c != j]]
-        left = design[:, j, j] - own @ np.linalg.lstsq(own, design[:, j, j], rcond=None)[0]
         if not counts[j]:
             joints[name] = dict.fromkeys(UNITS, _STILL)
             continue
-        apart = float(np.sqrt(np.sum(left**2) / counts[j]))
-        joints[name] = _parameters(model, name, x, spread, open_share, len(moves), apart)
+        # Torque of the links that no other term has; known ones fill one column, the first ones.
+        others = np.delete(design[:, j], j, axis=1)
+        links = design[:, j, j] - others @ np.linalg.lstsq(others, design[:, j, j], rcond=None)[0]
+        apart = float(np.sqrt(np.sum(links**2) / counts[j]))
+        joints[name] = {
+            term: _parameter(model, name, term, x, spread, quantile, hidden, apart)
+            for term in ("scale", *DRIVE_TERMS)
+        }
     return TorqueFit(
         joints=joints, coefficients=x, rank=rank, rms=rms, blocks=len(moves), model=model
     )
 
 
-def _parameters(
+def _parameter(
     model: TorqueModel,
     joint: str,
+    term: str,
     x: Array,
     covariance: Array,
-    open_share: Array,
-    blocks: int,
+    quantile: float,
+    hidden: Array,
     apart: float,
-) -> dict[str, TorqueParameter]:
-    """Every parameter of one joint, the scale divided out where it was fitted.
+) -> TorqueParameter:
+    """One parameter of a joint, the scale divided out where it was fitted.
 
-    `apart` is the torque of the links [N m] that no other term of the joint has.
+    `hidden` is the share of each that has no effect, `apart` the torque of the links [N m] that no
+    other term of the joint has.
     """
-    quantile, dry = float(stats.t.ppf(0.975, blocks - 1)), x[model.names.index((joint, "dry"))]
-    out = {}
-    scale_at = model.names.index((joint, "scale")) if model.links_known else None
-    for term in ("scale", *DRIVE_TERMS):
-        if term == "scale" and scale_at is None:
-            reason = "needs links of known mass: it is one with the unit of all masses"
-            out[term] = TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason=reason)
-            continue
-        owner = model.armature_of[joint][0] if term == "armature" else joint
-        at = model.names.index((owner, term))
-        value, gradient = x[at], np.zeros(len(x))
-        gradient[at] = 1.0
-        if scale_at is not None and term != "scale":
-            value = x[at] / x[scale_at]
-            gradient[at] = 1.0 / x[scale_at]
-            gradient[scale_at] -= value / x[scale_at]
-        sd = max(float(gradient @ covariance @ gradient), 0.0) ** 0.5
-        reason = ""
-        if open_share[at] > _NULL:
-            reason = (
-                "the motion does not separate it from the links' inertia (joints whose drives are "
-                "equal in robot.yaml share one armature)"
-            )
-            value = sd = np.nan
-        elif not sd <= _SD_MAX * abs(value):
-            reason = f"standard deviation {sd:.2g} {UNITS[term]}"
-        elif value < 0.0 and term != "stribeck":
-            reason = "negative: the model does not hold"
-        elif term == "scale" and value * apart < dry:
-            reason = f"dry friction, {dry:.2g} N m, hides {value * apart:.2g} N m of the links"
-        half = float(np.hypot(quantile * sd, _METHOD * value))
-        ends = float(value - half), float(value + half)
-        out[term] = TorqueParameter(value=float(value), ci95=ends, reason=reason)
-    return out
+    if (joint, term) not in model.columns:
+        reason = "needs links of known mass: it is one with the unit of all masses"
+        return TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason=reason)
+    at, scale_at = model.columns[joint, term], model.columns.get((joint, "scale"))
+    value, gradient = x[at], np.eye(len(x))[at]
+    if scale_at is not None and term != "scale":
+        value, gradient = value / x[scale_at], gradient / x[scale_at]
+        gradient[scale_at] -= value / x[scale_at]
+    sd = max(float(gradient @ covariance @ gradient), 0.0) ** 0.5
+    dry, reason = x[model.columns[joint, "dry"]], ""
+    if hidden[at] > _NULL:
+        reason = (
+            "the motion does not separate it from the links' inertia (joints whose drives are "
+            "equal in robot.yaml share one armature)"
+        )
+        value = sd = np.nan
+    elif not sd <= _SD_MAX * abs(value):
+        reason = f"standard deviation {sd:.2g} {UNITS[term]}"
+    elif value < 0.0 and term != "stribeck":
+        reason = "negative: the model does not hold"
+    elif term == "scale" and value * apart < dry:
+        reason = f"dry friction, {dry:.2g} N m, hides {value * apart:.2g} N m of the links"
+    half = float(np.hypot(quantile * sd, _METHOD * value))
+    ends = float(value - half), float(value + half)
+    return TorqueParameter(value=float(value), ci95=ends, reason=reason)
