@@ -124,12 +124,12 @@ def test_the_coarse_search_finds_the_best_of_the_whole_grid() -> None:
 def test_the_error_is_the_mean_square_in_decibels() -> None:
     goal = known("FR_hip_pitch")
     measured = goal.measured.response[goal.fit_mask]
-    assert mean_square(goal, measured * 10 ** (0.5 / 20)) == pytest.approx(0.25)
+    assert mean_square(goal.error_db(measured * 10 ** (0.5 / 20))) == pytest.approx(0.25)
     # Phase is disregarded (F9).
     turned = measured * np.exp(-1j * goal.omega * 0.01)
-    assert mean_square(goal, turned) == pytest.approx(0.0, abs=1e-20)
+    assert mean_square(goal.error_db(turned)) == pytest.approx(0.0, abs=1e-20)
     for broken in (0.0, np.nan):
-        assert mean_square(goal, broken * measured) == pytest.approx(DIVERGED_DB**2)
+        assert mean_square(goal.error_db(broken * measured)) == pytest.approx(DIVERGED_DB**2)
 
 
 # --- measured responses and simulated ones ------------------------------------------------------

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pronk.arrays import Array, ComplexArray, Mask
+from pronk.arrays import Array, Mask
 from pronk.errors import PronkError
 from pronk.match.measured_joint import DB, MeasuredJoint
 from pronk.match.response_fit import Fit, refine
@@ -88,12 +88,8 @@ def axes(robot: RobotSpec, points: int = 50) -> tuple[Array, Array]:
     return np.linspace(a, reach * b, points), np.linspace(c, reach * d, points)
 
 
-def mean_square(goal: MeasuredJoint, simulated: ComplexArray) -> Array:
-    """Mean square of the gain error [dB^2], shape (...), for responses of shape (..., inside)."""
-    return _mean_square(goal.error_db(simulated))
-
-
-def _mean_square(error: Array) -> Array:
+def mean_square(error: Array) -> Array:
+    """Mean square of gain errors [dB^2], shape (...), of shape (..., inside) [dB]."""
     error = np.where(np.isfinite(error), np.clip(error, -DIVERGED_DB, DIVERGED_DB), DIVERGED_DB)
     count = error.shape[-1]
     return np.asarray(error**2 @ np.full(count, 1.0 / count))
@@ -128,7 +124,7 @@ def errors(
     out = np.empty((len(group), len(stiffness)))
     for part, position in rigs.run([longest], values, max(goal.steps for goal in group)):
         for k, goal in enumerate(group):
-            out[k, part] = mean_square(goal, goal.fit_response(position))
+            out[k, part] = mean_square(goal.error_db(goal.fit_response(position)))
         if progress is not None:
             progress(part.stop / len(stiffness))
     return out
@@ -308,7 +304,7 @@ def quick_search(
     grids = []
     for goal, error, mine in zip(targets, maps, nodes, strict=True):
         if len(mine):
-            verified = [float(mean_square(goal, next(simulated))) for _ in mine]
+            verified = [float(mean_square(goal.error_db(next(simulated)))) for _ in mine]
             # The simulator decides among them; no node without a simulation may win.
             error = np.maximum(error, min(verified) * (1.0 + 1e-9))
             error[mine] = verified
@@ -324,7 +320,7 @@ def linearized(rigs: MujocoSimulator, goal: MeasuredJoint) -> Plant:
 
 def _map(goal: MeasuredJoint, log: Array) -> Array:
     """Mean squared errors of log gains, shapes (b, inside) to (b,) [dB^2]."""
-    return _mean_square(DB * (log - np.log(np.abs(goal.measured.response[goal.fit_mask]))))
+    return mean_square(DB * (log - np.log(np.abs(goal.measured.response[goal.fit_mask]))))
 
 
 def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:

@@ -64,14 +64,16 @@ _MOST_DELAY_S = 0.1
 _STARTS = (-0.5, 0.0, 0.5)
 """First values of the poles' coefficient a1 / (1 + a2)."""
 
+Coefficients = tuple[float, float, float]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prefilter:
     """The filter of one joint's commands."""
 
-    numerator: tuple[float, float, float]
+    numerator: Coefficients
     """b0, b1, b2; commands are filtered about the pose or as they are, F(1) being 1."""
-    denominator: tuple[float, float, float]
+    denominator: Coefficients
     """1, a1, a2."""
     delay_s: float
     """How much later the shaped joint responds than the simulated one [s]."""
@@ -93,14 +95,19 @@ class Prefilter:
 
     def response(self, omega: Array, rate_hz: float) -> ComplexArray:
         """Response of the filter at some frequencies [rad/s]."""
-        z = np.exp(-1j * omega / rate_hz)
-        above, below = (np.polyval(c[::-1], z) for c in (self.numerator, self.denominator))
-        return np.asarray(above / below)
+        return _response(self.numerator, self.denominator, omega, rate_hz)
 
     def apply(self, command: Array) -> Array:
         """Filter commands [rad] of shape (ticks,), at rest before the first."""
         first = command[:1]
         return np.asarray(first + lfilter(self.numerator, self.denominator, command - first))
+
+
+def _response(
+    numerator: Sequence[float], denominator: Sequence[float], omega: Array, rate_hz: float
+) -> ComplexArray:
+    z = np.exp(-1j * omega / rate_hz)
+    return np.asarray(np.polyval(numerator[::-1], z) / np.polyval(denominator[::-1], z))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,17 +239,15 @@ def prefilter(
     omega, measured = goal.omega, goal.measured.response[goal.fit_mask]
     above = np.linspace(omega[-1], np.pi * rate_hz, 20)[1:]
 
-    def parts(x: Array) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+    def parts(x: Array) -> tuple[Coefficients, Coefficients]:
         # The triangle of stable poles: |a2| < 1 and |a1| < 1 + a2.
         a2 = float(np.tanh(x[3]))
         a1 = float(np.tanh(x[2])) * (1.0 + a2)
         b0 = 1.0 + a1 + a2 - x[0] - x[1]
-        return (float(b0), float(x[0]), float(x[1])), (1.0, a1, a2), float(x[4])
+        return (float(b0), float(x[0]), float(x[1])), (1.0, a1, a2)
 
     def gain(x: Array, at: Array) -> ComplexArray:
-        b, a, _ = parts(x)
-        z = np.exp(-1j * at / rate_hz)
-        return np.asarray(np.polyval(b[::-1], z) / np.polyval(a[::-1], z))
+        return _response(*parts(x), at, rate_hz)
 
     def residual(x: Array) -> Array:
         shaped = gain(x, omega) * measured / simulated
@@ -256,19 +261,20 @@ def prefilter(
         least_squares(residual, [0.0, 0.0, pole, 0.0, 0.01], bounds=bounds) for pole in _STARTS
     ]
     best = min(tries, key=lambda one: float(one.cost)).x
-    numerator, denominator, delay = parts(best)
+    numerator, denominator = parts(best)
     every = np.linspace(0.0, np.pi * rate_hz, 500)
     loudness = np.abs(gain(best, every))
     peak = int(np.argmax(loudness))
     ratio = measured / simulated
+    shaped = ratio * gain(best, omega)
     return Prefilter(
-        numerator=numerator,  # type: ignore[arg-type]
-        denominator=denominator,  # type: ignore[arg-type]
-        delay_s=delay,
+        numerator=numerator,
+        denominator=denominator,
+        delay_s=float(best[4]),
         before_db=rms(DB * np.log(np.abs(ratio))),
-        after_db=rms(DB * np.log(np.abs(ratio * gain(best, omega)))),
+        after_db=rms(DB * np.log(np.abs(shaped))),
         before_error=rms(ratio - 1.0),
-        after_error=rms(ratio * gain(best, omega) - 1.0),
+        after_error=rms(shaped - 1.0),
         peak_db=float(DB * np.log(loudness[peak])),
         peak_hz=float(every[peak] / (2.0 * np.pi)),
         amplitude=goal.measured.amplitude,
