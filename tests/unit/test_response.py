@@ -218,7 +218,7 @@ def test_ramped_and_unequal_periods_fall_out() -> None:
     read = read_periods(log, "knee", Estimator(), 500.0)
     assert len(read.command) == 3
     known = second_order(read.omega, **KNEE)
-    assert np.abs(read.position / read.command / read.factor / known - 1.0).max() < 2e-4
+    assert np.abs(read.position / read.command / known - 1.0).max() < 2e-4
 
 
 # --- delay and third harmonic -------------------------------------------------------------------

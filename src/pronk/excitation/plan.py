@@ -26,12 +26,11 @@ _BISECTIONS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Excitation:
-    """A signal to one joint."""
+    """A signal to one joint; repeats of it are numbered from 0."""
 
     joint: str
     signal: Signal
     repeat: int = 0
-    """Number of this repeat of the same excitation, from 0."""
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically meanwhile."""
     sign: float = 1.0
@@ -53,9 +52,8 @@ class SweepPlan:
     settle_s: float
     """Rest after each excitation, logged as its part [s]."""
     stiffness: Array
-    """Gains on the drives [N m/rad], shape (joints,)."""
     damping: Array
-    """Gains on the drives [N m s/rad], shape (joints,)."""
+    """Gains on the drives [N m/rad], [N m s/rad], shape (joints,)."""
     uncertainty: Uncertainty
     forecasts: tuple[Forecast, ...] = ()
     """Worst case of the loudest excitation of each joint, for it and its neighbours, over every
@@ -109,11 +107,9 @@ class SweepPlan:
             # The forecasts are of the largest amplitude, which comes first.
             loudest = next(each for each in self.excitations if each.joint == worst.excited)
             fits, unsure = self._fit(loudest), self.uncertainty
-            way_out = (
-                f"an amplitude of {fits:.3g} rad fits"
-                if fits > 0.0
-                else "no amplitude fits, so choose other joints or another pose"
-            )
+            way_out = "no amplitude fits, so choose other joints or another pose"
+            if fits > 0.0:
+                way_out = f"an amplitude of {fits:.3g} rad fits"
             raise PlanError(
                 f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
                 f"could {breaches[0]} (inertia, gains and friction uncertain by "
@@ -128,10 +124,8 @@ class SweepPlan:
             share = 0.5 * (fits + too_much)
             amplitude = share * excitation.signal.amplitude
             quieter = replace(excitation, signal=replace(excitation.signal, amplitude=amplitude))
-            if any(f.breaches() for f in self._worst(quieter, {})):
-                too_much = share
-            else:
-                fits = share
+            exceeds = any(found.breaches() for found in self._worst(quieter, {}))
+            fits, too_much = (fits, share) if exceeds else (share, too_much)
         amplitude = fits * excitation.signal.amplitude
         # Three significant digits.
         scale = 10.0 ** (np.floor(np.log10(amplitude or 1.0)) - 2)

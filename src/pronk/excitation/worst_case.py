@@ -44,41 +44,38 @@ class Uncertainty:
 
     def corners(self) -> list[tuple[float, float, float]]:
         """(inertia, stiffness, friction) factors: the model itself, then the eight corners."""
-        sides = [(1.0 - w, 1.0 + w) for w in (self.inertia, self.stiffness, self.friction)]
-        return [(1.0, 1.0, 1.0), *(tuple(c) for c in product(*sides))]  # type: ignore[list-item]
+        a, b, c = ((1.0 - w, 1.0 + w) for w in (self.inertia, self.stiffness, self.friction))
+        return [(1.0, 1.0, 1.0), *product(a, b, c)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """Extremes of one joint over an excitation and over every corner of the uncertainty."""
+    """Extremes of one joint over an excitation and over every corner of the uncertainty.
+
+    Positions [rad], speeds [rad/s], torques [N m], powers [W] and the current from the bus [A].
+    """
 
     joint: str
     excited: str
     """The excited joint: this one, or a neighbour of it."""
     amplitude: float
-    """Peak of the command [rad]; 0 for a joint that is only held."""
+    """Peak of the command; 0 for a joint that is only held."""
     lowest: float
-    """Least position [rad]."""
     highest: float
-    """Greatest position [rad]."""
     range: tuple[float, float]
-    """Mechanical limits [rad]."""
+    """Mechanical limits."""
     speed: float
-    """Greatest speed [rad/s]."""
     no_load_speed: float
-    """Speed at which back-EMF takes the whole bus voltage [rad/s]."""
+    """Speed at which back-EMF takes the whole bus voltage."""
     torque: float
-    """Greatest torque that the controller commands [N m]."""
+    """Greatest torque that the controller commands."""
     effort_limit: float
-    """Greatest torque that the drive gives [N m]."""
     torque_share: float
     """Greatest share of the torque available at the speed of the moment [1]."""
     mechanical_power: float
-    """Greatest mechanical power [W]."""
     electrical_power: float
-    """Greatest power from the bus [W]."""
+    """Greatest power from the bus."""
     bus_current: float
-    """Greatest current from the bus [A]."""
 
     def breaches(self) -> list[str]:
         """What could be exceeded: what the joint could do, and the limit, in words."""
@@ -122,9 +119,8 @@ def forecast(
 ) -> list[Forecast]:
     """Simulate the bench model in every corner of the uncertainty; a forecast a joint of the chain.
 
-    `offsets` of the command to a joint about the default pose [rad] have shape (ticks,);
-    `stiffness` and `damping` are those of the real drives by joint. PlanError if the simulation
-    diverges.
+    `offsets` of the command about the default pose [rad] have shape (ticks,); `stiffness` and
+    `damping` are those of the real drives by joint. PlanError if the simulation diverges.
     """
     spec = bench_spec(robot, joint, stiffness=stiffness, damping=damping)
     spec.option.timestep = timestep_s
@@ -135,14 +131,25 @@ def forecast(
     command[-len(offsets) :, order.index(joint)] += offsets
     steps = np.repeat(command, round(1.0 / (rate_hz * timestep_s)), axis=0)
     corners = (uncertainty or Uncertainty()).corners()
-    models = [_altered(model, robot, order, stiffness, damping, corner) for corner in corners]
+    models = []
+    for inertia, strength, friction in corners:
+        altered = copy(model)
+        altered.body_mass[:] *= inertia
+        altered.body_inertia[:] *= inertia
+        altered.dof_armature[:] *= inertia
+        altered.dof_frictionloss[:] *= friction
+        mujoco.mj_setConst(altered, mujoco.MjData(altered))
+        for name in order:
+            gains = strength * stiffness[name], strength * damping[name]
+            set_drive_gains(altered, name, robot.joint(name).drive, *gains)
+        models.append(altered)
     position, velocity = _roll(models, order, steps)
     if not (np.isfinite(position).all() and np.abs(velocity).max() < 1e4):
         raise PlanError(
             f"{joint}: the simulation of the excitation diverges; its gains "
             f"({stiffness[joint]:g} N m/rad, {damping[joint]:g} N m s/rad) are not stable."
         )
-    scale = np.array([corner[1] for corner in corners])[:, None]
+    scale = np.array(corners)[:, 1:2]
     forecasts = []
     for i, name in enumerate(order):
         q, v = position[..., i], velocity[..., i]
@@ -150,8 +157,7 @@ def forecast(
             steps[:, i], q, v, stiffness=scale * stiffness[name], damping=scale * damping[name]
         )
         drive = robot.joint(name).drive
-        limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
-        low, high = torque_limits(v, *limits)
+        low, high = torque_limits(v, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
         # A drive that can give nothing at this speed exceeds its limit with any command.
         available = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
         given = np.clip(torque, low, high)
@@ -184,28 +190,6 @@ def forecast(
     return forecasts
 
 
-def _altered(
-    model: mujoco.MjModel,
-    robot: RobotSpec,
-    order: Sequence[str],
-    stiffness: Mapping[str, float],
-    damping: Mapping[str, float],
-    corner: tuple[float, float, float],
-) -> mujoco.MjModel:
-    """A copy of the model in one corner of the uncertainty."""
-    inertia, torque, friction = corner
-    altered = copy(model)
-    altered.body_mass[:] *= inertia
-    altered.body_inertia[:] *= inertia
-    altered.dof_armature[:] *= inertia
-    altered.dof_frictionloss[:] *= friction
-    mujoco.mj_setConst(altered, mujoco.MjData(altered))
-    for name in order:
-        gains = torque * stiffness[name], torque * damping[name]
-        set_drive_gains(altered, name, robot.joint(name).drive, *gains)
-    return altered
-
-
 def _roll(
     models: Sequence[mujoco.MjModel], order: Sequence[str], steps: Array
 ) -> tuple[Array, Array]:
@@ -216,16 +200,15 @@ def _roll(
     full = mujoco.mjtState.mjSTATE_FULLPHYSICS
     initial = np.zeros(mujoco.mj_stateSize(model, full))
     mujoco.mj_getState(model, data, initial, full)
-    batch = len(models)
     threads = os.cpu_count() or 1
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         states, _ = pool.rollout(
             list(models),
             [mujoco.MjData(model) for _ in range(threads)],
-            np.tile(initial, (batch, 1)),
-            np.broadcast_to(steps, (batch, *steps.shape)),
+            np.tile(initial, (len(models), 1)),
+            np.broadcast_to(steps, (len(models), *steps.shape)),
         )
-    before = np.concatenate([np.tile(initial, (batch, 1, 1)), states[:, :-1]], axis=1)
+    before = np.concatenate([np.tile(initial, (len(models), 1, 1)), states[:, :-1]], axis=1)
     # Full physics begins with time, then qpos, then qvel (mjtState); a bench has hinges only.
     columns = np.array([model.joint(n).qposadr[0] for n in order])
     rates = np.array([model.joint(n).dofadr[0] for n in order])

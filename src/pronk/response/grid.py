@@ -38,14 +38,13 @@ class Grid:
     count: int
 
     @property
-    def times(self) -> Array:
-        """The instants [s], shape (count,)."""
-        return np.asarray(self.start + np.arange(self.count) / self.rate_hz)
-
-    @property
     def edges(self) -> Array:
         """The instants and the end of the last interval [s], shape (count + 1,)."""
         return np.asarray(self.start + np.arange(self.count + 1) / self.rate_hz)
+
+    def within(self, time: Array) -> Array:
+        """The instants, none before the first or after the last of `time` [s], shape (count,)."""
+        return np.clip(self.edges[:-1], time[0], time[-1])
 
 
 def analysis_rate(times: Sequence[Array]) -> float:
@@ -83,9 +82,8 @@ def held_mean(time: Array, command: Array, edges: Array) -> Array:
 
 def interpolate(time: Array, values: Array, grid: Grid) -> Array:
     """Cubic spline through `values` (shape (n, ...) at `time`), read on the grid."""
-    degree = min(3, len(time) - 1)
-    spline = make_interp_spline(time, values, k=degree)
-    return np.asarray(spline(np.clip(grid.times, time[0], time[-1])))
+    spline = make_interp_spline(time, values, k=min(3, len(time) - 1))
+    return np.asarray(spline(grid.within(time)))
 
 
 def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
@@ -99,7 +97,7 @@ def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
     degree = min(3, len(time) - 1)
     knots = make_interp_spline(time, np.zeros(len(time)), k=degree).t
     collocation = BSpline.design_matrix(time, knots, degree)
-    onto_grid = BSpline.design_matrix(np.clip(grid.times, time[0], time[-1]), knots, degree)
+    onto_grid = BSpline.design_matrix(grid.within(time), knots, degree)
     # Real arithmetic: the spline is real, and the solver takes one kind of number.
     parts = np.ascontiguousarray(weights).view(np.float64)
     on_knots: Any = onto_grid.T @ parts

@@ -186,7 +186,7 @@ class Sums:
 
 
 def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
-    """Sum the spectra of one excitation (`Layout.spectra`, shape (k, f)) over its segments."""
+    """Sum the spectra of one excitation (`Layout.spectra`) over its segments."""
     # Phase from a common instant, in which the noise of two segments correlates by their overlap.
     turn = np.exp(-1j * np.outer(where.starts / where.grid.rate_hz, where.omega))
     aligned, power = command * turn, float(where.window @ where.window)

@@ -55,9 +55,7 @@ class Spectra:
     command: ComplexArray
     """Per period (or block of periods), shape (p, f)."""
     position: ComplexArray
-    """Shape (p, f)."""
-    factor: ComplexArray
-    """Grid factor of each line (`grid.hold`), shape (f,)."""
+    """Over the grid factor of each line (`grid.hold`), shape (p, f)."""
     third: Array = field(default_factory=lambda: np.empty(0))
     """Of steps: position at three times the frequency over that at it, shape (f,)."""
 
@@ -134,12 +132,8 @@ def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float
     column = log.column(joint)
     where, command = _periods(log.time, log.command[:, column], period, estimator, rate_hz)
     position = interpolate(log.time, log.position[:, column], where.grid)
-    return Spectra(
-        omega=where.omega,
-        command=command,
-        position=where.spectra(position),
-        factor=hold(where.omega, where.grid.rate_hz),
-    )
+    factor = hold(where.omega, where.grid.rate_hz)
+    return Spectra(omega=where.omega, command=command, position=where.spectra(position) / factor)
 
 
 def multisine_operator(
@@ -234,18 +228,13 @@ def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) 
         window = get_window("hann", samples) if each >= 2 else np.ones(samples)
         turn = 2j * np.pi * each * np.arange(samples) / samples
         once, thrice = window * np.exp(-turn), window * np.exp(-3.0 * turn)
-        omega = 2.0 * np.pi * hz
-        ratio = abs((y @ thrice).mean()) / abs((y @ once).mean())
-        factor = hold(np.array([omega]), grid.rate_hz)[0]
-        third = ratio if 3.0 * hz < rate_hz / 2.0 else float("nan")
-        rows.append((omega, u @ once, y @ once, factor, third))
-    omegas, us, ys, factors, thirds = zip(*rows, strict=True)
+        factor = hold(2.0 * np.pi * np.array([hz]), grid.rate_hz)
+        third = abs((y @ thrice).mean()) / abs((y @ once).mean())
+        known = third if 3.0 * hz < rate_hz / 2.0 else float("nan")
+        rows.append((hz, u @ once, y @ once / factor, known))
+    lines_hz, commands, positions, thirds = map(np.array, zip(*rows, strict=True))
     return Spectra(
-        omega=np.array(omegas),
-        command=np.stack(us, axis=1),
-        position=np.stack(ys, axis=1),
-        factor=np.array(factors),
-        third=np.array(thirds),
+        omega=2.0 * np.pi * lines_hz, command=commands.T, position=positions.T, third=thirds
     )
 
 
@@ -271,29 +260,27 @@ def estimate_periodic(
         read = [read_steps(part, joint, estimator, rate_hz) for part in parts]
         length = float(2.0 * np.pi / read[0].omega[0])
         window = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
-    omega, factor = read[0].omega, read[0].factor
-    for other in read[1:]:
-        if other.omega.shape != omega.shape or not np.allclose(other.omega, omega):
-            raise LogError(
-                f"{parts[0].source or 'log'}: the repeats of {joint} excite different frequencies; "
-                "give them the same period, band and steps."
-            )
+    omega = read[0].omega
+    if any(one.omega.shape != omega.shape or not np.allclose(one.omega, omega) for one in read):
+        raise LogError(
+            f"{parts[0].source or 'log'}: the repeats of {joint} excite different frequencies; "
+            "give them the same period, band and steps."
+        )
     u = np.concatenate([one.command for one in read])
     y = np.concatenate([one.position for one in read])
+    repeats = y / u
     if len(read) >= _ENOUGH_REPEATS:
         repeats = np.array([_h1(one.command, one.position) for one in read])
-    else:
-        repeats = y / u
     power = (np.abs(u) ** 2).sum(axis=0) * (np.abs(y) ** 2).sum(axis=0)
     cross = np.abs((np.conj(u) * y).sum(axis=0)) ** 2
     return FrequencyResponse(
         joint=joint,
         amplitude=parts[0].segments[0].amplitude,
         omega=omega,
-        response=_h1(u, y) / factor,
+        response=_h1(u, y),
         coherence=np.clip(cross / np.maximum(power, np.finfo(np.float64).tiny), 0.0, 1.0),
         averages=np.full(len(omega), float(len(u))),
-        repeats=repeats / factor,
+        repeats=repeats,
         estimator="periodic",
         window=window,
         segment_s=length,

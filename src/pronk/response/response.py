@@ -77,7 +77,7 @@ class FrequencyResponse:
     amplitude: float
     """Peak of the command [rad]."""
     omega: Array
-    """Angular frequency [rad/s], increasing, shape (f,)."""
+    """[rad/s], increasing, shape (f,)."""
     response: ComplexArray
     """Position over held command, averaged over all repeats, shape (f,)."""
     coherence: Array
@@ -91,7 +91,6 @@ class FrequencyResponse:
     window: str
     """Window and overlap in words, for the page."""
     segment_s: float
-    """Length of a segment [s]."""
     delay_s: float = 0.0
     """Command delay from the slope of the phase beyond the fitted joint [s]; NaN if not fitted."""
     third_harmonic: float = float("nan")
@@ -101,9 +100,8 @@ class FrequencyResponse:
 
     def __post_init__(self) -> None:
         """Refuse a name, shapes and frequencies that no estimate gives."""
-        where = self.source or "response"
+        where, shape = self.source or "response", np.shape(self.omega)
         check_names([self.joint], where, ArtefactError)
-        shape = np.shape(self.omega)
         fits = all(np.shape(v) == shape for v in (self.response, self.coherence, self.averages))
         if len(shape) != 1 or 0 in shape or not fits or np.shape(self.repeats)[1:] != shape:
             raise ArtefactError(f"{where}: the response of {self.joint} has contradictory shapes.")
