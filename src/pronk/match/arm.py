@@ -49,9 +49,7 @@ _PLAIN = ("stiffness", "damping", "delay")
 _ROUNDS = 15
 _SETTLED = 1e-3
 """Relative change of cost or parameters that ends the search: far below the intervals."""
-_HOLD_FIRST = (
-    *("stribeck", "armature", "stiffness", "delay", "offset", "frictionloss", "damping"),
-)
+_HOLD_FIRST = ["stribeck", "armature", "stiffness", "delay", "offset", "frictionloss", "damping"]
 """Of several parameters that cannot be distinguished, the first of these is held."""
 _COHERENT = 0.95
 _SEGMENT_S = 5.0
@@ -66,7 +64,7 @@ _AT_LIMIT = 0.25
 
 
 class ArmProblem(Problem):
-    """Residuals of the drives of one arm in time."""
+    """Residuals of the drives of one arm in time, one joint after another."""
 
     def __init__(
         self,
@@ -112,7 +110,7 @@ class ArmProblem(Problem):
         return [self.slots.index(slot) for slot in slots]
 
     def residual(self, x: Array) -> Array:
-        """Simulated less measured [rad], 0 where not trusted, one joint after another."""
+        """Simulated less measured [rad], 0 where not trusted, shape (joints * rows,)."""
         if self._last is None or not np.array_equal(self._last[0], x):
             self._last = (x.copy(), self._simulated([self.values(x)])[0])
         return self._last[1]
@@ -162,15 +160,10 @@ def fit_together(
 ) -> tuple[dict[str, JointFit], dict[str, str]]:
     """Fit drive parameters of every joint that moves in some recordings, chain by chain.
 
-    Args:
-        logs: Recordings of one robot whose base is fixed; several joints may move at once.
-        robot: The robot.
-        names: Parameters to fit, out of `PARAMETERS`; `stribeck` goes with `frictionloss` where the
-            drive has a Stribeck speed.
-        most_held: How many parameters of a joint may be held at the published value, one after
-            the other, because the recordings do not identify them.
-        threads: Threads of the simulator.
-        progress: Called with the share that is done, 0 to 1.
+    The base is fixed; several joints may move at once. `stribeck` is fitted with `frictionloss`
+    where the drive has a Stribeck speed. Up to `most_held` parameters of a joint are held at the
+    published value, one after the other, because the recordings do not identify them. `progress`
+    is called with the share that is done, 0 to 1.
 
     Returns:
         Fits by joint, and joints that moved but were not fitted with the reason.
@@ -411,7 +404,7 @@ def _joint_fits(
     matched, naive = arm.run([problem.values(solution.x), problem.nominal])
     naive_residual = problem.residuals(naive)
     for i, (name, found) in enumerate(estimates.items()):
-        rows, mask = problem.block(name), problem.used[:, i]
+        rows, mask, aside = problem.block(name), problem.used[:, i], held_out.get(name, {})
         flags = [
             f"{one} held at {found.values[one]:.4g}: these recordings do not identify it; "
             f"{PARAMETERS[one].remedy}"
@@ -436,8 +429,8 @@ def _joint_fits(
             rmse=rms(solution.residual[rows][mask]),
             published_rmse=rms(naive_residual[rows][mask]),
             total95=found.ci95,
-            held_out=held_out.get(name, {}),
-            flags=(*held_out_flags(held_out.get(name, {})), *flags, *found.flags),
+            held_out=aside,
+            flags=(*held_out_flags(aside), *flags, *found.flags),
             **_compared(arm, name, simulated, limit_hz[name]),
         )
     return out
@@ -452,27 +445,29 @@ def _compared(
     """
     low, high = arm.robot.joint(joint).band_hz
     band = (low, min(high, limit_hz))
-    found: list[tuple[int, Mask, FrequencyResponse]] = []
-    for k, log in enumerate(arm.logs):
+    best: FrequencyResponse | None = None
+    inside, k = np.zeros(0, dtype=bool), 0
+    for number, log in enumerate(arm.logs):
         try:
             measured = estimate_response(log, joint)[0]
         except LogError:
             continue  # not excited, or stuck, in this recording
-        found.append((k, measured.band(*band, COHERENCE_MIN), measured))
-    if not any(inside.any() for _, inside, _ in found):
+        mine = measured.band(*band, COHERENCE_MIN)
+        if mine.sum() > inside.sum():
+            best, inside, k = measured, mine, number
+    if best is None:
         return {}
-    k, inside, measured = max(found, key=lambda each: int(each[1].sum()))
     log, responses = arm.logs[k], []
     for position in simulated[k]:
         # Through the same estimator as the recording's.
         positions = log.position.copy()
         positions[:, log.column(joint)] = position
         responses.append(estimate_response(replace(log, position=positions), joint)[0])
-    errors = [rms(DB * np.log(one.gain[inside] / measured.gain[inside])) for one in responses]
+    errors = [rms(DB * np.log(one.gain[inside] / best.gain[inside])) for one in responses]
     return {
-        "responses": (measured,),
+        "responses": (best,),
         "band_hz": band,
-        "coherence_min": float(measured.coherence[inside].min()),
+        "coherence_min": float(best.coherence[inside].min()),
         "matched": responses[0].response,
         "naive": responses[1].response,
         "error_db": errors[0],
