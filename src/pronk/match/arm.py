@@ -163,16 +163,12 @@ def fit_together(
     The base is fixed; several joints may move at once. `stribeck` is fitted with `frictionloss`
     where the drive has a Stribeck speed. Up to `most_held` parameters of a joint are held at the
     published value, one after the other, because the recordings do not identify them. `progress`
-    is called with the share that is done, 0 to 1.
+    is called with the share that is done, 0 to 1. Also returns joints that moved but were not
+    fitted, with the reason.
 
-    Returns:
-        Fits by joint, and joints that moved but were not fitted with the reason.
-
-    Raises:
-        PronkError: A parameter is unknown or there is none.
-        LogError: Nothing moves in radians, or the recordings are too short for intervals.
-        IdentifiabilityError: A parameter is still not identified; the message names it and what to
-            record.
+    PronkError for an unknown parameter or none; LogError if nothing moves in radians or the
+    recordings are too short for intervals; IdentifiabilityError names a parameter that is still not
+    identified, and what to record.
     """
     if not logs:
         raise LogError("no recordings; the fit of an arm needs at least one.")
@@ -265,8 +261,7 @@ def _lost(
 ) -> list[tuple[str, str]]:
     """Joints and parameters to hold because the recordings do not identify them.
 
-    Raises:
-        IdentifiabilityError: More than `most_held` of a joint, or all, would be held.
+    IdentifiabilityError if more than `most_held` of a joint, or all, would be held.
     """
     unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
     lost_delay = most_held and any("delay" in lost for lost in unknown.values())

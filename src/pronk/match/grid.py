@@ -252,7 +252,7 @@ def quick_search(
     exact: bool = True,
     corrections: Sequence[Array] = (),
 ) -> tuple[list[GridSearch], list[Fit]]:
-    """Search the grid linearized everywhere and simulated where it matters.
+    """Search the grid linearized everywhere and simulated where it matters, with MuJoCo alone.
 
     1. The closed form (`pronk.simulators.linear`) over the whole grid gives a first cell.
     2. Gauss-Newton with the simulator goes from there to the optimum off the grid; not `exact`
@@ -266,11 +266,8 @@ def quick_search(
     framework has them, 1. ends at the optimum of the corrected closed form, 2. is not exact, and
     3. simulates only nodes that may be the best: two simulations are enough for most joints.
 
-    Returns:
-        Corrected map, simulated around its best node, and optimum off the grid of each target.
-
-    Raises:
-        PronkError: The simulator is not MuJoCo.
+    Returns the corrected map, simulated around its best node, and the optimum off the grid of each
+    target.
     """
     if not isinstance(rigs, MujocoSimulator):
         raise PronkError(

@@ -178,9 +178,7 @@ def with_drive_gains(
 ) -> list[JointLog]:
     """Logs with segments and the gains that were on the real drives: their own, or the given ones.
 
-    Raises:
-        LogError: A log has no gains and none are given for a joint of it, or they contradict it.
-        PronkError: A given name is no joint and no joint group of the robot.
+    LogError if a log has no gains and none are given for a joint of it, or they contradict it.
     """
     by_joint = {} if given is None or given == "default" else gains_by_joint(robot, given)
     out = []
@@ -225,11 +223,9 @@ def measured_joints(
 ) -> list[MeasuredJoint]:
     """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
 
-    Sine steps are left out: they are read step by step and have no single matrix.
-
-    Raises:
-        LogError: The joint was not excited or did not move, or its unit is unknown.
-        IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
+    Sine steps are left out: they are read step by step and have no single matrix. LogError if the
+    joint was not excited or did not move, or its unit is unknown; IdentifiabilityError if too
+    little of the band is coherent at the largest amplitude.
     """
     where = log.source or "log"
     chosen = tuple(one for one in with_segments(log).segments if one.kind != "sine_steps")
@@ -271,8 +267,7 @@ def measured_joints(
 def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
     """Join repeats of the same excitation from several logs; one an amplitude, largest first.
 
-    Raises:
-        LogError: The same amplitude has different frequencies in several logs.
+    Each log counts by its repeats. LogError if one amplitude has different frequencies in several.
     """
     groups: dict[tuple[object, ...], list[MeasuredJoint]] = {}
     for goal in (goal for row in found for goal in row):
@@ -280,35 +275,30 @@ def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
         key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
         groups.setdefault(key, []).append(goal)
     out = []
-    for goals in groups.values():
-        first = goals[0]
-        alike = [g for g in goals if np.allclose(g.measured.omega, first.measured.omega)]
-        if len(alike) < len(goals):
+    for first, *others in groups.values():
+        if not others:
+            out.append(first)
+            continue
+        each = [goal.measured for goal in (first, *others)]
+        if not all(np.allclose(one.omega, first.measured.omega) for one in each):
             raise LogError(
                 f"{first.joint} was excited at {first.measured.amplitude:.3g} rad in several logs "
                 "whose responses have different frequencies; match them one at a time."
             )
-        out.append(first if len(goals) == 1 else _together(goals))
+        share = [len(one.repeats) for one in each]
+        measured = replace(
+            first.measured,
+            response=np.average([one.response for one in each], axis=0, weights=share),
+            coherence=np.average([one.coherence for one in each], axis=0, weights=share),
+            averages=np.sum([one.averages for one in each], axis=0),
+            repeats=np.concatenate([one.repeats for one in each]),
+            source=", ".join(dict.fromkeys(one.source for one in each)),
+        )
+        # Only frequencies that are coherent in all logs.
+        inside = np.logical_and.reduce([goal.fit_mask for goal in (first, *others)])
+        warnings = dict.fromkeys(one for goal in (first, *others) for one in goal.warnings)
+        out.append(replace(first, measured=measured, fit_mask=inside, warnings=tuple(warnings)))
     return sorted(out, key=lambda goal: -goal.measured.amplitude)
-
-
-def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
-    """One target from repeats in several logs, each log counting by its repeats."""
-    share = np.array([len(goal.measured.repeats) for goal in goals], dtype=np.float64)
-    share /= share.sum()
-    each = [goal.measured for goal in goals]
-    measured = replace(
-        each[0],
-        response=np.asarray(sum(w * r.response for w, r in zip(share, each, strict=True))),
-        coherence=np.asarray(sum(w * r.coherence for w, r in zip(share, each, strict=True))),
-        averages=np.asarray(sum(r.averages for r in each)),
-        repeats=np.concatenate([r.repeats for r in each]),
-        source=", ".join(dict.fromkeys(r.source for r in each)),
-    )
-    # Only frequencies that are coherent in all logs.
-    inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
-    warnings = tuple(dict.fromkeys(one for goal in goals for one in goal.warnings))
-    return replace(goals[0], measured=measured, fit_mask=inside, warnings=warnings)
 
 
 def _inside(

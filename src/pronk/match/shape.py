@@ -163,10 +163,7 @@ def goals_of(
     """Each joint's measured response of the largest amplitude, and the simulated one, (inside,).
 
     The simulated joint has the gains, the dry friction and the delay of `gains`, and its response
-    goes through the estimator of the log.
-
-    Raises:
-        PronkError: The gains are of another robot, or lack a joint.
+    goes through the estimator of the log. PronkError if these are of another robot or lack a joint.
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
@@ -195,10 +192,8 @@ def shaped_plan(
     """Find a joint's filter, and the sweep with shaped commands that would verify it.
 
     `on_drive` are the gains on the real drive; the sweep has the amplitude of the measured one.
-
-    Raises:
-        PlanError: No filter brings the joint near the simulated one, or with every one that does a
-            limit of the drive or joint could be exceeded.
+    PlanError if no filter brings the joint near the simulated one, or with every one that does a
+    limit of the drive or joint could be exceeded.
     """
     stiffness, damping = ({goal.joint: value} for value in on_drive)
     refused = ""
@@ -284,9 +279,8 @@ def prefilter(
 def distance(goal: MeasuredJoint, simulated: ComplexArray) -> tuple[float, float, float]:
     """How far a measured response is from a simulated one.
 
-    Returns:
-        Root mean squares of the magnitude [dB] and of the distance over the magnitude, delay
-        included, and how much later it responds [s].
+    Root mean squares of the magnitude [dB] and of the distance over the magnitude, delay included,
+    and how much later it responds [s].
     """
     ratio = goal.measured.response[goal.fit_mask] / simulated
     phase = np.unwrap(np.angle(ratio))

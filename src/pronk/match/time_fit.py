@@ -99,8 +99,7 @@ class TimeFit:
 def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Repeat]:
     """Every excitation of one joint in some logs, repeats together, largest amplitude first.
 
-    Raises:
-        LogError: The joint was not excited, or its unit is not radians.
+    LogError if the joint was not excited, or its unit is not radians.
     """
     parts = [part for log in logs for group in excitations(log, joint) for part in group]
     pairs = [(part, command_trace(part, part.segments[0], joint, robot)) for part in parts]

@@ -38,9 +38,10 @@ from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import TorqueParameter
 from pronk.match.result import JointFit
+from pronk.match.simulated import grouped
 from pronk.match.uncertainty import block_moves, jackknife
 from pronk.robots.model import bench_spec
-from pronk.robots.robot import Drive, RobotSpec
+from pronk.robots.robot import RobotSpec
 
 MOTION_HZ = 40.0
 """Cutoff of position before it is differentiated [Hz]."""
@@ -119,18 +120,16 @@ class TorqueFit:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A recording on an even grid, low-passed at `MOTION_HZ`."""
+    """A recording on an even grid, low-passed at `MOTION_HZ`: rad, s and N m.
+
+    Time has the shape (n,), the others (n, joints).
+    """
 
     time: Array
-    """[s], shape (n,)."""
     position: Array
-    """[rad], shape (n, joints)."""
     velocity: Array
-    """[rad/s], shape (n, joints)."""
     acceleration: Array
-    """[rad/s^2], shape (n, joints)."""
     torque: Array
-    """[N m], shape (n, joints)."""
 
     def moves(self) -> Mask:
         """Which joints move enough for their friction to be known, shape (joints,)."""
@@ -146,11 +145,7 @@ def low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> Array:
 
 
 def motion(log: JointLog, joints: Sequence[str]) -> Motion:
-    """Position, its derivatives and torque of some joints.
-
-    Raises:
-        LogError: The log has no torque, or samples too slowly.
-    """
+    """Motion of some joints; LogError if the log has no torque, or samples too slowly."""
     where = log.source or "log"
     if log.torque is None:
         raise LogError(f"{where}: no torque channel; the torque fit needs one.")
@@ -254,19 +249,11 @@ def fit_torque(
 ) -> TorqueFit:
     """Fit armature and friction of the chain of a joint, and the torque scale or the links.
 
-    Each joint counts by the inverse of its own residual (`_PASSES` passes). Blocks are
-    `BLOCK_S` of a recording.
-
-    Args:
-        logs: Recordings with torque, every joint of the chain in each, the base fixed.
-        robot: Geometry, and the links' inertia if known.
-        joint: The joint whose chain is fitted.
-        links_known: Hold the links as the model has them, and fit the torque scale.
-        shared: Groups of joints with the same actuator: one armature for each group.
-        most_s: Beginning of each log that is used [s].
-
-    Raises:
-        LogError: A log has no torque or is too slow, or there are fewer than three blocks.
+    Every log has the torque of all joints of the chain, the base fixed; its first `most_s` are
+    used. With `links_known` the links are as in the model and the torque scale is fitted. Each
+    group of `shared` joints has the same actuator and one armature. Each joint counts by the
+    inverse of its own residual (`_PASSES` passes). LogError without torque, for a log that is too
+    slow, or with fewer than three blocks of `BLOCK_S`.
     """
     model = TorqueModel(robot, joint, links_known=links_known, shared=shared)
     columns, torques, numbers, first = [], [], [], 0
@@ -301,10 +288,7 @@ def fit_drives(
 
     The links are the model's if these explain the torque as well as fitted ones, and their torque
     is not hidden by friction. Else they are fitted, joints with equal drives share one armature,
-    and the torque scale is left open.
-
-    Returns:
-        Parameters by joint, and by joint what is to be known of them.
+    and the torque scale is left open. Also returns what is to be known of the joints.
     """
     found: dict[str, dict[str, TorqueParameter]] = {}
     flags: dict[str, str] = {}
@@ -324,12 +308,10 @@ def fit_drives(
             reason = f"{length:.3g} s, less than {3.0 * BLOCK_S:g}" if mine else reasons[0]
             flags |= dict.fromkeys(chain, f"torque not used: {reason}")
             continue
-        by_drive: dict[Drive, list[str]] = {}
-        for name in chain:
-            by_drive.setdefault(robot.joint(name).drive, []).append(name)
+        alike = grouped(chain, lambda a, b: robot.joint(a).drive == robot.joint(b).drive)
         fit = partial(fit_torque, mine, robot, root, most_s=_MOST_S / len(mine))
         known = fit(links_known=True)
-        fitted = fit(links_known=False, shared=list(by_drive.values()))
+        fitted = fit(links_known=False, shared=alike)
         wrong = bool((known.rms > _LINKS_HOLD * fitted.rms).any())
         for j, (name, own) in enumerate(known.joints.items()):
             scale = own["scale"]
