@@ -22,12 +22,10 @@ TICK_HZ = 50.0
 def second_order(
     omega: Array, *, stiffness: float, damping: float, inertia: float, delay_s: float = 0.0
 ) -> ComplexArray:
-    """Response of an ideal joint to its position command.
+    """`stiffness exp(-s delay) / (inertia s^2 + damping s + stiffness)` at s = j omega.
 
-    `stiffness exp(-s delay) / (inertia s^2 + damping s + stiffness)` at s = j omega: paper M2 with
-    zero target velocity (reading A9), where `damping` is the drive's and the joint's own together.
-
-    Units: rad/s, N m/rad, N m s/rad, kg m^2 (link and armature), s.
+    Paper M2 with zero target velocity (reading A9), `damping` of drive and joint together. Units:
+    rad/s, N m/rad, N m s/rad, kg m^2 (link and armature), s.
     """
     s = 1j * np.asarray(omega, dtype=np.float64)
     joint = stiffness / (inertia * s**2 + damping * s + stiffness)
@@ -37,15 +35,10 @@ def second_order(
 def simulate_second_order(
     command: Array, rate_hz: float, *, stiffness: float, damping: float, inertia: float
 ) -> Array:
-    """Exact response [rad] of the same joint, at rest at first, to a held command [rad].
-
-    The command is constant within each step of `1 / rate_hz`, for which the zero-order-hold
-    equivalent is exact.
-    """
+    """Exact response [rad] of the same joint, at rest at first, to a held command [rad]."""
     joint = (np.array([stiffness]), np.array([inertia, damping, stiffness]))
     numerator, denominator, _ = cont2discrete(joint, 1.0 / rate_hz, method="zoh")
-    rest = float(command[0])
-    return np.asarray(lfilter(np.ravel(numerator), denominator, command - rest) + rest)
+    return np.asarray(lfilter(np.ravel(numerator), denominator, command - command[0]) + command[0])
 
 
 def held(time: Array) -> Array:
@@ -97,7 +90,7 @@ def friction_joint(frictionloss: float) -> Callable[[Array, float], Array]:
 
     def simulate(command: Array, rate: float) -> Array:
         fine, step = 8, 1.0 / (8.0 * rate)
-        k, d, inertia = KNEE["stiffness"], KNEE["damping"], KNEE["inertia"]
+        k, d, inertia = KNEE.values()
         q = v = 0.0
         out = np.empty(len(command))
         for i, u in enumerate(command.tolist()):

@@ -14,18 +14,9 @@ from scipy.signal import lfilter
 from pronk.errors import ArtefactError, LogError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_log
-from pronk.response import (
-    Estimator,
-    FrequencyResponse,
-    H1Operator,
-    estimate,
-    load,
-    operators,
-    save,
-)
+from pronk.response import Estimator, FrequencyResponse, H1Operator, estimate, load, operators, save
 from pronk.response.grid import Grid, grid_over, held_mean
-from pronk.response.h1 import layout, sums
-from pronk.response.periodic import read_periods
+from pronk.response.h1 import Layout, layout, sums
 from synthetic_joint import (
     AMPLITUDE,
     HIP,
@@ -73,37 +64,35 @@ def errors(
 # --- estimates ----------------------------------------------------------------------------------
 
 
+NOISE = {"noise": 2e-5}
+STEPS_HZ = (0.5, 1.0, 2.0, 3.0, 5.0, 7.3, 10.0, 12.5, 15.0, 20.0)
+KINDS: dict[str, tuple[Any, float, float, int]] = {
+    "chirp": (lambda j, r: chirps(3, j, rate=r, **NOISE), 0.005, 0.5, 191),  # every bin is coherent
+    "log_chirp": (
+        lambda j, r: make_log([chirp_command("log_chirp", r)] * 3, j, kind="log_chirp", **NOISE),
+        *(0.005, 0.5, 191),
+    ),
+    "multisine": (lambda j, r: multisines(3, j, rate=r, **NOISE), 0.003, 0.2, 36),
+    # Between the lines there is only their leakage; such bins must not count as coherent.
+    "unknown": (
+        lambda j, r: multisines(3, j, rate=r, kind="unknown", period=None),
+        *(0.005, 0.5, 36),
+    ),
+    "sine_steps": (
+        lambda j, r: make_log([steps_command(r, STEPS_HZ)], j, kind="sine_steps", **NOISE),
+        *(0.005, 0.2, 10),
+    ),
+}
+
+
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
-@pytest.mark.parametrize("kind", ["chirp", "log_chirp"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", JOINTS)
-def test_chirp_gives_the_analytic_response(name: str, kind: str, rate: float) -> None:
-    log = make_log(
-        [chirp_command(kind, rate)] * 3, linear_joint(**JOINTS[name]), kind=kind, noise=2e-5
-    )
-    (response,) = estimate(log, "knee")
+def test_the_analytic_response_is_found(name: str, kind: str, rate: float) -> None:
+    make, gain_limit, phase_limit, expected = KINDS[kind]
+    (response,) = estimate(make(linear_joint(**JOINTS[name]), rate), "knee")
     gain, phase, bins = errors(response, JOINTS[name])
-    assert (gain < 0.005, phase < 0.5, bins) == (True, True, 191)  # Every bin is coherent.
-    assert response.repeats.shape == (3, len(response.omega))
-
-
-@pytest.mark.parametrize("rate", [200.0, 500.0])
-@pytest.mark.parametrize("name", JOINTS)
-def test_multisine_and_steps_give_the_analytic_response(name: str, rate: float) -> None:
-    joint = linear_joint(**JOINTS[name])
-    (response,) = estimate(multisines(3, joint, rate=rate, noise=2e-5), "knee")
-    gain, phase, bins = errors(response, JOINTS[name])
-    assert (gain < 0.003, phase < 0.2, bins) == (True, True, 36)
-    steps = [steps_command(rate, (0.5, 1.0, 2.0, 3.0, 5.0, 7.3, 10.0, 12.5, 15.0, 20.0))]
-    (response,) = estimate(make_log(steps, joint, kind="sine_steps", noise=2e-5), "knee")
-    gain, phase, bins = errors(response, JOINTS[name])
-    assert (gain < 0.005, phase < 0.2, bins) == (True, True, 10)
-
-
-def test_multisine_of_unknown_kind_is_right_where_it_is_coherent() -> None:
-    """Between the lines there is only their leakage; such bins must not count as coherent."""
-    (response,) = estimate(multisines(3, kind="unknown", period=None), "knee")
-    gain, phase, bins = errors(response, KNEE)
-    assert (gain < 0.005, phase < 0.5, bins) == (True, True, 36)
+    assert (gain < gain_limit, phase < phase_limit, bins) == (True, True, expected)
 
 
 @pytest.mark.parametrize("jitter", [0.05, 0.9])
@@ -122,10 +111,9 @@ def test_held_mean_is_the_zero_order_hold_on_the_grid_and_moves_no_step_off_it()
     time, command = np.arange(400) / 500.0, np.repeat(rng.normal(size=40), 10)
     assert np.abs(held_mean(time, command, grid_over(time).edges) - command).max() < 1e-12
     off = Grid(start=0.0013, rate_hz=487.0, count=380)
-    area = held_mean(time, command, off.edges).sum() / off.rate_hz
     fine = np.linspace(off.start, off.start + off.count / off.rate_hz, 400_001)[:-1]
     expected = command[np.searchsorted(time, fine, side="right") - 1].mean()
-    assert area == pytest.approx(expected * off.count / off.rate_hz, rel=1e-4)
+    assert held_mean(time, command, off.edges).mean() == pytest.approx(expected, rel=1e-4)
 
 
 def test_amplitudes_come_largest_first_and_repeats_together() -> None:
@@ -156,10 +144,12 @@ def test_settings_are_checked(setting: dict[str, Any], words: str) -> None:
 def test_logs_without_a_response_are_refused() -> None:
     time, command, hz = chirp_command("chirp", 200.0)
     stuck = chirps(joint=lambda u, _: 1e-4 * np.sin(u))
-    still = make_log([(time, 0.0 * command, hz)], lambda u, _: u, kind="chirp")
+    still = make_log([(time, 0.0 * command, hz)], KNEE_JOINT, kind="chirp")
     short = make_log([(time[:300], command[:300], hz[:300])], KNEE_JOINT, kind="chirp")
     time, command, hz = steps_command(500.0, (1.0, 2.0))
-    hurried = (time[:600], command[:600], hz[:600])
+    bare = make_log([(time, command, None)], KNEE_JOINT, kind="sine_steps")
+    hurried = make_log([(time[:600], command[:600], hz[:600])], KNEE_JOINT, kind="sine_steps")
+    both = np.repeat(stuck.command, 2, axis=1)
     for log, joint, words in (
         (stuck, "knee", "knee did not move"),
         (still, "knee", "stands still"),
@@ -167,19 +157,15 @@ def test_logs_without_a_response_are_refused() -> None:
         (short, "hip", r"no joint 'hip'; it has knee"),
         (multisines(periods=2), "knee", "3 equal periods are needed"),
         (multisines(period=None), "knee", "no period_s"),
+        (bare, "knee", "instantaneous frequency"),
+        (hurried, "knee", "the step at 1 Hz lasts"),
         (
-            make_log([(time, command, None)], KNEE_JOINT, kind="sine_steps"),
-            "knee",
-            "instantaneous frequency",
+            replace(stuck, joints=("knee", "hip"), command=both, position=both),
+            *("hip", "hip was not excited; knee"),
         ),
-        (make_log([hurried], KNEE_JOINT, kind="sine_steps"), "knee", "the step at 1 Hz lasts"),
     ):
         with pytest.raises(LogError, match=words):
             estimate(log, joint)
-    both = np.repeat(stuck.command, 2, axis=1)
-    two = replace(stuck, joints=("knee", "hip"), command=both, position=both)
-    with pytest.raises(LogError, match="hip was not excited; knee"):
-        estimate(two, "hip")
 
 
 @pytest.mark.skipif(not SO101.exists(), reason="the SO-101 recordings are not here")
@@ -199,64 +185,58 @@ def test_recorded_chirp_is_coherent_where_the_servo_follows() -> None:
 # --- periods ------------------------------------------------------------------------------------
 
 
-def test_lines_of_a_linear_joint_are_exact_without_noise() -> None:
-    (response,) = estimate(multisines(), "knee")
-    known = second_order(response.omega, **KNEE)
-    assert np.abs(response.response / known - 1.0).max() < 2e-4
-    # Five equal periods, of which the first settles: four repeats.
-    assert response.repeats.shape == (4, 36)
+@pytest.mark.parametrize("ramp_s", [0.0, 1.0])
+def test_lines_of_a_linear_joint_are_exact_without_noise(ramp_s: float) -> None:
+    """Of five equal periods the first settles; a ramped one falls out."""
+    time, command = multisine_command(500.0)
+    ramp = np.clip(time / ramp_s, 0.0, 1.0) if ramp_s else 1.0
+    log = make_log([(time, command * ramp, None)], KNEE_JOINT, kind="multisine", period=4.0)
+    (response,) = estimate(log, "knee")
+    assert np.abs(response.response / second_order(response.omega, **KNEE) - 1.0).max() < 2e-4
+    assert response.repeats.shape == (3 if ramp_s else 4, 36)
     assert np.allclose(response.frequency_hz * 4.0 % 2.0, 1.0)  # Odd lines alone.
+
+
+def test_of_three_excitations_each_is_a_repeat() -> None:
     (response,) = estimate(multisines(3, noise=1e-3), "knee")
     assert response.repeats.shape == (3, 36)
     assert np.all(response.averages == 12)
 
 
-def test_ramped_and_unequal_periods_fall_out() -> None:
-    time, command = multisine_command(500.0)
-    ramped = [(time, command * np.clip(time / 1.0, 0.0, 1.0), None)]
-    log = make_log(ramped, KNEE_JOINT, kind="multisine", period=4.0)
-    read = read_periods(log, "knee", Estimator(), 500.0)
-    assert len(read.command) == 3
-    known = second_order(read.omega, **KNEE)
-    assert np.abs(read.position / read.command / known - 1.0).max() < 2e-4
-
-
 # --- delay and third harmonic -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("delay", [0.002, 0.010])
-def test_delay_is_recovered(delay: float) -> None:
-    shift = round(delay * 500.0)
-
+@pytest.mark.parametrize(("delay", "noise"), [(0.002, 0.0), (0.010, 0.0), (0.0, 3e-3)])
+def test_delay_is_recovered(delay: float, noise: float) -> None:
     def late(command: np.ndarray, rate: float) -> np.ndarray:
-        return np.r_[np.zeros(shift), simulate_second_order(command, rate, **KNEE)[:-shift]]
+        moved = simulate_second_order(command, rate, **KNEE)
+        return np.r_[np.zeros(round(delay * rate)), moved][: len(moved)]
 
-    (response,) = estimate(chirps(joint=late, rate=500.0), "knee")
-    assert response.delay_s == pytest.approx(delay, abs=5e-5)
+    (response,) = estimate(chirps(4, late, rate=500.0, noise=noise), "knee")
+    assert response.delay_s == pytest.approx(delay, abs=3e-4 if noise else 5e-5)
     gain, phase, _ = errors(response, KNEE, delay=delay)
-    assert (gain < 0.005, phase < 0.5) == (True, True)
-
-
-def test_noise_moves_the_delay_little() -> None:
-    for seed in range(4):
-        (response,) = estimate(chirps(4, rate=500.0, noise=3e-3, seed=seed), "knee")
-        assert abs(response.delay_s) < 3e-4
+    assert noise or (gain < 0.005, phase < 0.5) == (True, True)
 
 
 def test_friction_shows_in_the_third_harmonic() -> None:
     """0.0000 without friction, 0.013 with 0.2 N m, twice that at half the amplitude."""
     time, command, hz = chirp_command("chirp", 500.0)
-    ratio = {}
-    for friction, scale in ((0.0, 1.0), (0.2, 1.0), (0.2, 0.5)):
-        signal = (time, scale * command, hz)
-        log = make_log([signal], friction_joint(friction), kind="chirp", noise=2e-5)
-        ratio[friction, scale] = estimate(log, "knee")[0].third_harmonic
-    assert ratio[0.0, 1.0] < 0.001
-    assert 0.008 < ratio[0.2, 1.0] < 0.02
-    assert ratio[0.2, 0.5] == pytest.approx(2.0 * ratio[0.2, 1.0], rel=0.15)
-    signals = [steps_command(500.0, (1.0, 2.0, 3.0))]
-    steps = make_log(signals, friction_joint(0.2), kind="sine_steps")
-    assert estimate(steps, "knee")[0].third_harmonic == pytest.approx(ratio[0.2, 1.0], rel=0.15)
+    half, steps = (time, 0.5 * command, hz), steps_command(500.0, (1.0, 2.0, 3.0))
+    none, all_, twice, stepped = (
+        estimate(make_log([signal], friction_joint(dry), kind=kind, noise=2e-5), "knee")[
+            0
+        ].third_harmonic
+        for signal, dry, kind in (
+            ((time, command, hz), 0.0, "chirp"),
+            ((time, command, hz), 0.2, "chirp"),
+            (half, 0.2, "chirp"),
+            (steps, 0.2, "sine_steps"),
+        )
+    )
+    assert none < 0.001
+    assert 0.008 < all_ < 0.02
+    assert twice == pytest.approx(2.0 * all_, rel=0.15)
+    assert stepped == pytest.approx(all_, rel=0.15)
 
 
 # --- uncertainty --------------------------------------------------------------------------------
@@ -292,16 +272,10 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     matrix, ones = operator.matrix(time), np.ones(len(operator.omega))
     clean = simulate_second_order(command, 200.0, **KNEE)
     noise = coloured(rng, (300, repeats, len(time)), 2e-3)
+    known, rest = clean @ matrix, {"coherence": ones, "averages": ones}
     hits = np.array(
         [
-            covered(
-                operator.omega,
-                clean @ matrix,
-                response=row.mean(axis=0),
-                coherence=ones,
-                averages=ones,
-                repeats=row,
-            )
+            covered(operator.omega, known, response=row.mean(axis=0), repeats=row, **rest)
             for row in (clean + noise) @ matrix
         ]
     )
@@ -312,19 +286,22 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     assert np.mean(np.abs(hits[:, 0].mean(axis=0) - 0.945) <= 0.045) > 0.97
 
 
+def laid_out() -> tuple[Layout, np.ndarray]:
+    """Segments over one chirp at 200 Hz, and its spectra."""
+    time, command, _ = chirp_command("chirp", 200.0)
+    where = layout(grid_over(time), SETTINGS, padded=True)
+    return where, where.spectra(held_mean(time, command, where.grid.edges))
+
+
 @pytest.mark.parametrize("colour", ["white", "coloured"])
 def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> None:
-    rng = np.random.default_rng(7)
-    time, command, _ = chirp_command("chirp", 200.0)
-    grid = grid_over(time)
-    where = layout(grid, SETTINGS, padded=True)
-    excited = where.spectra(held_mean(time, command, grid.edges))
-    clean = KNEE_JOINT(command, 200.0)
+    rng, (where, excited) = np.random.default_rng(7), laid_out()
+    clean = KNEE_JOINT(chirp_command("chirp", 200.0)[1], 200.0)
     known = sums(excited, where.spectra(clean), where).response(where.omega, 200.0)
     hits = []
     for _ in range(150):
-        white = 4e-3 * rng.standard_normal(len(time))
-        noise = white if colour == "white" else coloured(rng, (len(time),), 8e-3)
+        white = 4e-3 * rng.standard_normal(len(clean))
+        noise = white if colour == "white" else coloured(rng, (len(clean),), 8e-3)
         s = sums(excited, where.spectra(clean + noise), where)
         found = s.response(where.omega, 200.0)
         parts = {"coherence": s.coherence(), "averages": s.averages(), "repeats": found[None]}
@@ -333,18 +310,11 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
 
 
 def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
-    time, command, _ = chirp_command("chirp", 200.0)
-    grid = grid_over(time)
-    where = layout(grid, SETTINGS, padded=True)
-    excited = where.spectra(held_mean(time, command, grid.edges))
-    rng = np.random.default_rng(3)
-    raw, averages = [], np.empty(0)
-    for _ in range(150):
-        s = sums(excited, where.spectra(rng.standard_normal(grid.count)), where)
-        raw.append(np.abs(s.uy) ** 2 / (s.uu * s.yy))
-        averages = s.averages()
-    inner = slice(8, -8)
-    assert float((np.mean(raw, axis=0) * averages)[inner].mean()) == pytest.approx(1.0, abs=0.1)
+    rng, (where, excited) = np.random.default_rng(3), laid_out()
+    noise = [rng.standard_normal(where.grid.count) for _ in range(150)]
+    each = [sums(excited, where.spectra(one), where) for one in noise]
+    raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in each], axis=0)
+    assert float((raw * each[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
     # Nor is a single noisy repeat coherent by construction.
     assert float(np.median(estimate(chirps(noise=0.5), "knee")[0].coherence)) < 0.7
 
@@ -368,13 +338,13 @@ IN_MOTION = [tuple(part[:3500] for part in chirp_command("chirp", 200.0))]
 def test_operator_is_the_estimate(log: JointLog, settings: Estimator) -> None:
     (response,) = estimate(log, "knee", settings)
     (row,) = operators(log, "knee", settings)
-    parts = [log.cut(segment) for segment in log.segments]
-    each = np.array([p.position[:, 0] @ o.matrix(o.time) for o, p in zip(row, parts, strict=True)])
+    positions = [log.cut(segment).position[:, 0] for segment in log.segments]
+    pairs = list(zip(row, positions, strict=True))
+    each = np.array([position @ one.matrix(one.time) for one, position in pairs])
     weight = np.array([one.excitation for one in row])
     scale = np.abs(response.response).max()
-    for operator, part, expected in zip(row, parts, each, strict=True):
-        found = operator.response(operator.time, part.position[:, 0])
-        assert np.abs(found - expected).max() < 1e-9 * scale
+    by_transforms = np.array([one.response(one.time, position) for one, position in pairs])
+    assert np.abs(by_transforms - each).max() < 1e-9 * scale
     if len(each) == len(response.repeats):
         assert np.abs(each - response.repeats).max() < 1e-9 * scale
     whole = (each * weight).sum(axis=0) / weight.sum(axis=0)
@@ -416,15 +386,11 @@ def test_responses_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
         save(path, [FrequencyResponse(**{**vars(written[0]), "source": object()})])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-    headers: dict[str, Any] = {
-        "this pronk reads": json.dumps({"schema": "pronk/response/0"}),
-        "not a response file": np.array([{"schema": "pronk/response/1"}], dtype=object),
-    }
-    for words, header in headers.items():
-        np.savez(path, header=header)
-        with pytest.raises(ArtefactError, match=words):
-            load(path)
-    for data in (b"not a zip", before[:-200]):
+    np.savez(path, header=json.dumps({"schema": "pronk/response/0"}))
+    with pytest.raises(ArtefactError, match="this pronk reads"):
+        load(path)
+    np.savez(path, header=np.array([{"schema": "pronk/response/1"}], dtype=object))
+    for data in (path.read_bytes(), b"not a zip", before[:-200]):
         path.write_bytes(data)
         with pytest.raises(ArtefactError, match="not a response file"):
             load(path)

@@ -18,7 +18,7 @@ from pronk.match.pipeline import amplitude_flags, amplitude_gains, command_delay
 from pronk.match.response_fit import refine
 from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import gain_interval
+from pronk.match.uncertainty import Estimate, gain_interval
 from pronk.response.estimate import operators
 from pronk.response.response import Estimator
 from pronk.robots import load_robot
@@ -38,10 +38,8 @@ def known(
     repeats: int = 1,
     **options: Any,
 ) -> list[MeasuredJoint]:
-    excitations = [
-        Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=repeats)
-        for a in amplitudes
-    ]
+    signals = [Chirp(length_s=8.0, amplitude=a).samples() for a in amplitudes]
+    excitations = [Excitation(offsets=one, repeats=repeats) for one in signals]
     log = synthetic_log(ROBOT, joint, excitations, *gains, **options)
     return measured_joints(log, joint, ROBOT, SHORT)
 
@@ -55,23 +53,30 @@ def delayed(goal: MeasuredJoint, delay_s: float) -> MeasuredJoint:
     return repeated(goal, goal.measured.repeats * np.exp(-1j * goal.measured.omega * delay_s))
 
 
+def intervals(goals: list[MeasuredJoint]) -> list[Estimate]:
+    with MujocoSimulator(ROBOT) as simulator:
+        fits = refine(simulator, goals, [KNOWN] * len(goals))
+    return [gain_interval(fit.target, fit.solution) for fit in fits]
+
+
 def test_known_gains_are_found_from_anywhere_on_the_grid_whatever_the_delay() -> None:
-    goals = [known()[0], delayed(known("FR_knee", (22.0, 0.523))[0], 0.004)]
+    truth = {JOINT: KNOWN, "FR_knee": (22.0, 0.523)}
+    goals = [known()[0], delayed(known("FR_knee", truth["FR_knee"])[0], 0.004)]
     with MujocoSimulator(ROBOT) as simulator:
         for start in ((13.0, 0.1), (27.0, 0.7), (13.0, 0.7), (27.0, 0.1)):
-            fits = refine(simulator, goals, [start, start])
-            for fit, gains in zip(fits, (KNOWN, (22.0, 0.523)), strict=True):
+            for fit in refine(simulator, goals, [start, start]):
                 assert fit.solution.settled
-                assert fit.gains == pytest.approx(gains, rel=1e-3)
+                assert fit.gains == pytest.approx(truth[fit.target.joint], rel=1e-3)
                 assert fit.error_db < 0.01
 
 
 def test_delay_is_the_lag_of_the_phase_where_the_joint_is_coherent() -> None:
-    goal = known()[0]
-    band, late = ROBOT.joint(JOINT).band_hz, delayed(goal, 0.002).measured
-    assert command_delay(late, goal.measured.response, band) == pytest.approx(0.002, abs=1e-6)
+    goal, band = known()[0], ROBOT.joint(JOINT).band_hz
+    late = delayed(goal, 0.002).measured
     incoherent = replace(late, coherence=np.zeros_like(late.coherence))
-    assert command_delay(incoherent, goal.measured.response, band) == 0.0
+    for measured, delay in ((late, 0.002), (incoherent, 0.0)):
+        found = command_delay(measured, goal.measured.response, band)
+        assert found == pytest.approx(delay, abs=1e-6)
 
 
 def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
@@ -82,14 +87,10 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
     excitation = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
     log = synthetic_log(ROBOT, JOINT, [excitation], *KNOWN, noise=list(noise((repeats, 6000))))
     measured = measured_joints(log, JOINT, ROBOT, SHORT)[0]
-    operator = operators(log, JOINT, SHORT.estimator)[0][0]
+    ((operator, *_),) = operators(log, JOINT, SHORT.estimator)
     errors = noise((trials, repeats, len(operator.time))) @ operator.matrix(operator.time)
     goals = [repeated(measured, one) for one in known()[0].measured.response + errors]
-    with MujocoSimulator(ROBOT) as simulator:
-        found = [
-            gain_interval(fit.target, fit.solution)
-            for fit in refine(simulator, goals, [KNOWN] * trials)
-        ]
+    found = intervals(goals)
     assert all(one.flags == () for one in found)
     for name, true in zip(GAINS, KNOWN, strict=True):
         covered = sum(low <= true <= high for low, high in (one.ci95[name] for one in found))
@@ -102,15 +103,12 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
 def test_each_repeat_is_fitted_by_itself() -> None:
     others = np.array([(16.4, 0.380), (16.5, 0.384), (16.6, 0.386)])
     each = [known(gains=(kp, kd))[0] for kp, kd in others]
-    both = repeated(each[0], np.array([goal.measured.response for goal in each]))
-    with MujocoSimulator(ROBOT) as simulator:
-        fit = refine(simulator, [both], [(17.0, 0.4)])[0]
-    found = gain_interval(fit.target, fit.solution)
+    (found,) = intervals([repeated(each[0], np.array([one.measured.response for one in each]))])
     np.testing.assert_allclose(found.repeat_gains, others, rtol=1e-3)
     expected = np.cov(others.T) / 3
     np.testing.assert_allclose(found.covariance, expected, rtol=0.1)
     # Student's t of two degrees of freedom, 97.5 %.
-    half = found.ci95["stiffness"][1] - fit.stiffness
+    half = found.ci95["stiffness"][1] - found.values["stiffness"]
     assert half == pytest.approx(4.3027 * np.sqrt(expected[0, 0]), rel=0.05)
 
 
@@ -118,11 +116,7 @@ def test_few_repeats_are_flagged() -> None:
     rng = np.random.default_rng(3)
     two = known(repeats=2, noise=list(0.002 * rng.standard_normal((2, 6000))))[0]
     one = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
-    with MujocoSimulator(ROBOT) as simulator:
-        pair, single = (
-            gain_interval(fit.target, fit.solution)
-            for fit in refine(simulator, [two, one], [KNOWN, KNOWN])
-        )
+    pair, single = intervals([two, one])
     assert "two repeats" in pair.flags[0]
     assert "one repeat" in single.flags[0]
     low, high = single.ci95["stiffness"]

@@ -23,10 +23,8 @@ ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 @pytest.mark.parametrize("rate", [50.0, 100.0])
 def test_begins_and_ends_at_rest_and_reaches_its_peak(signal: Signal, rate: float) -> None:
     offsets = signal.samples(rate)
-    assert offsets[0] == 0.0
-    assert offsets[-1] == 0.0
-    assert np.abs(offsets).max() <= signal.amplitude * (1.0 + 1e-12)
-    assert np.abs(offsets).max() > 0.97 * signal.amplitude
+    assert offsets[0] == offsets[-1] == 0.0
+    assert 0.97 < np.abs(offsets).max() / signal.amplitude <= 1.0 + 1e-12
     assert len(offsets) == len(signal.frequency(rate))
     quiet = replace(signal, amplitude=signal.amplitude / 4.0).samples(rate)
     np.testing.assert_allclose(quiet, offsets / 4.0, atol=1e-15)
@@ -37,10 +35,7 @@ def test_begins_and_ends_at_rest_and_reaches_its_peak(signal: Signal, rate: floa
 
 def test_the_default_chirp_is_the_papers() -> None:
     chirp = Chirp()
-    assert chirp.band_hz == (0.1, 25.0)
-    assert chirp.amplitude == 0.25
-    assert len(chirp.samples()) == 1000  # 20 s at 50 Hz
-    assert chirp.period_s is None
+    assert (chirp.band_hz, chirp.amplitude, chirp.duration_s()) == ((0.1, 25.0), 0.25, 20.0)
 
 
 @pytest.mark.parametrize("chirp", [Chirp(), LogChirp()])
@@ -56,11 +51,9 @@ def test_a_chirp_turns_at_the_frequency_it_names(chirp: Chirp) -> None:
 def test_multisine_holds_odd_harmonics_and_nothing_else() -> None:
     signal = Multisine(length_s=10.0, periods=3)
     period = signal.one_period()
-    spectrum = np.abs(np.fft.rfft(period))
-    excited = np.zeros(len(spectrum), dtype=bool)
-    excited[list(signal.harmonic_numbers)] = True
-    assert all(number % 2 == 1 for number in signal.harmonic_numbers)
-    assert spectrum[~excited].max() < 1e-12 * spectrum[excited].max()
+    spectrum, lines = np.abs(np.fft.rfft(period)), np.array(signal.harmonic_numbers)
+    assert (lines % 2 == 1).all()
+    assert np.delete(spectrum, lines).max() < 1e-12 * spectrum[lines].max()
     # What is sent repeats that period exactly between the ramps.
     ramp = round(signal.ramp_s * 50.0)
     sent = signal.samples()[ramp : ramp + 3 * len(period)].reshape(3, -1)
@@ -75,21 +68,17 @@ def test_multisine_tilt_is_the_slope_of_its_lines() -> None:
 
 
 def test_more_draws_give_a_smaller_crest_factor() -> None:
-    def crest(draws: int) -> float:
-        period = Multisine(draws=draws).one_period()
-        return float(np.abs(period).max() / period.std())
-
-    assert crest(200) < crest(1)
-    assert crest(200) < 2.2
-    np.testing.assert_array_equal(Multisine(seed=3).samples(), Multisine(seed=3).samples())
-    assert not np.array_equal(Multisine(seed=3).samples(), Multisine(seed=4).samples())
+    one, best = (Multisine(draws=draws).one_period() for draws in (1, 200))
+    assert np.abs(best).max() / best.std() < min(2.2, np.abs(one).max() / one.std())
+    third, again, fourth = (Multisine(seed=seed).samples() for seed in (3, 3, 4))
+    assert np.array_equal(third, again)
+    assert not np.array_equal(third, fourth)
 
 
 def test_sine_steps_measure_whole_cycles_of_one_frequency() -> None:
     signal = SineSteps(frequencies_hz=(0.5, 3.3, 12.0))
     offsets, frequency = signal.samples(), signal.frequency()
     windows = signal.windows()
-    assert len(windows) == 3
     for (first, stop, exact), wanted in zip(windows, signal.frequencies_hz, strict=True):
         assert exact == pytest.approx(wanted, rel=0.02)
         assert set(frequency[first:stop]) == {exact}
@@ -112,8 +101,7 @@ def test_ramps_stay_between_zero_and_one(ticks: int, ramp: int) -> None:
         return
     window = ramps(ticks, ramp)
     assert window[0] == window[-1] == 0.0
-    assert window.min() >= 0.0
-    assert window.max() <= 1.0
+    assert 0.0 <= window.min() <= window.max() <= 1.0
     np.testing.assert_allclose(window, window[::-1], atol=1e-15)
 
 
@@ -134,22 +122,17 @@ def test_ramps_stay_between_zero_and_one(ticks: int, ramp: int) -> None:
     ],
 )
 def test_impossible_signals_are_refused(make: object, words: str) -> None:
-    with pytest.raises(PlanError, match=words) as caught:
+    with pytest.raises(PlanError, match=words):
         make()  # type: ignore[operator]
-    assert "\n" not in str(caught.value)
 
 
-def test_a_shifted_copy_is_found_though_it_does_not_correlate_at_lag_zero() -> None:
-    time = np.arange(2000) / 50.0
-    pair = np.stack([np.sin(2 * np.pi * time), np.cos(2 * np.pi * time)], axis=1)
-    assert abs(np.corrcoef(pair.T)[0, 1]) < 1e-3
-    note = correlation_note(time, pair, ["pan", "lift"])
+def test_commands_correlate_with_a_shifted_copy_and_not_with_noise_or_rest() -> None:
+    time, turn = np.arange(6000) / 50.0, 2.0 * np.pi * np.arange(6000) / 50.0
+    shifted = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+    assert abs(np.corrcoef(shifted.T)[0, 1]) < 1e-3
+    note = correlation_note(time, shifted, ["pan", "lift"])
     assert re.search(r"lift and pan correlate to (0\.9[5-9]|1\.00)", note)
-
-
-def test_still_commands_and_independent_noise_pass() -> None:
-    time = np.arange(6000) / 50.0
-    pair = np.stack([np.full(6000, 0.3), np.sin(time)], axis=1)
-    assert correlation_note(time, pair, ["pan", "lift"]) == ""
+    still = np.stack([np.full(6000, 0.3), np.sin(time)], axis=1)
+    assert correlation_note(time, still, ["pan", "lift"]) == ""
     noise = np.random.default_rng(0).normal(size=(6000, 4))
     assert correlation_note(time, noise, list("abcd")) == ""
