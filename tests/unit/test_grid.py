@@ -107,17 +107,6 @@ def test_rolls_moved_to_the_same_side_share_most_of_a_simulation() -> None:
     assert shares[-1] == pytest.approx(1.0)
 
 
-def test_the_coarse_search_finds_the_best_of_the_whole_grid() -> None:
-    goal, grid = known("FR_knee"), axes(ROBOT, 22)
-    with MujocoSimulator(ROBOT) as simulator:
-        whole = search(simulator, [goal], *grid)[0]
-        coarse = coarse_search(simulator, [goal], *grid)[0]
-    assert coarse.cell == whole.cell
-    looked = np.isfinite(coarse.error)
-    assert looked.mean() < 0.3
-    np.testing.assert_allclose(coarse.error[looked], whole.error[looked], rtol=1e-12)
-
-
 def test_the_error_is_the_mean_square_in_decibels() -> None:
     goal = known("FR_hip_pitch")
     measured = goal.measured.response[goal.fit_mask]
@@ -198,20 +187,26 @@ def test_with_friction_it_is_close_enough_to_start_from(joint: str) -> None:
     assert rough < min(0.3, bare)
 
 
-def test_the_quick_search_finds_what_simulating_everything_finds() -> None:
+def test_shorter_searches_find_what_simulating_everything_finds() -> None:
     """Same node of the grid, and the refined gains within 0.1 %, off the nodes and off the model.
 
     The measured joints have twice the simulator's dry friction, so no gains fit exactly and the
     optimum is one of a misfit.
     """
     goals = [known(f"FL_{group}", frictionloss=0.4) for group in ("hip_pitch", "knee")]
-    grid = axes(ROBOT, 18)
+    grid = axes(ROBOT, 20)
     with MujocoSimulator(ROBOT) as simulator:
         grids, quick = quick_search(simulator, goals, *grid)
-        whole = [search(simulator, [goal], *grid)[0] for goal in goals]
+        whole, coarse = (
+            [method(simulator, [goal], *grid)[0] for goal in goals]
+            for method in (search, coarse_search)
+        )
         fits = refine(simulator, goals, [one.gains for one in whole])
-    for cells, fast, slow, fit in zip(grids, quick, whole, fits, strict=True):
-        assert cells.cell == slow.cell
+    for cells, fast, rough, slow, fit in zip(grids, quick, coarse, whole, fits, strict=True):
+        assert cells.cell == rough.cell == slow.cell
+        looked = np.isfinite(rough.error)
+        assert looked.mean() < 0.35
+        np.testing.assert_allclose(rough.error[looked], slow.error[looked], rtol=1e-12)
         assert cells.error_db == pytest.approx(slow.error_db, rel=1e-6)
         assert fit.error_db > 0.02
         assert fast.gains == pytest.approx(fit.gains, rel=1e-3)
