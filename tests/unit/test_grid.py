@@ -84,9 +84,8 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
     for goal, one in zip(goals, found, strict=True):
         assert one.error.shape == (50, 50)
         assert one.cell == nearest(one, TABLE_I[goal.joint])
-        assert one.error_db < 0.1
         # Far off the error is large: the map has one valley.
-        assert np.sqrt(one.error[0, 0]) > 1.0
+        assert one.error_db < 0.1 < 1.0 < np.sqrt(one.error[0, 0])
 
 
 def test_rolls_moved_to_the_same_side_share_most_of_a_simulation() -> None:
@@ -173,18 +172,6 @@ def test_at_a_fine_step_the_closed_form_is_the_second_order_joint() -> None:
     gravity, s = (bias[1] - bias[0]) / 2e-4, 1j * omega
     expected = 17.0 / (inertia * s**2 + (0.4 + viscous) * s + 17.0 + gravity)
     np.testing.assert_allclose(found, expected, rtol=2e-3)
-
-
-@pytest.mark.parametrize("joint", ["FR_hip_roll", "FR_hip_pitch", "FR_knee"])
-def test_with_friction_it_is_close_enough_to_start_from(joint: str) -> None:
-    goal = known(joint, (20.0, 0.5), length_s=10.0)
-    with MujocoSimulator(ROBOT) as simulator:
-        linear = plant(simulator.rig(joint), goal.trace.excitation(ROBOT)[0], goal.omega)
-    rough, bare = (
-        goal.rms_db(linear.response(20.0, 0.5, amplitude=amplitude)[0])
-        for amplitude in (0.25, np.nan)
-    )
-    assert rough < min(0.3, bare)
 
 
 def test_shorter_searches_find_what_simulating_everything_finds() -> None:

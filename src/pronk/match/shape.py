@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 import yaml
 from scipy.optimize import least_squares
@@ -78,18 +78,16 @@ class Prefilter:
     delay_s: float
     """How much later the shaped joint responds than the simulated one [s]."""
     before_db: float
-    """Magnitude of the measured response over the simulated one, root mean square [dB]."""
     after_db: float
-    """The same of the shaped one, as computed [dB]."""
+    """Magnitude of the measured response over the simulated one, root mean square, and the same of
+    the shaped one, as computed [dB]."""
     before_error: float
-    """Distance of the measured response from the simulated one over its magnitude, delay included,
-    root mean square."""
     after_error: float
-    """The same of the shaped one, as computed."""
+    """Distance of the measured response from the simulated one over its magnitude, delay included,
+    root mean square, and the same of the shaped one, as computed."""
     peak_db: float
-    """Largest gain of the filter up to half the command rate [dB]."""
     peak_hz: float
-    """Where it is [Hz]."""
+    """Largest gain of the filter up to half the command rate [dB], and where it is [Hz]."""
     amplitude: float
     """Of the command at which the joint was measured [rad]."""
 
@@ -305,11 +303,5 @@ def as_requested(log: JointLog, signals: Mapping[str, Shaped], robot: RobotSpec)
 
 def save(path: Path, shape: Shape) -> None:
     """Write `shape.yaml`, whole or not at all."""
-    body: dict[str, Any] = {"schema": SCHEMA, **vars(shape)}
-    body["gains"] = {name: list(pair) for name, pair in shape.gains.items()}
-    body["joints"] = {
-        name: {k: list(v) if isinstance(v, tuple) else v for k, v in vars(one).items()}
-        for name, one in shape.joints.items()
-    }
-    body["logs"] = dict(shape.logs)
+    body = {"schema": SCHEMA, **msgspec.to_builtins(shape)}
     write_text(path, yaml.safe_dump(body, sort_keys=False, width=1000, default_flow_style=None))
