@@ -30,7 +30,7 @@ from pronk.match.fit import Problem, Solution, solve
 from pronk.match.measured_joint import DB, gains_on_drive, rms
 from pronk.match.parameters import GAINS, PARAMETERS, checked_names
 from pronk.match.result import HELD_OUT, JointFit, held_out_flags
-from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
+from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife, time_blocks
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
@@ -80,34 +80,16 @@ class ArmProblem(Problem):
         `found` holds drives from an earlier fit, the `nominal` ones where a joint is missing;
         `progress` is called with the number of simulations done.
         """
-        self.late = tuple(joint for joint, names in fitted.items() if "delay" in names)
-        """Joints whose common delay is fitted; it has the slot of the first."""
-        super().__init__(
-            {**nominal, **found},
-            {
-                j: [n for n in names if n != "delay" or j == self.late[0]]
-                for j, names in fitted.items()
-            },
-            refitted=found,
-        )
+        super().__init__({**nominal, **found}, fitted, shared=("delay",), refitted=found)
         self.arm, self.fitted, self.used, self.nominal = arm, fitted, used, nominal
         self.measured = np.concatenate(arm.measured())
         """Shape (rows, joints) [rad]; NaN where a recording does not excite a joint."""
         self._progress = progress
         self._last: tuple[Array, Array] | None = None
 
-    def values(self, x: Array) -> dict[str, dict[str, float]]:
-        """Parameters by joint that some searched numbers stand for."""
-        out = super().values(x)
-        for joint in self.late:
-            out[joint]["delay"] = out[self.late[0]]["delay"]
-        return out
-
     def columns(self, joint: str) -> list[int]:
         """Places of a joint's fitted parameters among the searched numbers."""
-        first = self.late[0] if joint in self.late else joint
-        slots = [(first if n == "delay" else joint, n) for n in self.fitted[joint]]
-        return [self.slots.index(slot) for slot in slots]
+        return [self.column[joint, name] for name in self.fitted[joint]]
 
     def residual(self, x: Array) -> Array:
         """Simulated less measured [rad], 0 where not trusted, shape (joints * rows,)."""
@@ -192,7 +174,10 @@ def _fit_chain(
 ) -> dict[str, JointFit]:
     """Fit the joints of one chain: first without every fourth block, then to everything."""
     used, limit_hz = trusted(arm)
-    blocks = _blocks(arm.logs)
+    times, (short, length) = [log.time for log in arm.logs], BLOCKS_S
+    if (whole := sum(map(np.ptp, times))) < MIN_BLOCKS * length:
+        length = max(short, whole / _BLOCKS)
+    blocks = np.concatenate(time_blocks(times, length))
     if (count := len(np.unique(blocks))) < MIN_BLOCKS:
         raise LogError(
             f"the recordings make {count} blocks of {BLOCKS_S[0]:g} s or more; intervals need at "
@@ -271,8 +256,9 @@ def _lost(
         for e in estimates.values()
         if "delay" in e.ci95
     )
-    if (lost_delay or none_late) and all(len(problem.fitted[j]) > 1 for j in problem.late):
-        return [(joint, "delay") for joint in problem.late]
+    late = [joint for joint, names in problem.fitted.items() if "delay" in names]
+    if (lost_delay or none_late) and all(len(problem.fitted[joint]) > 1 for joint in late):
+        return [(joint, "delay") for joint in late]
     if any(
         len({*held[joint]} - {"delay"}) >= most_held or len(problem.fitted[joint]) == 1
         for joint in unknown
@@ -345,21 +331,6 @@ def trusted(arm: ChainSimulation) -> tuple[Mask, dict[str, float]]:
                 limit[joint] = min(limit[joint], highest)
         masks.append(mask)
     return np.concatenate(masks), limit
-
-
-def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
-    """Number of the block of every sample of all recordings, shape (rows,)."""
-    out, first = [], 0
-    spans = [float(log.time[-1] - log.time[0]) for log in logs]
-    short, length = BLOCKS_S
-    if sum(spans) < MIN_BLOCKS * length:
-        length = max(short, sum(spans) / _BLOCKS)
-    for log, span in zip(logs, spans, strict=True):
-        count = max(round(span / length), 1)
-        share = ((log.time - log.time[0]) / span * count).astype(np.int64)
-        out.append(first + np.minimum(share, count - 1))
-        first += count
-    return np.concatenate(out)
 
 
 def _estimates(
@@ -452,19 +423,20 @@ def _compared(
             best, inside, k = measured, mine, number
     if best is None:
         return {}
-    log, responses = arm.logs[k], []
+    responses, errors = [], []
     for position in simulated[k]:
         # Through the same estimator as the recording's.
-        positions = log.position.copy()
-        positions[:, log.column(joint)] = position
-        responses.append(estimate_response(replace(log, position=positions), joint)[0])
-    errors = [rms(DB * np.log(one.gain[inside] / best.gain[inside])) for one in responses]
+        positions = arm.logs[k].position.copy()
+        positions[:, arm.logs[k].column(joint)] = position
+        one = estimate_response(replace(arm.logs[k], position=positions), joint)[0]
+        responses.append(one.response)
+        errors.append(rms(DB * np.log(one.gain[inside] / best.gain[inside])))
     return {
         "responses": (best,),
         "band_hz": band,
         "coherence_min": float(best.coherence[inside].min()),
-        "matched": responses[0].response,
-        "naive": responses[1].response,
+        "matched": responses[0],
+        "naive": responses[1],
         "error_db": errors[0],
         "naive_error_db": errors[1],
     }

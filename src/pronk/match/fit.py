@@ -33,16 +33,23 @@ class Problem(ABC):
         start: Mapping[str, Mapping[str, float]],
         fitted: Mapping[str, Sequence[str]],
         *,
+        shared: Collection[str] = (),
         refitted: Collection[str] = (),
     ) -> None:
         """Choose what is searched: the `fitted` parameters, from where `start` has them, by joint.
 
-        Published values may be a bad place to begin (`Parameter.start`); those of the `refitted`
-        joints come from an earlier fit.
+        The `shared` parameters are one for all joints. Published values may be a bad place to begin
+        (`Parameter.start`); those of the `refitted` joints come from an earlier fit.
         """
         self.start = start
-        self.slots = [(joint, name) for joint, names in fitted.items() for name in names]
-        """Joint and name of each searched number."""
+        self.slots: list[tuple[str, str]] = []
+        """Joint and name of each searched number; of a shared one the first joint."""
+        self.column: dict[tuple[str, str], int] = {}
+        """Searched number of each joint and name."""
+        for joint, name in ((joint, name) for joint, names in fitted.items() for name in names):
+            same = [n for n, (_, known) in enumerate(self.slots) if known == name in shared]
+            self.column[joint, name] = same[0] if same else len(self.slots)
+            self.slots += [] if same else [(joint, name)]
         kinds = [PARAMETERS[name] for _, name in self.slots]
         self.low = np.array([kind.scaled(kind.low) for kind in kinds])
         self.high = np.array([kind.scaled(kind.high) for kind in kinds])
@@ -56,8 +63,8 @@ class Problem(ABC):
     def values(self, x: Array) -> dict[str, dict[str, float]]:
         """Parameters by joint that some searched numbers stand for."""
         out = {joint: dict(values) for joint, values in self.start.items()}
-        for (joint, name), number in zip(self.slots, x, strict=True):
-            out[joint][name] = PARAMETERS[name].unscaled(float(number))
+        for (joint, name), column in self.column.items():
+            out[joint][name] = PARAMETERS[name].unscaled(float(x[column]))
         return out
 
     @abstractmethod

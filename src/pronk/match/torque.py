@@ -39,7 +39,7 @@ from pronk.logs.joint_log import JointLog
 from pronk.match.gains import TorqueParameter
 from pronk.match.result import JointFit
 from pronk.match.simulated import grouped
-from pronk.match.uncertainty import block_moves, jackknife
+from pronk.match.uncertainty import block_moves, jackknife, time_blocks
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
 
@@ -256,7 +256,7 @@ def fit_torque(
     slow, or with fewer than three blocks of `BLOCK_S`.
     """
     model = TorqueModel(robot, joint, links_known=links_known, shared=shared)
-    columns, torques, numbers, first = [], [], [], 0
+    columns, torques, times, kept = [], [], [], []
     for log in logs:
         moved = motion(log, model.joints)
         every = max(1, round(log.rate_hz / RATE_HZ))
@@ -265,19 +265,18 @@ def fit_torque(
         full, torque = low_passed(full, step, FIT_HZ), low_passed(moved.torque[used], step, FIT_HZ)
         # Both sides end at FIT_HZ, and the ends hold the transients of the filters.
         keep = slice(round(0.1 * step), -round(0.1 * step), max(1, int(step / (4.0 * FIT_HZ))))
-        time = moved.time[used] - moved.time[0]
-        count = max(round(time[-1] / BLOCK_S), 1)
-        share = np.minimum((time[keep] / time[-1] * count).astype(int), count - 1)
         # What friction holds a joint at that stands still is not known.
         moves = moved.moves()
         columns.append(np.where(moves[:, None], full[keep], 0.0))
         torques.append(np.where(moves, torque[keep], 0.0))
-        numbers.append(first + share)
-        first += count
-    if first < 3:
-        raise LogError(f"the recordings make {first} blocks of {BLOCK_S:g} s; intervals need 3.")
+        times.append(moved.time[used] - moved.time[0])
+        kept.append(keep)
+    numbers = time_blocks(times, BLOCK_S)
+    if (count := int(numbers[-1][-1]) + 1) < 3:
+        raise LogError(f"the recordings make {count} blocks of {BLOCK_S:g} s; intervals need 3.")
     design, goal = np.concatenate(columns), np.concatenate(torques)
-    blocks = np.repeat(np.concatenate(numbers), goal.shape[1])
+    used_numbers = [own[keep] for own, keep in zip(numbers, kept, strict=True)]
+    blocks = np.repeat(np.concatenate(used_numbers), goal.shape[1])
     return _solve(model, design, goal, blocks)
 
 

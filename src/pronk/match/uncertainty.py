@@ -53,6 +53,18 @@ def block_moves(jacobian: Array, residual: Array, blocks: NDArray[np.int64]) -> 
     return np.array(moves)
 
 
+def time_blocks(times: Sequence[Array], length_s: float) -> list[NDArray[np.int64]]:
+    """Number of the block of each timestamp of some recordings [s], blocks of about `length_s`."""
+    out, first = [], 0
+    for time in times:
+        span = time[-1] - time[0]
+        count = max(round(span / length_s), 1)
+        share = ((time - time[0]) / span * count).astype(np.int64)
+        out.append(first + np.minimum(share, count - 1))
+        first += count
+    return out
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Parameters of one joint with their uncertainty."""
