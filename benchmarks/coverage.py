@@ -74,7 +74,7 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
                     goals.append(replace(noisy, measured=each))
                 for k, fit in enumerate(refine(simulator, goals, [known] * count), start=begin):
                     ci95 = gain_interval(fit.target, fit.solution).ci95
-                    gains[k] = fit.stiffness, fit.damping
+                    gains[k] = fit.gains
                     low[k], high[k] = zip(*(ci95[one] for one in GAINS), strict=True)
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))
         expected = np.array(known)

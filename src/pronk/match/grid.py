@@ -105,7 +105,7 @@ def errors(
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Progress | None = None,
+    progress: Progress = lambda share: None,
     armature: float | None = None,
 ) -> Array:
     """Mean squared errors of targets that share one simulation [dB^2], shape (group, b).
@@ -125,8 +125,7 @@ def errors(
     for part, position in rigs.run([longest], values, max(goal.steps for goal in group)):
         for k, goal in enumerate(group):
             out[k, part] = mean_square(goal.error_db(goal.fit_response(position)))
-        if progress is not None:
-            progress(part.stop / len(stiffness))
+        progress(part.stop / len(stiffness))
     return out
 
 
@@ -135,15 +134,12 @@ def search(
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Progress | None = None,
+    progress: Progress = lambda share: None,
 ) -> list[GridSearch]:
     """Simulate the whole grid for targets that share one simulation; arguments as `errors`."""
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
-    shape = (len(stiffness), len(damping))
-    found = errors(rigs, group, kp, kd, progress)
-    return [
-        GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
-    ]
+    found = errors(rigs, group, kp, kd, progress).reshape(-1, len(stiffness), len(damping))
+    return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in found]
 
 
 def search_all(
@@ -151,7 +147,7 @@ def search_all(
     targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Progress | None = None,
+    progress: Progress = lambda share: None,
 ) -> list[GridSearch]:
     """The whole grid for any number of targets, each family of mirrored joints simulated once.
 
@@ -169,15 +165,14 @@ def search_all(
     for k, family in enumerate(families):
 
         def report(share: float, k: int = k) -> None:
-            if progress is not None:
-                progress((k + share) / len(families))
+            progress((k + share) / len(families))
 
         members = [goal for group in family for goal in group]
         maps = search(rigs, members, stiffness, damping, report)
-        found |= {id(goal): one for goal, one in zip(members, maps, strict=True)}
+        found |= zip(map(id, members), maps, strict=True)
         for group in family[1:]:
             done = _simulate_near(rigs, group, [found[id(goal)] for goal in group])
-            found |= {id(goal): one for goal, one in zip(group, done, strict=True)}
+            found |= zip(map(id, group), done, strict=True)
     return [found[id(goal)] for goal in targets]
 
 
@@ -276,11 +271,10 @@ def quick_search(
         )
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     known = corrections or [np.zeros(len(goal.omega)) for goal in targets]
-    plants, logs, first = [], [], []
-    for goal, correction in zip(targets, known, strict=True):
-        plants.append(linearized(rigs, goal))
-        response = plants[-1].response(kp, kd, amplitude=goal.trace.amplitude)
-        logs.append(np.log(np.abs(response)))
+    plants = [linearized(rigs, goal) for goal in targets]
+    logs, first = [], []
+    for goal, linear, correction in zip(targets, plants, known, strict=True):
+        logs.append(np.log(np.abs(linear.response(kp, kd, amplitude=goal.trace.amplitude))))
         best = int(np.argmin(_map(goal, logs[-1] + correction)))
         first.append((float(kp[best]), float(kd[best])))
     if corrections:

@@ -90,23 +90,13 @@ class Fit:
     """Gains of one joint at one amplitude, off the grid."""
 
     target: MeasuredJoint
-    """The measured response."""
     solution: Solution
 
     @property
-    def stiffness(self) -> float:
-        """Stiffness [N m/rad]."""
-        return float(np.exp(self.solution.x[0]))
-
-    @property
-    def damping(self) -> float:
-        """Damping [N m s/rad]."""
-        return float(np.exp(self.solution.x[1]))
-
-    @property
     def gains(self) -> Pair:
-        """Stiffness and damping."""
-        return self.stiffness, self.damping
+        """Stiffness [N m/rad] and damping [N m s/rad]."""
+        stiffness, damping = np.exp(self.solution.x).tolist()
+        return stiffness, damping
 
     @property
     def gain_db(self) -> Array:

@@ -86,8 +86,8 @@ _SCALE = (0.5, 2.0)
 """Torque scale of a sensor on the joint's side of the gear."""
 _AGREE = 0.3
 """Relative difference of one parameter by torque and by position that is no contradiction."""
-_BOTH = {"armature": ("armature", "kg m^2"), "dry": ("frictionloss", "N m")}
-"""Names by position and units of what is fitted by torque as well."""
+_BOTH = {"armature": "armature", "dry": "frictionloss"}
+"""Names by position of what is fitted by torque as well."""
 _PRIOR = {"viscous": 1.0, "stribeck": 0.3}
 """Standard deviations about zero, of the root mean square torque of the joint's friction: all of it
 may be viscous, and geared drives break away at 1.15 to 1.45 of their Coulomb friction (those of
@@ -342,24 +342,23 @@ def joint_fits(
     """
     out = {}
     for known in robot.joints:
-        name, own = known.name, drives.get(known.name, {})
-        found = [flags[name]] if name in flags else []
+        joint, own = known.name, drives.get(known.name, {})
+        found = [flags[joint]] if joint in flags else []
         identified = {
             term: own[term].value for term in _BOTH if term in own and own[term].identified
         }
-        fit = fits.get(name)
+        fit = fits.get(joint)
         if fit:
             for term, value in identified.items():
-                parameter, unit = _BOTH[term]
-                other, (low, high) = getattr(fit, parameter), own[term].ci95
+                name = _BOTH[term]
+                other, (low, high) = getattr(fit, name), own[term].ci95
                 apart = not low <= other <= high and abs(value - other) > _AGREE * other
-                if parameter in fit.ci95 and apart:
-                    found.append(
-                        f"{parameter} {other:.3g} {unit} by position, {value:.3g} by torque"
-                    )
+                if name in fit.ci95 and apart:
+                    unit = UNITS[term]
+                    found.append(f"{name} {other:.3g} {unit} by position, {value:.3g} by torque")
         elif any(one.identified for one in own.values()):
             fit = JointFit(
-                joint=name,
+                joint=joint,
                 stiffness=known.stiffness,
                 damping=known.damping,
                 armature=identified.get("armature", known.drive.armature),
@@ -369,7 +368,7 @@ def joint_fits(
             held = ["stiffness", "damping", *["armature"] * ("armature" not in identified)]
             found.append(f"{', '.join(held)}: not fitted but those of the robot's file")
         if fit:
-            out[name] = replace(fit, torque=own, flags=(*fit.flags, *found))
+            out[joint] = replace(fit, torque=own, flags=(*fit.flags, *found))
     return out
 
 
