@@ -21,12 +21,15 @@ from pronk.virtual.sim_params import load_sim_params
 ROBOT = load_robot("mini_cheetah")
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("sweep")
-    plan = make_plan(ROBOT, ["FL_knee"], Chirp(length_s=12.0), amplitudes=(0.2,), repeats=2)
+def swept(out: Path, joint: str, amplitude: float) -> Path:
+    plan = make_plan(ROBOT, [joint], Chirp(length_s=12.0), amplitudes=(amplitude,), repeats=2)
     sweep_virtual(plan, load_sim_params(None, ROBOT), out)
     return out
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return swept(tmp_path_factory.mktemp("sweep"), "FL_knee", 0.2)
 
 
 def test_the_shaped_joint_responds_like_the_simulated_one(logs: Path, tmp_path: Path) -> None:
@@ -50,19 +53,17 @@ def test_the_shaped_joint_responds_like_the_simulated_one(logs: Path, tmp_path: 
 
 
 def test_what_the_drive_cannot_do_is_refused(logs: Path, tmp_path: Path) -> None:
-    common = ("shape", logs, "--robot", "mini_cheetah", "--out", tmp_path / "shape.yaml")
-    assert "times the torque" in refused(*common, "--sim-gains", "knee=60,.6")
-    assert "--sim-gains" in refused(*common)
-    assert "--sim-gains" in refused(*common, "--sim-gains", "hip_roll=17,.4")
-    assert "isaaclab-newton" in refused(*common, "--sim-gains", "knee=17,.4", "--like", "isaac")
+    small = swept(tmp_path / "small", "FR_knee", 0.04)
+    for folder, options, words in (
+        (logs, ("--sim-gains", "knee=60,.6"), "times the torque"),
+        (logs, (), "--sim-gains"),
+        (logs, ("--sim-gains", "hip_roll=17,.4"), "--sim-gains"),
+        (logs, ("--sim-gains", "knee=17,.4", "--like", "isaac"), "isaaclab-newton"),
+        (small, ("--sim-gains", "knee=400,.4"), "at most 25 %"),
+    ):
+        common = ("shape", folder, "--robot", "mini_cheetah", "--out", tmp_path / "shape.yaml")
+        assert words in refused(*common, *options)
     assert not (tmp_path / "shape.yaml").exists()
-
-
-def test_a_joint_far_from_the_simulated_one_is_refused(tmp_path: Path) -> None:
-    plan = make_plan(ROBOT, ["FR_knee"], Chirp(length_s=12.0), amplitudes=(0.04,), repeats=2)
-    sweep_virtual(plan, load_sim_params(None, ROBOT), tmp_path)
-    common = ("shape", tmp_path, "--robot", "mini_cheetah", "--out", tmp_path / "shape.yaml")
-    assert "at most 25 %" in refused(*common, "--sim-gains", "knee=400,.4")
 
 
 def test_a_filter_keeps_the_pose_and_its_signal_ends_at_rest() -> None:

@@ -145,17 +145,6 @@ def test_full_and_banded_responses_agree_and_the_horizon_changes_no_gain() -> No
 # --- the linearized simulator -------------------------------------------------------------------
 
 
-def test_without_friction_the_closed_form_is_the_simulation() -> None:
-    measured = known("FR_knee", (20.0, 0.5), length_s=20.0, frictionloss=0.0).measured
-    with MujocoSimulator(ROBOT) as simulator:
-        linear = plant(simulator.rig("FR_knee"), np.array([1.6]), measured.omega)
-    # Below 1 Hz the windows of the chirp leak; above it nothing but the swing of gravity is left.
-    above = measured.omega > 2 * np.pi * 1.0
-    ratio = (measured.response / linear.response(20.0, 0.5)[0])[above]
-    assert np.abs(DB * np.log(np.abs(ratio))).max() < 0.05
-    assert np.abs(np.angle(ratio)).max() < np.deg2rad(0.3)
-
-
 def test_at_a_fine_step_the_closed_form_is_the_second_order_joint() -> None:
     """`stiffness / (I s^2 + (damping + b) s + stiffness + gravity)` (paper M2, reading A9)."""
     omega = 2 * np.pi * np.array([0.5, 2.0, 5.0, 10.0, 20.0])
