@@ -81,8 +81,7 @@ class MeasuredJoint:
         """From position about the pose at each step to the response, shape (steps, 2 inside).
 
         Real and imaginary columns side by side: one real product is faster than one of complex
-        numbers. A chirp leaves the band long before it ends; the windows of the segments after
-        that hold next to nothing of the band's frequencies. The rows end where all remaining
+        numbers. A chirp leaves the band long before it ends: the rows end where all remaining
         positions together move no gain by `_TAIL`, judged by a joint that follows its command
         perfectly, so later steps need not be simulated.
         """
@@ -90,8 +89,8 @@ class MeasuredJoint:
         command = self.trace.command - self.trace.command[0]
         tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
         loud = np.nonzero(tail > _TAIL)[0]
-        steps = min(int(loud[-1]) + 2, len(chosen)) if len(loud) else len(chosen)
-        return np.hstack([chosen[:steps].real, chosen[:steps].imag])
+        chosen = chosen[: int(loud[-1]) + 2] if len(loud) else chosen
+        return np.hstack([chosen.real, chosen.imag])
 
     @property
     def steps(self) -> int:
@@ -101,8 +100,7 @@ class MeasuredJoint:
     def fit_response(self, position: Array) -> ComplexArray:
         """Response at the frequencies inside, in this joint's coordinate, shape (..., inside).
 
-        `position` is that of the joint simulated, about the pose, shape (..., at least `steps`)
-        [rad].
+        `position` is that of the joint simulated [rad], shape (..., at least `steps`).
         """
         # The mean is removed; without it nothing is cut off where the steps end at rest.
         moved = position[..., : self.steps] - position[..., :1]

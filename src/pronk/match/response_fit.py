@@ -116,12 +116,11 @@ def refine(
     linear: Sequence[Plant] = (),
     corrections: Sequence[Array] = (),
 ) -> list[Fit]:
-    """Find the gains that minimize the weighted squared gain error, one fit a target.
+    """Find the gains that minimize the weighted squared gain error, from a `start` each.
 
-    `start` holds the (stiffness, damping) to begin with, one a target. With the `linear` drives
-    of the targets steps are a third as long to compute, and the optimum is off by the part of the
-    error that the joint cannot avoid times the error of the linear slope. With `corrections` of
-    the linear drives' log gain, shape (inside,) each, nothing is simulated.
+    With the `linear` drives of the targets steps are a third as long to compute, and the optimum is
+    off by the part of the error that the joint cannot avoid times the error of the linear slope.
+    With `corrections` of their log gain, shape (inside,) each, nothing is simulated.
     """
     none = [None] * len(targets)
     each = zip(targets, start, linear or none, corrections or none, strict=True)

@@ -31,9 +31,8 @@ from pronk.response.periodic import read_steps
 from pronk.response.response import Estimator, FrequencyResponse
 
 _TOP_HZ = 25.0
-"""Highest frequency that takes part in the fit of the delay [Hz]."""
 _COHERENT = 0.8
-"""Least coherence of a frequency that takes part in the fit of the delay."""
+"""Highest frequency [Hz] and least coherence that take part in the fit of the delay."""
 _FLOOR = 1e-3
 """Incoherence that no frequency falls below: a perfect bin must not dominate the fit."""
 _FEWEST = 8
@@ -53,8 +52,7 @@ _SHAPE = {1: 4, 2: 2, 3: 2}
 def fit_delay(response: FrequencyResponse) -> float:
     """Delay beyond a second-order joint [s]; NaN if too few frequencies are coherent.
 
-    Joint and delay are fitted to the response up to 25 Hz. Frequencies of coherence below 0.8 take
-    no part, the rest weigh `coherence / (1 - coherence)`.
+    Frequencies weigh `coherence / (1 - coherence)`.
     """
     use = response.band(0.0, _TOP_HZ, _COHERENT) & (response.gain > 0.0)
     if int(use.sum()) < _FEWEST:
@@ -64,8 +62,7 @@ def fit_delay(response: FrequencyResponse) -> float:
     weight = np.sqrt(coherence / np.maximum(1.0 - coherence, _FLOOR))
     weight = weight / weight.mean()
     # The natural frequency is near where the phase passes -90 degrees.
-    phase = np.unwrap(np.angle(values))
-    natural = float(omega[int(np.argmin(np.abs(phase + np.pi / 2.0)))])
+    natural = omega[int(np.argmin(np.abs(np.unwrap(np.angle(values)) + np.pi / 2.0)))]
     start = np.array([np.log(abs(values[0])), np.log(natural), np.log(0.7), 0.0])
 
     def residual(parameters: Array) -> Array:
@@ -102,10 +99,10 @@ def third_harmonic(log: JointLog, joint: str) -> float:
 
 
 def _of_chirp(time: Array, position: Array, frequency: Array) -> float:
-    """Third harmonic by demodulation at three times the frequency of a chirp.
+    """Third harmonic of a chirp, the phase being the integral of its frequency.
 
-    The phase is the integral of the frequency; the position is fitted by its first three harmonics,
-    each with a size and phase that change smoothly over the band, and by a straight line.
+    The position is fitted by the first three harmonics, each with a size and phase that change
+    smoothly over the band, and by a straight line.
     """
     known = np.nan_to_num(frequency, nan=-1.0)
     low, high = _LOW_BAND_HZ
@@ -125,15 +122,12 @@ def _of_chirp(time: Array, position: Array, frequency: Array) -> float:
     line = np.linspace(-1.0, 1.0, len(t))
     columns, harmonics = [np.ones_like(line), line], [0, 0]
     for harmonic, degree in _SHAPE.items():
-        for power in range(degree + 1):
-            shape = np.polynomial.legendre.legval(x, np.eye(degree + 1)[power])
+        for shape in np.polynomial.legendre.legvander(x, degree).T:
             columns += [shape * np.cos(harmonic * phase), shape * np.sin(harmonic * phase)]
             harmonics += [harmonic, harmonic]
     basis = np.stack(columns, axis=1)
-    size = np.linalg.lstsq(basis, y, rcond=None)[0]
-
-    def rms(harmonic: int) -> float:
-        own = np.array(harmonics) == harmonic
-        return float(np.sqrt(np.mean((basis[:, own] @ size[own]) ** 2)))
-
-    return rms(3) / rms(1) if rms(1) > 0.0 else math.nan
+    parts = basis * np.linalg.lstsq(basis, y, rcond=None)[0]
+    first, third = (
+        float(np.sqrt(np.mean(parts[:, np.equal(harmonics, n)].sum(axis=1) ** 2))) for n in (1, 3)
+    )
+    return third / first if first > 0.0 else math.nan

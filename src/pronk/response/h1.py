@@ -4,9 +4,8 @@ Padding: a chirp of pronk starts and ends at rest, so before and after it both s
 to stay where they are; segments then reach over the ends, every sample counts alike, and there is
 no transient to drop. Of an excitation that ends in motion only whole segments inside it are used.
 
-With the command given, H1 is linear in the position: `H = position @ A`, A complex of shape
-(samples, f) and computed once (`H1Operator`). A grid of simulated positions becomes responses in
-one matrix product, by the same segments, windows, means and interpolation as the measured log.
+With the command given, H1 is linear in the position, `H = position @ A` with A of shape
+(samples, f): `H1Operator`, with the segments, windows, means and interpolation of the average.
 """
 
 from __future__ import annotations
@@ -249,8 +248,7 @@ def estimate_averaged(
 class H1Operator:
     """Linear map from the positions of one excitation to its response.
 
-    On the analysis grid it is the sum over segments of `scale * transform(window * segment)`
-    (`Layout.spectra`).
+    On the analysis grid it is the sum over segments of `scale` times `Layout.spectra`.
     """
 
     time: Array
@@ -265,8 +263,7 @@ class H1Operator:
     ) -> H1Operator:
         """Compute the map for one command [rad] in force from timestamps [s], both of shape (n,).
 
-        The analysis grid has the rate of the timestamps if none is given. LogError if the
-        excitation is shorter than two segments.
+        The analysis grid has the rate of the timestamps if none is given. LogError as of `layout`.
         """
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
