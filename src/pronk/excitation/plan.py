@@ -102,7 +102,7 @@ class SweepPlan:
         The PlanError names joint, number, limit, and the amplitude that fits in simulation.
         """
         for worst in self.forecasts:
-            if not (breaches := worst.breaches()):
+            if not (breach := next(worst.breaches(), "")):
                 continue
             # The forecasts are of the largest amplitude, which comes first.
             loudest = next(each for each in self.excitations if each.joint == worst.excited)
@@ -112,7 +112,7 @@ class SweepPlan:
                 way_out = f"an amplitude of {fits:.3g} rad fits"
             raise PlanError(
                 f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
-                f"could {breaches[0]} (inertia, gains and friction uncertain by "
+                f"could {breach} (inertia, gains and friction uncertain by "
                 f"{100 * unsure.inertia:.0f}, {100 * unsure.stiffness:.0f} and "
                 f"{100 * unsure.friction:.0f} %); {way_out}."
             )
@@ -124,7 +124,7 @@ class SweepPlan:
             share = 0.5 * (fits + too_much)
             amplitude = share * excitation.signal.amplitude
             quieter = replace(excitation, signal=replace(excitation.signal, amplitude=amplitude))
-            exceeds = any(found.breaches() for found in self._worst(quieter, {}))
+            exceeds = any(any(found.breaches()) for found in self._worst(quieter, {}))
             fits, too_much = (fits, share) if exceeds else (share, too_much)
         amplitude = fits * excitation.signal.amplitude
         # Three significant digits.

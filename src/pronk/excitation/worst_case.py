@@ -7,7 +7,7 @@ uncertainty. A plan that exceeds a limit in any corner is refused.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import product
@@ -77,26 +77,24 @@ class Forecast:
     """Greatest power from the bus."""
     bus_current: float
 
-    def breaches(self) -> list[str]:
+    def breaches(self) -> Iterator[str]:
         """What could be exceeded: what the joint could do, and the limit, in words."""
         low, high = self.range
-        found = []
         if self.lowest < low:
-            found.append(f"reach {self.lowest:.3f} rad, below its range at {low:.3f} rad")
+            yield f"reach {self.lowest:.3f} rad, below its range at {low:.3f} rad"
         if self.highest > high:
-            found.append(f"reach {self.highest:.3f} rad, above its range at {high:.3f} rad")
+            yield f"reach {self.highest:.3f} rad, above its range at {high:.3f} rad"
         if self.speed > self.no_load_speed:
-            found.append(
+            yield (
                 f"turn at {self.speed:.1f} rad/s, above its no-load speed of "
                 f"{self.no_load_speed:.1f} rad/s"
             )
         if self.torque_share > 1.0:
-            found.append(
+            yield (
                 f"need {self.torque_share:.2f} times the torque that its drive gives at the speed "
                 f"of the moment (up to {self.torque:.1f} N m, the limit at standstill "
                 f"is {self.effort_limit:.1f} N m)"
             )
-        return found
 
     def mirrored(self, robot: RobotSpec, joint: str) -> Forecast:
         """The same for a joint that mirrors this one."""

@@ -60,13 +60,14 @@ class Spectra:
     """Of steps: position at three times the frequency over that at it, shape (f,)."""
 
 
-def _periods(
+def multisine_operator(
     time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
-) -> tuple[Layout, ComplexArray]:
-    """Lay a segment over each period that counts; also the command at the lines excited in them.
+) -> H1Operator:
+    """`estimate_periodic` of one multisine as a matrix, for a fixed command.
 
-    The periods are those in which the command repeats the period before; ramps fall out by
-    themselves, and the first steady period is dropped as the transient.
+    A segment lies over each period in which the command repeats the period before; ramps fall out
+    by themselves, and the first steady period is dropped as the transient. Frequencies are the
+    lines excited in them.
     """
     samples = max(round(period_s * rate_hz), 1)
     fine = samples / period_s
@@ -100,7 +101,8 @@ def _periods(
     u = where.spectra(held_mean(time, command, grid.edges))
     size = np.abs(u).mean(axis=0)
     excited = size >= _EXCITED * size.max()
-    return replace(where, bins=numbers[excited]), u[:, excited]
+    where = replace(where, bins=numbers[excited])
+    return H1Operator(time=time, layout=where, command=u[:, excited])
 
 
 def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
@@ -130,18 +132,11 @@ def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float
             "name it, or call the segment `unknown` to have it averaged by segments."
         )
     column = log.column(joint)
-    where, command = _periods(log.time, log.command[:, column], period, estimator, rate_hz)
-    position = interpolate(log.time, log.position[:, column], where.grid)
-    factor = hold(where.omega, where.grid.rate_hz)
-    return Spectra(omega=where.omega, command=command, position=where.spectra(position) / factor)
-
-
-def multisine_operator(
-    time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
-) -> H1Operator:
-    """`estimate_periodic` of one multisine as a matrix, for a fixed command."""
-    where, u = _periods(time, command, period_s, estimator, rate_hz)
-    return H1Operator(time=time, layout=where, command=u)
+    found = multisine_operator(log.time, log.command[:, column], period, estimator, rate_hz)
+    where, omega = found.layout, found.omega
+    position = where.spectra(interpolate(log.time, log.position[:, column], where.grid))
+    factor = hold(omega, where.grid.rate_hz)
+    return Spectra(omega=omega, command=found.command, position=position / factor)
 
 
 def _runs(frequency: Array) -> list[tuple[int, int]]:
