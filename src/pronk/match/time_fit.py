@@ -354,10 +354,7 @@ def _total(
             change = float(np.abs(own).max())
         else:
             sd *= stats.t.ppf(0.975, len(moves) - 1)
-        half = [max(np.hypot(kind.scaled(end) - at, sd), change) for end in ends]
-        low, high = (
-            kind.unscaled(at + sign * min(h, 20.0))
-            for sign, h in zip((-1.0, 1.0), half, strict=True)
-        )
-        out[name] = (low, high)
+        low, high = (max(np.hypot(kind.scaled(end) - at, sd), change) for end in ends)
+        # e^20 is as good as infinite and does not overflow.
+        out[name] = kind.unscaled(at - min(low, 20.0)), kind.unscaled(at + min(high, 20.0))
     return out
