@@ -202,12 +202,14 @@ def load_artefact(path: Path, kind: type[T], schema: str, *, what: str, writer: 
         return converted(header["content"], kind, path, lambda _, key: arrays[key])
 
 
-def converted(data: Any, kind: type[T], path: Path, hook: Any = None) -> T:
-    """Make a dataclass of YAML or JSON data; ArtefactError names a wrong or unknown field."""
+def converted(
+    data: Any, kind: type[T], path: Path, hook: Any = None, error: type[PronkError] = ArtefactError
+) -> T:
+    """Make a dataclass of YAML or JSON data; an error names a wrong or unknown field."""
     try:
         out = msgspec.convert(data, kind, dec_hook=hook)
-    except msgspec.ValidationError as error:
-        raise ArtefactError(f"{path}: {error}.") from None
+    except msgspec.ValidationError as wrong:
+        raise error(f"{path}: {str(wrong).rstrip('.')}.") from None
     if hook is None:
         _refuse_unknown(data, msgspec.to_builtins(out), path, "")
     return out

@@ -17,7 +17,7 @@ pytest.importorskip("mjlab")
 import torch
 
 import training_env
-from pronk.actuator.model import pd_torque, torque_limits
+from pronk.actuator.model import torque_limits
 from pronk.errors import PronkError, RobotError
 from pronk.match.gains import GroupGains
 from pronk.train.mdp.actions import DelayedJointPositionActionCfg
@@ -57,7 +57,7 @@ def test_law_of_the_drives_is_that_of_the_actuator_model(group: int) -> None:
     speed = draw.uniform(-60.0, 60.0, (5000, 4))
     stiffness, damping = draw.uniform(10.0, 30.0, (5000, 4)), draw.uniform(0.2, 0.8, (5000, 4))
     limits = (cfg.saturation_effort, cfg.velocity_limit, cfg.effort_limit)
-    torque = pd_torque(target, position, speed, stiffness=stiffness, damping=damping)
+    torque = stiffness * (target - position) - damping * speed
     expected = np.clip(torque, *torque_limits(speed, *limits))
     stall, no_load, limit = (np.full((5000, 4), value) for value in limits)
     params = {"stiffness": stiffness, "damping": damping, "back_emf": stall / no_load}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.signal import chirp
 
-from pronk.actuator.model import pd_torque, torque_limits
+from pronk.actuator.model import torque_limits
 from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots import load_robot
@@ -72,7 +72,7 @@ def explicit_law(
     positions, clipped = [], 0
     for target in command:
         positions.append(data.qpos.copy())
-        wanted = pd_torque(target, data.qpos, data.qvel, stiffness=stiffness, damping=damping)
+        wanted = stiffness * (target - data.qpos) - damping * data.qvel
         for i, drive in enumerate(drives):
             limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
             data.ctrl[i] = np.clip(wanted[i], *torque_limits(data.qvel[i], *limits))

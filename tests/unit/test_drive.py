@@ -14,36 +14,36 @@ from hypothesis import strategies as st
 
 from pronk.actuator import model as drive
 from pronk.robots import load_robot
+from pronk.robots.load import DriveEntry
 
-HIP = {"gear_ratio": 6.0, "torque_constant": 0.05, "bus_voltage": 24.0}
 LINE = (62.428, 40.0, 17.0)
-POWER = {**HIP, "stall_torque": 10.8 / 0.173}
+POWER = {
+    "gear_ratio": 6.0,
+    "torque_constant": 0.05,
+    "bus_voltage": 24.0,
+    "stall_torque": 10.8 / 0.173,
+}
 
 
 @pytest.mark.parametrize(
-    ("motor", "resistance", "factors", "stall", "free"),
+    ("motor", "phases", "stall", "free"),
     [
-        ((6.0, 0.05, 24.0), 0.173, (1.5, 2.0), 62.428, 40.0),
-        ((9.33, 0.05, 24.0), 0.173, (1.5, 2.0), 97.08, 25.72),
-        ((1.0, 1.2116, 7.4), 2.6762, (1.0, 1.0), 3.3502, 6.1076),  # brushed
+        ((6.0, 0.05, 24.0, 0.173), 3, 62.428, 40.0),
+        ((9.33, 0.05, 24.0, 0.173), 3, 97.08, 25.72),
+        ((1.0, 1.2116, 7.4, 2.6762), 1, 3.3502, 6.1076),  # brushed
     ],
 )
 def test_stall_torque_and_no_load_speed_by_hand(
-    motor: tuple[float, ...],
-    resistance: float,
-    factors: tuple[float, float],
-    stall: float,
-    free: float,
+    motor: tuple[float, ...], phases: int, stall: float, free: float
 ) -> None:
-    values = dict(zip(HIP, motor, strict=True))
-    torque = drive.stall_torque(**values, resistance=resistance, torque_factor=factors[0])
-    assert torque == pytest.approx(stall, rel=2e-4)
-    assert drive.no_load_speed(**values, emf_factor=factors[1]) == pytest.approx(free, rel=2e-4)
-
-
-def test_pd_torque_by_hand() -> None:
-    torque = drive.pd_torque(0.25, [0.0, 0.25], [0.0, 2.0], stiffness=17.0, damping=0.4)
-    np.testing.assert_allclose(torque, [4.25, -0.8])
+    names = ("gear_ratio", "torque_constant", "bus_voltage", "resistance")
+    values = dict(zip(names, motor, strict=True))
+    found = DriveEntry(effort_limit=17.0, phases=phases, **values).drive("")  # type: ignore[arg-type]
+    assert (found.stall_torque, found.no_load_speed) == pytest.approx((stall, free), rel=2e-4)
+    line = {"stall_torque": found.stall_torque, "no_load_speed": found.no_load_speed}
+    volts = {"gear_ratio": motor[0], "bus_voltage": motor[2], "phases": phases}
+    again = DriveEntry(effort_limit=17.0, **line, **volts).drive("")  # type: ignore[arg-type]
+    assert (again.torque_constant, again.resistance) == pytest.approx((motor[1], motor[3]))
 
 
 def test_limits_at_stall_corner_no_load_and_beyond() -> None:
@@ -68,18 +68,12 @@ def test_limits_are_odd_and_bounded(speed: float) -> None:
     assert drive.torque_limits(-speed, *LINE) == (-high, -low)
 
 
-def test_winding_loss_is_copper_loss() -> None:
-    # 17 N m at the hip: i = 17 / (1.5 * 6 * .05) = 37.78 A peak; 1.5 * .173 * i^2 = 370.3 W.
-    assert drive.winding_loss(17.0, **POWER) == pytest.approx(370.3, abs=0.1)
+def test_winding_loss_and_power_of_motoring_and_regenerating() -> None:
     # A brushed motor at stall: V^2 / R.
     d = load_robot("so101").joints[0].drive
     loss = drive.winding_loss(d.stall_torque, **{n: getattr(d, n) for n in POWER})
     assert loss == pytest.approx(7.4**2 / 2.6762)
-
-
-def test_power_motoring_and_regenerating() -> None:
-    # 5 N m: loss 1.5 * .173 * (5 / .45)^2 = 32.04 W; 10 rad/s: 50 W of mechanical power.
+    # 5 N m at the hip: i = 5 / (1.5 * 6 * .05), 1.5 * .173 * i^2 = 32.04 W; 10 rad/s: 50 W more.
     power = drive.electrical_power([5.0, 5.0, 5.0, 5.0], [10.0, -10.0, 0.0, -6.0], **POWER)
     # Below loss / torque = 6.41 rad/s braking heats the winding more than the joint gives.
     np.testing.assert_allclose(power, [82.04, -17.96, 32.04, 2.04], atol=0.01)
-    np.testing.assert_allclose(drive.bus_current(power, 24.0), power / 24.0)

@@ -3,10 +3,6 @@
 Everything is at the joint (output of the gear) unless a name contains motor. Signs: torque is what
 the drive puts on the joint, positive along the joint axis; power and current are positive when
 drawn from the bus, negative when the drive brakes hard enough to feed it.
-
-Torque constant kt: torque per ampere at the motor [N m/A]. Of a three-phase motor with peak
-currents, as in Cheetah-Software's ActuatorModel.h, torque = 1.5 kt i, and the back-EMF that fits
-under the bus voltage is 2 kt omega. A brushed motor has 1 and 1.
 """
 
 from __future__ import annotations
@@ -15,38 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pronk.arrays import Array
-
-
-def pd_torque(
-    command: ArrayLike,
-    position: ArrayLike,
-    velocity: ArrayLike,
-    *,
-    stiffness: ArrayLike,
-    damping: ArrayLike,
-) -> Array:
-    """Controller torque for target velocity zero (paper M1 with reading A9) [N m]."""
-    error = np.subtract(command, position)
-    return np.asarray(np.multiply(stiffness, error) - np.multiply(damping, velocity))
-
-
-def stall_torque(
-    *,
-    gear_ratio: float,
-    torque_constant: float,
-    resistance: float,
-    bus_voltage: float,
-    torque_factor: float = 1.5,
-) -> float:
-    """Torque at standstill with the bus voltage across the phase resistance [N m]."""
-    return torque_factor * gear_ratio * torque_constant * bus_voltage / resistance
-
-
-def no_load_speed(
-    *, gear_ratio: float, torque_constant: float, bus_voltage: float, emf_factor: float = 2.0
-) -> float:
-    """Joint speed at which back-EMF takes the whole bus voltage [rad/s]."""
-    return bus_voltage / (emf_factor * gear_ratio * torque_constant)
 
 
 def motor_constants(
@@ -109,8 +73,3 @@ def electrical_power(torque: ArrayLike, speed: ArrayLike, **drive: float) -> Arr
     are left out.
     """
     return np.asarray(np.multiply(torque, speed) + winding_loss(torque, **drive))
-
-
-def bus_current(power: ArrayLike, bus_voltage: float) -> Array:
-    """Current drawn from the bus for a power [A]; negative charges the battery."""
-    return np.asarray(np.divide(power, bus_voltage))

@@ -16,7 +16,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from pronk.actuator.model import bus_current, electrical_power, pd_torque, torque_limits
+from pronk.actuator.model import electrical_power, torque_limits
 from pronk.arrays import Array
 from pronk.errors import PlanError
 from pronk.robots.model import bench_spec, set_drive_gains
@@ -151,9 +151,7 @@ def forecast(
     forecasts = []
     for i, name in enumerate(order):
         q, v = position[..., i], velocity[..., i]
-        torque = pd_torque(
-            steps[:, i], q, v, stiffness=scale * stiffness[name], damping=scale * damping[name]
-        )
+        torque = scale * stiffness[name] * (steps[:, i] - q) - scale * damping[name] * v
         drive = robot.joint(name).drive
         low, high = torque_limits(v, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
         # A drive that can give nothing at this speed exceeds its limit with any command.
@@ -182,7 +180,7 @@ def forecast(
                 torque_share=float((np.abs(torque) / available).max()),
                 mechanical_power=float((given * v).max()),
                 electrical_power=float(power.max()),
-                bus_current=float(bus_current(power, drive.bus_voltage).max()),
+                bus_current=float((power / drive.bus_voltage).max()),
             )
         )
     return forecasts

@@ -21,17 +21,14 @@ _MODELS = (".xml", ".mjcf", ".urdf")
 
 
 def load_robot(name: str | Path) -> RobotSpec:
-    """Load a robot.
+    """Load a robot; a RobotError says that there is none, or what is inconsistent in its files.
 
     Args:
         name: A shipped robot, a path to a `robot.yaml` or its folder, to an MJCF or a URDF, or an
             entry point of the group `pronk.robots` (a function that returns such a path).
-
-    Raises:
-        RobotError: There is none, or its files are inconsistent.
     """
-    path = Path(name)
-    if str(name) in ROBOT_NAMES:
+    path, shipped = Path(name), str(name) in ROBOT_NAMES
+    if shipped:
         path = Path(__file__).parent / str(name) / "robot.yaml"
     elif not path.exists():
         known = entry_points(group="pronk.robots")
@@ -49,18 +46,16 @@ def load_robot(name: str | Path) -> RobotSpec:
         robot = _load(path.resolve(), path.stat().st_mtime_ns)
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
-    shipped = str(name) in ROBOT_NAMES
     return replace(robot, source=str(name) if shipped else str(path.resolve()))
 
 
 @lru_cache
 def _load(path: Path, _changed: int) -> RobotSpec:
+    from pronk.robots.bare import file_of_model
+    from pronk.robots.load import make_robot, read_model, read_robot
+
     if path.suffix in _MODELS:
-        from pronk.robots.bare import robot_of_model
-
-        return robot_of_model(path)
-    from pronk.robots.load import read_robot
-
+        return make_robot(file_of_model(path), read_model(path), str(path))
     return read_robot(path)
 
 

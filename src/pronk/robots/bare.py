@@ -10,8 +10,7 @@ import numpy as np
 import yaml
 
 from pronk.errors import RobotError
-from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, RobotFile, make_robot, read_model
-from pronk.robots.robot import RobotSpec
+from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, RobotFile, read_model
 
 NATURAL_HZ, DAMPING_RATIO = 3.0, 0.7
 """Of the joint under its nominal gains, where the model has no position servo."""
@@ -31,10 +30,8 @@ def file_of_model(path: Path) -> RobotFile:
     Gains are those of the model's position servos, else they give the joint a natural frequency of
     3 Hz and a damping ratio of 0.7 in the default pose. Effort limits come from the actuators or
     joints, else they are twice the torque of gravity and 0.5 rad of stiffness. The default pose is
-    the keyframe `home` or the first one, else zero, moved into the ranges.
-
-    Raises:
-        RobotError: The model has no hinge, or cannot be read.
+    the keyframe `home` or the first one, else zero, moved into the ranges. A RobotError says that
+    the model has no hinge, or cannot be read.
     """
     read_model(path)
     spec = mujoco.MjSpec.from_file(str(path))
@@ -44,8 +41,8 @@ def file_of_model(path: Path) -> RobotFile:
     if model.nkey:
         keys = [model.key(i).name for i in range(model.nkey)]
         data.qpos[:] = model.key_qpos[keys.index("home") if "home" in keys else 0]
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    if not hinges:
+    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    if not len(hinges):
         raise RobotError(f"{path}: the model has no hinge joint.")
     for j in hinges:
         if model.jnt_limited[j]:
@@ -108,11 +105,6 @@ def file_of_model(path: Path) -> RobotFile:
         grid_stiffness=(_short(0.3 * min(kp)), _short(3.0 * max(kp))),
         grid_damping=(_short(0.1 * min(kd)), _short(4.0 * max(kd))),
     )
-
-
-def robot_of_model(path: Path) -> RobotSpec:
-    """Make a robot of a bare model; see `file_of_model`."""
-    return make_robot(file_of_model(path), read_model(path), str(path))
 
 
 def yaml_of_model(path: Path) -> str:

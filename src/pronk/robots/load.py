@@ -21,9 +21,8 @@ import mujoco
 import numpy as np
 from msgspec import Meta
 
-from pronk.actuator.model import no_load_speed, stall_torque
 from pronk.errors import RobotError
-from pronk.files import read_yaml
+from pronk.files import converted, read_yaml
 from pronk.robots.model import set_inertia
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
@@ -32,7 +31,10 @@ _MIRROR_TOLERANCE = 1e-9
 """Largest relative difference of inertia and bias forces of joints that mirror each other."""
 _ROUNDING = 1e-3
 """How far a pose may be outside of a range by its rounding to four digits [rad]."""
-_TORQUE_FACTOR, _EMF_FACTOR = {1: 1.0, 3: 1.5}, {1: 1.0, 3: 2.0}
+_MOTORS = {1: (1.0, 1.0), 3: (1.5, 2.0)}
+"""By phases: torque over `kt i`, and back-EMF over `kt omega`. Of a three-phase motor with peak
+currents, as in Cheetah-Software's ActuatorModel.h, torque is 1.5 kt i, and the back-EMF that fits
+under the bus voltage 2 kt omega."""
 _Positive = Annotated[float, Meta(gt=0.0)]
 _Least = Annotated[float, Meta(ge=0.0)]
 _Band = tuple[_Positive, _Positive]
@@ -63,19 +65,18 @@ class DriveEntry(_Entry, frozen=True):
     def drive(self, source: str) -> Drive:
         """Make the drive; a RobotError names what is missing of its torque-speed line."""
         gear, volts = self.gear_ratio, self.bus_voltage
-        if self.phases not in _TORQUE_FACTOR:
+        if self.phases not in _MOTORS:
             raise RobotError(f"{source}: phases is {self.phases}; expected 1 (brushed) or 3.")
         if self.armature is not None and self.rotor_inertia is not None:
             raise RobotError(f"{source}: give rotor_inertia or armature, not both.")
-        torque_factor, emf_factor = _TORQUE_FACTOR[self.phases], _EMF_FACTOR[self.phases]
+        torque_factor, emf_factor = _MOTORS[self.phases]
         constant, resistance = self.torque_constant, self.resistance
         if self.joint_torque_constant is not None:
             constant = self.joint_torque_constant / gear
         stall, free = self.stall_torque, self.no_load_speed
         if constant is not None and resistance is not None:
-            motor = {"gear_ratio": gear, "torque_constant": constant, "bus_voltage": volts}
-            stall = stall_torque(resistance=resistance, torque_factor=torque_factor, **motor)
-            free = no_load_speed(emf_factor=emf_factor, **motor)
+            stall = torque_factor * gear * constant * volts / resistance
+            free = volts / (emf_factor * gear * constant)
         elif stall is not None and free is not None:
             constant = volts / (emf_factor * gear * free)
             resistance = torque_factor * gear * constant * volts / stall
@@ -85,18 +86,15 @@ class DriveEntry(_Entry, frozen=True):
                 "or torque_constant and resistance."
             )
         rotor = (self.armature or 0.0) / gear**2
+        friction = ("frictionloss", "viscous_damping", "stribeck_speed")
+        same = ("gear_ratio", "bus_voltage", "effort_limit", *friction)
         return Drive(
-            gear_ratio=gear,
             rotor_inertia=rotor if self.rotor_inertia is None else self.rotor_inertia,
             stall_torque=stall,
             no_load_speed=free,
-            effort_limit=self.effort_limit,
-            frictionloss=self.frictionloss,
-            viscous_damping=self.viscous_damping,
-            bus_voltage=volts,
             resistance=resistance,
             torque_constant=constant,
-            stribeck_speed=self.stribeck_speed,
+            **{name: getattr(self, name) for name in same},
         )
 
 
@@ -186,11 +184,10 @@ def read_model(path: Path) -> Model:
                 set_inertia(body, model)
         for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]:
             spec.delete(geom)
-        for part in (spec.pairs, spec.sensors, spec.keys, spec.actuators, spec.skins, spec.meshes):
-            for element in list(part):
+        unused = (spec.pairs, spec.sensors, spec.keys, spec.actuators, spec.skins, spec.meshes)
+        for elements in (*unused, spec.materials, spec.textures):
+            for element in list(elements):
                 spec.delete(element)
-        for element in (*spec.materials, *spec.textures):
-            spec.delete(element)
         spec.compile()
         made = Model(spec.to_xml())
         made().compile()  # MuJoCo writes XML that it cannot read where a number is not finite.
@@ -205,10 +202,7 @@ def read_robot(path: Path) -> RobotSpec:
     body = read_yaml(path, RobotError)
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise RobotError(f"{path}: not a robot file; its schema must be {SCHEMA!r}.")
-    try:
-        file = msgspec.convert(body, RobotFile)
-    except msgspec.ValidationError as error:
-        raise RobotError(f"{path}: {str(error).rstrip('.')}.") from None
+    file = converted(body, RobotFile, path, error=RobotError)
     return make_robot(file, read_model(path.parent / file.model), str(path))
 
 
@@ -272,10 +266,11 @@ def _joint(
     source: str,
 ) -> Joint:
     """One joint, from its group, the defaults, the poses and the model."""
+    own = file.groups[group]
     entry: dict[str, Any] = {}
     for field in ("drive", "stiffness", "damping", "band_hz"):
-        own, shared = getattr(file.groups[group], field), getattr(file.defaults, field)
-        entry[field] = shared if own is None else own
+        stated = (getattr(one, field) for one in (own, file.defaults))
+        entry[field] = next((value for value in stated if value is not None), None)
         if entry[field] is None:
             raise RobotError(f"{source}: groups.{group}.{field} is missing.")
     drive = entry.pop("drive")
@@ -283,7 +278,7 @@ def _joint(
         drives = ", ".join(file.drives)
         raise RobotError(f"{source}: groups.{group}.drive is {drive!r}; the drives are {drives}.")
     limb = [other for other in limbs if limbs[other] == limbs[name]]
-    patterns = file.groups[group].clamped or file.defaults.clamped
+    patterns = own.clamped or file.defaults.clamped
     clamped = tuple(other for other in limb if any(fnmatch.fnmatch(other, p) for p in patterns))
     (low, high), limited = model.joint(name).range, model.jnt_limited[model.joint(name).id]
     mirror = None
@@ -291,33 +286,33 @@ def _joint(
         if name.startswith(f"{prefix}_"):
             sign = -1.0 if name in file.symmetry.negated else 1.0
             mirror = (original + name.removeprefix(prefix), sign)
-    position: dict[str, float | None] = {"folded": None}
+    position: dict[str, float] = {}
     for pose in ("default", "folded") if "folded" in file.poses else ("default",):
-        values = file.poses.get(pose, {})
-        if name not in values and group not in values:
+        angles = file.poses.get(pose, {})
+        if name not in angles and group not in angles:
             raise RobotError(f"{source}: poses.{pose} has no entry for {name} or {group}.")
-        position[pose] = angle = float(values[name] if name in values else values[group])
+        position[pose] = angle = float(angles[name if name in angles else group])
         if limited and not low - _ROUNDING <= angle <= high + _ROUNDING:
             raise RobotError(
                 f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
                 f"{low:g} to {high:g} rad."
             )
-    pattern, own = file.groups[group].joints or group, file.groups[group].own_names
-    if own and not pattern.count("*") == own.count("*") == 1:
+    pattern, theirs = own.joints or group, own.own_names or ""
+    if theirs and not pattern.count("*") == theirs.count("*") == 1:
         raise RobotError(
-            f"{source}: groups.{group}.own_names is {own!r} for joints {pattern!r}; expected one "
-            "star in both."
+            f"{source}: groups.{group}.own_names is {theirs!r} for joints {pattern!r}; expected "
+            "one star in both."
         )
     before, _, after = pattern.partition("*")
     stem = name.removeprefix(before).removesuffix(after)
     return Joint(
         name=name,
-        own_name=own.replace("*", stem) if own else "",
+        own_name=theirs.replace("*", stem),
         group=group,
         drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
         range=(float(low), float(high)) if limited else (-math.pi, math.pi),
-        default_position=position["default"] or 0.0,
-        folded_position=position["folded"],
+        default_position=position["default"],
+        folded_position=position.get("folded"),
         clamped=clamped,
         chain=tuple(other for other in limb if other not in clamped),
         mirror=mirror,
@@ -342,11 +337,10 @@ def _verify_mirrors(robot: RobotSpec, model: mujoco.MjModel, source: str) -> Non
     # The same pose about the default one, and the same speeds, in the originals' coordinates.
     for joint in robot.joints:
         original, sign = joint.original
-        k = robot.joint_names.index(original)
-        model_joint = model.joint(joint.name)
-        offset = 0.2 * math.sin(1.0 + k)
-        data.qpos[model_joint.qposadr[0]] = joint.default_position + sign * offset
-        data.qvel[dof[joint.name]] = sign * math.cos(1.0 + k)
+        phase = 1.0 + robot.joint_names.index(original)
+        at = model.joint(joint.name).qposadr[0]
+        data.qpos[at] = joint.default_position + sign * (0.2 * math.sin(phase))
+        data.qvel[dof[joint.name]] = sign * math.cos(phase)
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
     scale = max(np.abs(full[d, d]) for d in dof.values())

@@ -42,8 +42,6 @@ ratio of a half, with the inertia of the joint. They are as stiff as an explicit
 servo of the SO-101 280 N m/rad at 5 ms, which is within 2 mrad of bristles a hundred times as stiff
 at a twentieth of the step over a step of the command of 0.1 rad."""
 
-Values = Mapping[str, float]
-
 
 def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
     """The robot as it stands, without floor and without actuators.
@@ -73,10 +71,7 @@ def set_law(option: mujoco.MjOption, robot: RobotSpec) -> None:
 def bench_spec(
     robot: RobotSpec,
     joint_name: str,
-    *,
-    stiffness: Values | None = None,
-    damping: Values | None = None,
-    stribeck: Values | None = None,
+    **drives: Mapping[str, float],
 ) -> mujoco.MjSpec:
     """One joint on the bench: what moves when it is excited, and nothing else.
 
@@ -85,8 +80,8 @@ def bench_spec(
     by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
     computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
 
-    Gains by joint name [N m/rad, N m s/rad] replace those of the robot's drives; `stribeck` as in
-    `add_drives`. A RobotError names a joint outside the chain that could move with it.
+    `drives` are `stiffness`, `damping` and `stribeck` of `add_drives`. A RobotError names a joint
+    outside the chain that could move with it.
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
@@ -101,7 +96,7 @@ def bench_spec(
         _weld(spec, name, robot.joint(name).default_position)
     for name in joint.chain:
         _set_passive(spec, robot.joint(name))
-    add_drives(spec, robot, joint.chain, stiffness=stiffness, damping=damping, stribeck=stribeck)
+    add_drives(spec, robot, joint.chain, **drives)
     _add_default_key(spec, robot, with_command=True)
     return spec
 
@@ -139,9 +134,9 @@ def add_drives(
     robot: RobotSpec,
     joint_names: Iterable[str],
     *,
-    stiffness: Values | None = None,
-    damping: Values | None = None,
-    stribeck: Values | None = None,
+    stiffness: Mapping[str, float] = {},
+    damping: Mapping[str, float] = {},
+    stribeck: Mapping[str, float] = {},
 ) -> None:
     """Give joints of a spec a native dcmotor each.
 
@@ -149,26 +144,20 @@ def add_drives(
     [N m/rad, N m s/rad] replace those of the robot's drives. Of joints with a `stribeck` share
     (see `lugre`) the actuator takes over the dry friction that the joint has.
     """
-    for name in (*(stiffness or {}), *(damping or {})):
+    for name in (*stiffness, *damping):
         robot.joint(name)
     model = spec.compile() if stribeck else None
+    step = spec.option.timestep
     for name in joint_names:
         joint = robot.joint(name)
         drive = joint.drive
         constant, resistance = _constants(drive)
-        own = (stiffness or {}).get(name, joint.stiffness)
-        both = (
-            own,
-            robot.law.damping(own, (damping or {}).get(name, joint.damping), spec.option.timestep),
-        )
-        kp, kd = _voltage_gains(drive, *both)
+        kp, kd = stiffness.get(name, joint.stiffness), damping.get(name, joint.damping)
+        kp, kd = _voltage_gains(drive, kp, robot.law.damping(kp, kd, step))
         friction = {}
-        if model and stribeck and name in stribeck:
-            hinge = spec.joint(name)
-            friction["lugre"] = lugre(
-                *(drive, float(model.joint(name).M0[0]), hinge.frictionloss),
-                *(stribeck[name], spec.option.timestep),
-            )
+        if model and name in stribeck:
+            hinge, inertia = spec.joint(name), float(model.joint(name).M0[0])
+            friction["lugre"] = lugre(drive, inertia, hinge.frictionloss, stribeck[name], step)
             hinge.frictionloss = 0.0
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_dcmotor(
@@ -205,13 +194,8 @@ def lugre(
     """
     damping = inertia * _BRISTLE_ANGLE / timestep
     stiffness = damping * _BRISTLE_ANGLE / timestep
-    return [
-        stiffness,
-        damping,
-        frictionloss * (1.0 - stribeck),
-        frictionloss,
-        drive.stribeck_speed,
-    ]
+    moving = frictionloss * (1.0 - stribeck)
+    return [stiffness, damping, moving, frictionloss, drive.stribeck_speed]
 
 
 def set_stribeck(
@@ -225,23 +209,16 @@ def set_stribeck(
     model.actuator_biasprm[index, _FRICTION] = values[2:]
 
 
-def set_passive(
-    model: mujoco.MjModel,
-    joint_name: str,
-    *,
-    armature: float | None = None,
-    frictionloss: float | None = None,
-) -> None:
-    """Change armature [kg m^2] or dry friction [N m] of one joint in a compiled model.
+def set_passive(model: mujoco.MjModel, joint_name: str, **values: float) -> None:
+    """Change `armature` [kg m^2] or `frictionloss` [N m] of one joint in a compiled model.
 
     Constants that MuJoCo derives from them are computed anew, so the model is the one that
-    compiling with these values would give. None leaves a value.
+    compiling with these values would give.
     """
     dof = model.jnt_dofadr[_index(model, "joint", model.njnt, joint_name)]
-    if frictionloss is not None:
-        model.dof_frictionloss[dof] = frictionloss
-    if armature is not None:
-        model.dof_armature[dof] = armature
+    for name, value in values.items():
+        getattr(model, f"dof_{name}")[dof] = value
+    if "armature" in values:
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
@@ -255,11 +232,8 @@ def _index(model: mujoco.MjModel, kind: str, count: int, name: str) -> int:
 
 
 def _constants(drive: Drive) -> tuple[float, float]:
-    return motor_constants(
-        stall_torque=drive.stall_torque,
-        no_load_speed=drive.no_load_speed,
-        bus_voltage=drive.bus_voltage,
-    )
+    names = ("stall_torque", "no_load_speed", "bus_voltage")
+    return motor_constants(**{name: getattr(drive, name) for name in names})
 
 
 def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
@@ -280,7 +254,7 @@ def _remove_other_branches(
 ) -> None:
     """Delete, below a body that is still, every branch that moves without the wanted joints."""
     for child in list(body.bodies):
-        joints = {joint.name for joint in _subtree_joints(child)}
+        joints = {joint.name for joint in child.find_all("joint")}
         if joints and not joints & wanted:
             spec.delete(child)
         elif strangers := joints - wanted:
@@ -288,10 +262,6 @@ def _remove_other_branches(
                 f"{', '.join(sorted(strangers))} can move when {joint_name} is excited; name them "
                 "in its chain (held by their drives) or among its clamped joints."
             )
-
-
-def _subtree_joints(body: Any) -> list[Any]:
-    return [*body.joints, *(joint for child in body.bodies for joint in _subtree_joints(child))]
 
 
 def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -94,6 +94,12 @@ class Joint:
     """Its name in the models of the robot's maker, for exports; empty if it is `name`."""
 
     @property
+    def parameters(self) -> dict[str, float]:
+        """Its own stiffness, damping, armature and frictionloss, as a simulator sets them."""
+        drive = {"armature": self.drive.armature, "frictionloss": self.drive.frictionloss}
+        return {"stiffness": self.stiffness, "damping": self.damping, **drive}
+
+    @property
     def original(self) -> tuple[str, float]:
         """The joint to simulate in this one's place, and the sign between their coordinates."""
         return self.mirror or (self.name, 1.0)
@@ -156,6 +162,18 @@ class RobotSpec:
         raise RobotError(
             f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."
         )
+
+    def branches(self, names: Collection[str]) -> Iterator[Joint]:
+        """Joints whose chains hold all of `names`; with the base fixed, no other chain moves them.
+
+        Each is the joint of the shortest chain with most of the names that are left.
+        """
+        left = [name for name in self.joint_names if name in names]
+        while left:
+            roots = [joint for joint in self.joints if left[0] in joint.chain]
+            root = max(roots, key=lambda one: (len(set(one.chain) & set(left)), -len(one.chain)))
+            yield root
+            left = [name for name in left if name not in root.chain]
 
     def group(self, name: str) -> tuple[Joint, ...]:
         """The joints of one group, in file order; a RobotError lists the groups."""
