@@ -33,10 +33,9 @@ def probe(
     made = load_simulator(simulator, known, threads=1, python=simulator_python)
     found = look(made, known, joint)
     info, one = made.info, known.joint(found.joint)
-    names = {"explicit": "E", "implicit_damping": "IF"}
     beside = "E, beside it " if found.beside_explicit else ""
     rows: list[list[Any]] = [
-        ["law", names.get(info.law, f"I{info.iterations}"), beside + found.law.label],
+        ["law", info.drive_law.label, beside + found.law.label],
         ["stiffness [N m/rad]", one.stiffness, one.stiffness * found.stiffness_factor],
         ["damping [N m s/rad]", one.damping, one.damping * found.damping_factor],
         ["armature [kg m^2]", found.armature_set, found.armature],

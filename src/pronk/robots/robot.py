@@ -163,16 +163,17 @@ class RobotSpec:
             f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."
         )
 
-    def branches(self, names: Collection[str]) -> Iterator[Joint]:
-        """Joints whose chains hold all of `names`; with the base fixed, no other chain moves them.
+    def branches(self, names: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+        """Some joints by the chains that hold them; with the base fixed, these move independently.
 
-        Each is the joint of the shortest chain with most of the names that are left.
+        Yields the joint whose chain it is, the shortest with most of the joints that are left, and
+        those of `names` that it holds.
         """
         left = [name for name in self.joint_names if name in names]
         while left:
             roots = [joint for joint in self.joints if left[0] in joint.chain]
             root = max(roots, key=lambda one: (len(set(one.chain) & set(left)), -len(one.chain)))
-            yield root
+            yield root.name, tuple(name for name in left if name in root.chain)
             left = [name for name in left if name not in root.chain]
 
     def group(self, name: str) -> tuple[Joint, ...]:

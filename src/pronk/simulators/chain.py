@@ -29,16 +29,7 @@ def published(robot: RobotSpec, joint: str) -> dict[str, float]:
     `delay` is that of the command [s], `offset` the reading of the encoder where the model's joint
     is at zero [rad].
     """
-    known = robot.joint(joint)
-    return {
-        "stiffness": known.stiffness,
-        "damping": known.damping,
-        "armature": known.drive.armature,
-        "frictionloss": known.drive.frictionloss,
-        "stribeck": 0.0,
-        "delay": 0.0,
-        "offset": 0.0,
-    }
+    return robot.joint(joint).parameters | {"stribeck": 0.0, "delay": 0.0, "offset": 0.0}
 
 
 def has_stribeck(robot: RobotSpec, joint: str) -> bool:
@@ -47,30 +38,16 @@ def has_stribeck(robot: RobotSpec, joint: str) -> bool:
 
 
 def branches(logs: Sequence[JointLog], robot: RobotSpec) -> list[tuple[str, ...]]:
-    """Joints that move in some logs, by the chain that holds them.
-
-    With the base fixed, chains do not affect each other. LogError if nothing moves in radians.
-    """
+    """Joints that move in some logs, by the chain that holds them; LogError if none in radians."""
     moved = {name for log in logs for name in excited_joints(log, robot)[0]}
-    out: list[tuple[str, ...]] = []
-    left = [name for name in robot.joint_names if name in moved]
-    while left:
-        roots = (joint.chain for joint in robot.joints if left[0] in joint.chain)
-        chain = max(roots, key=lambda names: (len(set(names) & set(left)), -len(names)))
-        out.append(tuple(name for name in left if name in chain))
-        left = [name for name in left if name not in chain]
-    return out
+    return [names for _, names in robot.branches(moved)]
 
 
 def excited_joints(log: JointLog, robot: RobotSpec) -> tuple[tuple[str, ...], dict[str, str]]:
     """Which joints of a log can be simulated, and why the others cannot.
 
-    Returns:
-        Joints of the robot whose command moves, in the robot's order, and a sentence for each
-        joint that moves in a unit that is not radians.
-
-    Raises:
-        LogError: No joint of the robot moves in radians.
+    Returns joints of the robot whose command moves, in the robot's order, and a sentence for each
+    joint that moves in a unit that is not radians. LogError if none moves in radians.
     """
     excited, excluded = [], {}
     for name in robot.joint_names:
@@ -113,13 +90,13 @@ class _StribeckChain(Chain):
         super().__init__(robot, joint, spec=spec, threads=threads)
 
     def _set(self, model: mujoco.MjModel, name: str, values: Mapping[str, float]) -> None:
-        values = dict(values)
-        dry = values.pop("frictionloss", None) if has_stribeck(self.robot, name) else None
-        super()._set(model, name, values)
-        if has_stribeck(self.robot, name):
-            drive = self.robot.joint(name).drive
-            dry = drive.frictionloss if dry is None else dry
-            set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
+        if not has_stribeck(self.robot, name):
+            super()._set(model, name, values)
+            return
+        drive, others = self.robot.joint(name).drive, dict(values)
+        dry = others.pop("frictionloss", drive.frictionloss)
+        super()._set(model, name, others)
+        set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
 
 
 class _Elsewhere(Closing):
@@ -130,7 +107,7 @@ class _Elsewhere(Closing):
 
     def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
         """See `Chain.rollout`; delays are in the command."""
-        names, known = self.simulator.joints, self.simulator.parameters
+        names = self.simulator.joints
         columns = [names.index(name) for name in self.joints]
         full = np.empty((len(sets), command.shape[1] + 1, len(names)))
         full[:] = [self.robot.joint(name).default_position for name in names]
@@ -138,8 +115,7 @@ class _Elsewhere(Closing):
         drives = [[published(self.robot, n) | dict(one.get(n, {})) for n in names] for one in sets]
         values: dict[str, Array] = {
             key: np.array([[joint[key] for joint in one] for one in drives])
-            for key in ("stiffness", "damping", "armature", "frictionloss")
-            if key in known
+            for key in self.simulator.parameters - {"delay"}
         }
         locked = [name for name in names if name not in self.joints]
         return np.asarray(self.simulator.rollout(full, values, locked=locked)[..., columns])
@@ -160,51 +136,42 @@ class ChainSimulation(Closing):
         """Compile the model of the chain that holds all joints that move, or the given ones.
 
         `joints` are one of `branches`; logs in which none of them moves are left out. Another
-        `simulator` than MuJoCo starts from rest at the first command.
-
-        Raises:
-            LogError: Nothing moves in radians, or joints of different chains move together.
+        `simulator` than MuJoCo starts from rest at the first command. LogError if nothing moves in
+        radians, or joints of different chains move together.
         """
-        self.robot = robot
-        pairs = [(log, excited_joints(log, robot)) for log in logs]
-        found, kept = [], []
-        for log, (excited, reasons) in pairs:
-            mine = tuple(name for name in excited if joints is None or name in joints)
-            if mine:
-                kept.append(log)
-                found.append((mine, reasons))
-        self.logs = tuple(kept)
-        names = {name for excited, _ in found for name in excited}
-        self.joints = tuple(name for name in robot.joint_names if name in names)
-        self.excited = tuple(excited for excited, _ in found)
+        self.robot, self.logs, self.excluded = robot, list[JointLog](), dict[str, str]()
+        self.excited: list[tuple[str, ...]] = []
         """Joints that each log moves in radians."""
-        self.excluded = {k: v for _, reasons in found for k, v in reasons.items()}
+        for log in logs:
+            excited, reasons = excited_joints(log, robot)
+            if mine := tuple(name for name in excited if joints is None or name in joints):
+                self.logs.append(log)
+                self.excited.append(mine)
+                self.excluded |= reasons
+        names = {name for excited in self.excited for name in excited}
+        self.joints = tuple(name for name in robot.joint_names if name in names)
         root = next((j for j in robot.joints if names <= set(j.chain)), None)
         if root is None:
             raise LogError(
                 f"{self.logs[0].source or 'log'}: {', '.join(self.joints)} move together but no "
                 f"chain of {robot.name} holds them all; excite the joints of one chain at a time."
             )
-        self._chain: _StribeckChain | _Elsewhere = (
-            _Elsewhere(simulator, robot, root.name)
-            if simulator
-            else _StribeckChain(robot, root.name, threads=threads)
-        )
+        self._chain: _StribeckChain | _Elsewhere
+        if simulator:
+            self._chain = _Elsewhere(simulator, robot, root.name)
+        else:
+            self._chain = _StribeckChain(robot, root.name, threads=threads)
 
     def close(self) -> None:
         """Stop the threads."""
         self._chain.close()
 
     def run(self, sets: Sequence[Drives]) -> list[list[Array]]:
-        """Simulate every log with every set of drives.
+        """Simulate every log with every set of drives, as `published` where joints are missing.
 
-        Args:
-            sets: Parameters by joint, as `published`, which stands in for missing joints.
-
-        Returns:
-            One list per set with one array per log: reading of the encoders at the log's
-            timestamps [rad], shape (n, joints) in the order of `joints`; NaN from where a
-            simulation diverged.
+        Returns one list per set with one array per log: reading of the encoders at the log's
+        timestamps [rad], shape (n, joints) in the order of `joints`; NaN from where a simulation
+        diverged.
         """
         names, timestep = self._chain.joints, self.robot.timestep_s
         late, offset = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
@@ -27,17 +28,18 @@ def load_simulator(
     an interpreter, the simulator is made there (`pronk.simulators.remote`). A PronkError says that
     there is no such simulator, or that it lacks what the protocol needs.
     """
-    if choice == "mujoco" and python is not None:
-        raise PronkError(
-            "simulator mujoco runs in this Python only; leave --simulator-python out, or name "
-            "another with --simulator."
-        )
     if choice == "mujoco":
+        if python is not None:
+            raise PronkError(
+                "simulator mujoco runs in this Python only; leave --simulator-python out, or name "
+                "another with --simulator."
+            )
         return MujocoSimulator(robot, threads=threads, device=device)
     if device != "cpu":
         raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
-    made = RemoteSimulator(choice, robot, python) if python else factory(choice)(robot)
-    simulator: Simulator = made
+    simulator: Simulator = (
+        RemoteSimulator(choice, robot, python) if python else factory(choice)(robot)
+    )
     members = ("info", "joints", "parameters", "rollout")
     if lacking := [name for name in members if not hasattr(simulator, name)]:
         raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
@@ -49,14 +51,7 @@ def load_simulator(
     return simulator
 
 
-def joint_rigs(
-    choice: str,
-    robot: RobotSpec,
-    *,
-    threads: int = 2,
-    device: str = "cpu",
-    python: Path | None = None,
-) -> JointRigs:
-    """Rigs of a robot's joints in a simulator; arguments and errors are `load_simulator`'s."""
-    simulator = load_simulator(choice, robot, threads=threads, device=device, python=python)
+def joint_rigs(choice: str, robot: RobotSpec, **options: Any) -> JointRigs:
+    """Rigs of a robot's joints in a simulator; options and errors are `load_simulator`'s."""
+    simulator = load_simulator(choice, robot, **options)
     return simulator if isinstance(simulator, MujocoSimulator) else RolloutRigs(simulator, robot)

@@ -61,7 +61,7 @@ class Chain(Closing):
         spec: mujoco.MjSpec | None = None,
         threads: int = 2,
     ) -> None:
-        """Compile the chain of a joint; `spec` is its bench model where it was extended."""
+        """Compile the chain of a joint; `spec` is its bench model where that was extended."""
         self.robot, self.model = robot, (spec or bench_spec(robot, joint)).compile()
         self.joints = tuple(self.model.joint(i).name for i in range(self.model.njnt))
         self._stiffness = np.array([robot.joint(name).stiffness for name in self.joints])
@@ -99,7 +99,7 @@ class Chain(Closing):
         return np.array(data.qpos)
 
     def rollout(self, command: Array, sets: Sequence[Drives], start: Array | None = None) -> Array:
-        """Simulate runs from rest.
+        """Positions at the start of each step and after the last, of runs from rest.
 
         Args:
             command: Target positions during each step [rad], shape (runs, steps, chain).
@@ -108,8 +108,7 @@ class Chain(Closing):
                 the first command if None.
 
         Returns:
-            Positions at the start of each step and after the last [rad], shape
-            (runs, steps + 1, chain); NaN where a run diverged.
+            Shape (runs, steps + 1, chain) [rad]; NaN where a run diverged.
         """
         model = self.model
         models = [copy.copy(model) for _ in sets]
@@ -184,15 +183,12 @@ class JointTestRig(Chain):
 
     def torque_model(self) -> mujoco.MjModel:
         """A copy whose excited joint takes a torque [N m] and has no dry friction of its own."""
-        model = copy.copy(self.model)
-        i = self.actuator
+        model, i = copy.copy(self.model), self.actuator
         model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
         model.actuator_biastype[i] = mujoco.mjtBias.mjBIAS_NONE
         model.actuator_dyntype[i] = mujoco.mjtDyn.mjDYN_NONE
-        model.actuator_gainprm[i] = 0.0
-        model.actuator_gainprm[i, 0] = 1.0
-        model.actuator_ctrllimited[i] = False
-        model.actuator_forcelimited[i] = False
+        model.actuator_gainprm[i] = np.eye(model.actuator_gainprm.shape[1])[0]
+        model.actuator_ctrllimited[i] = model.actuator_forcelimited[i] = False
         model.dof_frictionloss[self.index] = 0.0
         return model
 
@@ -267,8 +263,7 @@ class MujocoSimulator(JointRigs):
 
     def __init__(self, robot: RobotSpec, *, threads: int = 2, device: str = "cpu") -> None:
         """Find the device; large runs of one joint are simulated there."""
-        self.robot, self.info = robot, mujoco_info(robot)
-        self.joints = robot.joint_names
+        self.robot, self.info, self.joints = robot, mujoco_info(robot), robot.joint_names
         self.parameters = frozenset(PARAMETERS)
         self._new_rig = partial(rig_on(device), threads=threads)
         self._rigs: dict[str, JointTestRig] = {}
@@ -302,30 +297,22 @@ class MujocoSimulator(JointRigs):
             raise PronkError(
                 f"MuJoCo sets {', '.join(PARAMETERS)}, not {', '.join(sorted(unknown))}."
             )
-        runs, steps = command.shape[:2]
+        steps, held = command.shape[1], command.copy()
         sets = [
             {
-                joint: {name: float(array[b, k]) for name, array in values.items()}
+                joint: {name: float(array[run, k]) for name, array in values.items()}
                 for k, joint in enumerate(self.joints)
             }
-            for b in range(runs)
+            for run in range(len(command))
         ]
         edges = self.robot.timestep_s * np.arange(steps + 1)
-        held = command.copy()
-        for b, drives in enumerate(sets):
-            for k, joint in enumerate(self.joints):
-                if delay := drives[joint].get("delay", 0.0):
-                    held[b, :, k] = held_mean(edges[:-1], command[b, :, k], edges - delay)
+        delays = values.get("delay", np.empty((0, 0)))
+        for run, k in np.argwhere(delays):
+            late = edges - delays[run, k]
+            held[run, :, k] = held_mean(edges[:-1], command[run, :, k], late)
         out = np.repeat(command[:, :1], steps, axis=1)
-        left = [name for name in self.joints if name not in locked]
-        while left:
-            # Branches do not feel each other: take the shortest chain with most of the joints.
-            root = max(
-                (joint for joint in self.robot.joints if left[0] in joint.chain),
-                key=lambda joint: (len(set(joint.chain) & set(left)), -len(joint.chain)),
-            )
-            with Chain(self.robot, root.name, threads=1) as chain:
+        for root, _ in self.robot.branches(set(self.joints) - set(locked)):
+            with Chain(self.robot, root, threads=1) as chain:
                 columns = [self.joints.index(name) for name in chain.joints]
                 out[..., columns] = chain.rollout(held[..., columns], sets)[:, :-1]
-            left = [name for name in left if name not in chain.joints]
         return out

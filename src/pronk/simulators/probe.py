@@ -16,7 +16,7 @@ the inertia of the links are the robot's, which is what makes the gains absolute
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import delayed
 from pronk.simulators.engines.links import links_of
-from pronk.simulators.simulator import Simulator
+from pronk.simulators.simulator import Simulator, excited
 
 AMPLITUDE = 0.2
 """Of the commands [rad]; less where the drive's effort limit needs it."""
@@ -92,9 +92,7 @@ class Probe:
     left: float
     """RMS of the motion that the answer leaves, as a share of the motion."""
     wrong: Mapping[str, str] = field(default_factory=dict)
-    """What acts otherwise than it is set: a word, and a sentence. The words are law, beside, twice,
-    degrees, stiffness, damping, armature, ignored, friction,
-    gravity, hold, early, unstable and left."""
+    """What acts otherwise than it is set: a word, and a sentence (see `_wrong`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +113,16 @@ class _Runs:
     gravity: tuple[float, float]
     """Torque of gravity `gravity[0] cos q + gravity[1] sin q` [N m]."""
 
+    @property
+    def torque(self) -> float:
+        """Of the largest stiffness at the amplitude [N m]."""
+        return float(self.stiffness.max()) * AMPLITUDE
+
+    @property
+    def gravity_shows(self) -> bool:
+        """True if gravity moves the joint by enough to be fitted."""
+        return math.hypot(*self.gravity) > _GRAVITY * float(self.stiffness.max())
+
 
 @dataclass(frozen=True)
 class _Law:
@@ -133,20 +141,14 @@ class _Fit:
 
 
 def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
-    """Name the drive law and the parameters that act at one joint.
+    """Name the drive law and the parameters that act at one joint, whose gains are the robot's.
 
-    Args:
-        simulator: Any simulator of the robot's joints.
-        robot: The robot; gains and armature are set to its own.
-        joint: The joint; the first one that moves no other if None.
-
-    Raises:
-        PronkError: There is no such joint, it does not move, or the simulator diverges even with
-            small gains.
+    It is the first joint that moves no other if None. A PronkError says that there is no such
+    joint, that it does not move, or that the simulator diverges even with small gains.
     """
     if joint is None:
         joint = min(robot.joints, key=lambda one: len(one.chain)).name
-    one = robot.joint(joint)
+    drive = robot.joint(joint).drive
     if joint not in simulator.joints:
         raise PronkError(
             f"the simulator has no joint {joint!r}; its joints are {', '.join(simulator.joints)}."
@@ -195,11 +197,11 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
         stiffness_factor=scale,
         damping_factor=scale * damping,
         armature=scale * inertia - runs.inertia,
-        armature_set=one.drive.armature,
+        armature_set=drive.armature,
         armature_applied=scale * applied if settable else None,
         viscous_damping=scale * viscous,
         frictionloss=scale * friction,
-        frictionloss_set=one.drive.frictionloss,
+        frictionloss_set=drive.frictionloss,
         soft_friction=law.soft,
         gravity=scale * gravity,
         delay_s=delay * runs.timestep,
@@ -207,7 +209,7 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
         stable_share=stable,
         left=left,
     )
-    return replace(found, wrong=dict(_wrong(found, simulator, runs)))
+    return replace(found, wrong=_wrong(found, simulator, runs))
 
 
 class _Bench:
@@ -215,32 +217,18 @@ class _Bench:
 
     def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str) -> None:
         self.simulator, self.joint, self.robot = simulator, robot.joint(joint), robot
-        self.column = simulator.joints.index(joint)
         self.step = simulator.info.timestep_s
-        self.pose = np.array([robot.joint(n).default_position for n in simulator.joints])
-        self.locked = tuple(name for name in simulator.joints if name != joint)
         effort = min(self.joint.drive.effort_limit, self.joint.drive.stall_torque)
         self.amplitude = min(AMPLITUDE, 0.3 * effort / self.joint.stiffness)
 
     def run(self, command: Array, **values: Array) -> Array:
         """Positions of the joint [rad], shape (B, T), with a command about the pose, (B, T)."""
-        full = np.tile(self.pose, (*command.shape, 1))
-        full[..., self.column] += command
         names = self.simulator.joints
-        sent = {}
-        for name, value in values.items():
-            own = [getattr(self.robot.joint(n), name, 0.0) for n in names]
-            if name == "armature":
-                own = [self.robot.joint(n).drive.armature for n in names]
-            sent[name] = np.tile(own, (len(command), 1)).astype(np.float64)
-            sent[name][:, self.column] = value
+        pose = np.array([self.robot.joint(name).default_position for name in names])
+        full = np.tile(pose, (*command.shape, 1))
+        full[..., names.index(self.joint.name)] += command
         with np.errstate(all="ignore"):
-            out = np.asarray(self.simulator.rollout(full, sent, locked=self.locked))
-        if out.shape != full.shape:
-            raise PronkError(
-                f"the simulator's rollout returned shape {out.shape}; expected {full.shape}."
-            )
-        return np.asarray(out[..., self.column])
+            return excited(self.simulator, self.robot, self.joint.name, full, values)
 
     def gains(self, share: Array) -> dict[str, Array]:
         """Both gains, shares of the robot's, shape (B,)."""
@@ -301,31 +289,28 @@ class _Bench:
 
     def chirps(self, share: float, hold: int, phase: int) -> _Runs:
         """Chirps with three pairs of gains, and with another armature."""
-        kp = np.array([1.0, 1.0, 0.5, 1.0]) * self.joint.stiffness * share
-        kd = np.array([1.0, 0.5, 0.5, 1.0]) * self.joint.damping * share
+        settable = "armature" in self.simulator.parameters
+        rows = 4 if settable else 3
+        kp = np.array([1.0, 1.0, 0.5, 1.0])[:rows] * self.joint.stiffness * share
+        kd = np.array([1.0, 0.5, 0.5, 1.0])[:rows] * self.joint.damping * share
         links = links_of(self.robot, self.joint.name)
         index = links.joints.index(self.joint.name)
         pose = np.array([self.robot.joint(n).default_position for n in links.joints])
         inertia = links.inertia_about(index, pose)
         own = self.joint.drive.armature
-        change = np.array([0.0, 0.0, 0.0, own + 0.5 * inertia])
-        values = {"stiffness": kp, "damping": kd}
-        if "armature" in self.simulator.parameters:
-            values["armature"] = own + change
-        else:
-            kp, kd, change = kp[:3], kd[:3], change[:3]
-            values = {"stiffness": kp, "damping": kd}
-        command = np.tile(self.chirp(), (len(kp), 1))
-        position = self.run(command, **values)
+        change = np.array([0.0, 0.0, 0.0, own + 0.5 * inertia])[:rows]
+        armature = {"armature": own + change} if settable else {}
+        command = np.tile(self.chirp(), (rows, 1))
+        position = self.run(command, stiffness=kp, damping=kd, **armature)
         at = np.arange(command.shape[1])
         seen = np.maximum((at - phase) // hold * hold + phase, 0)
-        held = command[0, np.minimum(seen, at)] + self.pose[self.column]
+        held = command[0, np.minimum(seen, at)] + self.joint.default_position
         torque = []
         for angle in (0.0, 0.5 * np.pi):
             pose[index] = angle
             torque.append(float(links.gravity_torque(pose)[index]))
         return _Runs(
-            command=np.tile(held[:, None], (1, len(kp))),
+            command=np.tile(held[:, None], (1, rows)),
             position=position.T,
             stiffness=kp,
             damping=kd,
@@ -374,8 +359,7 @@ def _simulated(runs: _Runs, law: _Law, theta: Array) -> Array:
 def _fit(runs: _Runs, law: _Law, start: Array, fixed: frozenset[str], rounds: int) -> _Fit:
     """Parameters of least squares (Levenberg and Marquardt)."""
     free = [i for i, name in enumerate(_NAMES) if name not in fixed]
-    torque = float(runs.stiffness.max()) * AMPLITUDE
-    size = np.array([start[0], start[1], runs.damping.max(), 0.1 * torque, *np.ones(3)])
+    size = np.array([start[0], start[1], runs.damping.max(), 0.1 * runs.torque, *np.ones(3)])
     low = np.array([0.0, 1e-3 * runs.inertia, -np.inf, 0.0, -1.0, -np.inf, -np.inf])
     high = np.array([np.inf] * 4 + [start[4] + 2.0, np.inf, np.inf])
     theta, trust = start, 1e-3
@@ -457,7 +441,7 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[_Fit, float]:
                     break
         # Whether friction is soft shows where there is some.
         theta = least().theta
-        friction = theta if theta[3] > 0.002 * float(runs.stiffness.max()) * AMPLITUDE else None
+        friction = theta if theta[3] > 0.002 * runs.torque else None
     tried.sort(key=lambda one: one.left)
     final: list[_Fit] = []
     for begin in tried[:3]:
@@ -480,7 +464,7 @@ def _scale(runs: _Runs, applied: float | None, gravity: float) -> float:
     A factor with a usual cause is taken unless another one explains both.
     """
     shares = [] if applied is None else [applied]
-    if math.hypot(*runs.gravity) > _GRAVITY * runs.stiffness.max():
+    if runs.gravity_shows:
         shares.append(gravity)
     others = [1.0 / share for share in shares if share > 0.01]
 
@@ -492,66 +476,51 @@ def _scale(runs: _Runs, applied: float | None, gravity: float) -> float:
     return min([best, *others], key=lambda one: off(one) + (0.1 if one != best else 0.0))
 
 
-def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> Iterator[tuple[str, str]]:
+def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> dict[str, str]:
     """Settings that act otherwise than they are set; see `Probe.wrong`."""
-    info = simulator.info
-    stated = DriveLaw(kind=info.law, iterations=info.iterations)  # type: ignore[arg-type]
+    out, stated, law = {}, simulator.info.drive_law, found.law
     if found.beside_explicit:
-        yield (
-            "beside",
-            f"a drive of law {found.law.label} acts beside the explicit torque; set the gains of "
-            "the engine's own drive to 0",
+        out["beside"] = (
+            f"a drive of law {law.label} acts beside the explicit torque; set the gains of the "
+            "engine's own drive to 0"
         )
-    elif found.law != stated:
-        yield "law", f"law {stated.label} is stated, the joint responds by {found.law.label}"
-    factors = {name: getattr(found, f"{name}_factor") for name in ("stiffness", "damping")}
-    causes = {
-        2.0: ("twice", "torques act twice: the effort is submitted two times"),
-        180.0 / math.pi: ("degrees", "gains per degree act as if they were per radian"),
-        math.pi / 180.0: ("degrees", "gains per radian act as if they were per degree"),
-    }
-    for scale, (word, sentence) in causes.items():
+    elif law != stated:
+        out["law"] = f"law {stated.label} is stated, the joint responds by {law.label}"
+    factors = {"stiffness": found.stiffness_factor, "damping": found.damping_factor}
+    causes = (
+        (2.0, "twice", "torques act twice: the effort is submitted two times"),
+        (180.0 / math.pi, "degrees", "gains per degree act as if they were per radian"),
+        (math.pi / 180.0, "degrees", "gains per radian act as if they were per degree"),
+    )
+    for scale, word, sentence in causes:
         if all(abs(factor / scale - 1.0) < 0.05 for factor in factors.values()):
-            yield word, f"{sentence}, {scale:.3g} times the gains that are set"
+            out[word] = f"{sentence}, {scale:.3g} times the gains that are set"
             break
     else:
         for name, factor in factors.items():
             if abs(factor - 1.0) > 0.05:
-                yield name, f"the {name} that acts is {factor:.3g} times the one that is set"
+                out[name] = f"the {name} that acts is {factor:.3g} times the one that is set"
+    acts, own = found.armature, found.armature_set
     if found.armature_applied is not None and found.armature_applied < 0.5:
-        yield "ignored", "a change of the armature changes nothing: the engine ignores it"
-    elif abs(found.armature - found.armature_set) > 0.03 * (runs.inertia + found.armature_set):
-        yield (
-            "armature",
-            f"an armature of {found.armature:.4g} kg m^2 acts, {found.armature_set:.4g} is set",
-        )
-    if "frictionloss" in simulator.parameters:
-        apart = abs(found.frictionloss - found.frictionloss_set)
-        if apart > max(
-            0.1 * found.frictionloss_set, 0.005 * float(runs.stiffness.max()) * AMPLITUDE
-        ):
-            yield (
-                "friction",
-                f"dry friction of {found.frictionloss:.3g} N m acts, "
-                f"{found.frictionloss_set:.3g} is set",
-            )
-    if (
-        abs(found.gravity - 1.0) > 0.1
-        and math.hypot(*runs.gravity) > _GRAVITY * runs.stiffness.max()
-    ):
-        yield "gravity", f"{max(found.gravity, 0.0):.2f} of the gravity acts that the model has"
+        out["ignored"] = "a change of the armature changes nothing: the engine ignores it"
+    elif abs(acts - own) > 0.03 * (runs.inertia + own):
+        out["armature"] = f"an armature of {acts:.4g} kg m^2 acts, {own:.4g} is set"
+    acts, own = found.frictionloss, found.frictionloss_set
+    apart = abs(acts - own) > max(0.1 * own, 0.005 * runs.torque)
+    if apart and "frictionloss" in simulator.parameters:
+        out["friction"] = f"dry friction of {acts:.3g} N m acts, {own:.3g} is set"
+    if abs(found.gravity - 1.0) > 0.1 and runs.gravity_shows:
+        out["gravity"] = f"{max(found.gravity, 0.0):.2f} of the gravity acts that the model has"
     if found.hold > 1:
-        yield "hold", f"the simulator holds each command for {found.hold} steps"
+        out["hold"] = f"the simulator holds each command for {found.hold} steps"
     if found.delay_s < -0.5 * runs.timestep:
-        yield "early", "positions are those at the end of each step, one step early"
+        out["early"] = "positions are those at the end of each step, one step early"
     if found.stable_share < 1.0:
-        yield (
-            "unstable",
-            f"the joint diverges with its gains; it was probed with {found.stable_share:g} of them",
-        )
+        share = found.stable_share
+        out["unstable"] = f"the joint diverges with its gains; it was probed with {share:g} of them"
     if found.left > _LEFT:
-        yield (
-            "left",
+        out["left"] = (
             f"{100.0 * found.left:.1f} % of the motion is left: the joint follows none of the "
-            "laws, or others move with it",
+            "laws, or others move with it"
         )
+    return out

@@ -8,7 +8,7 @@ the same gains.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -26,20 +26,15 @@ _NO_CURVE = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Profile:
-    """The joint of one framework."""
+class Profile(SimulatorInfo):
+    """The joint of one framework.
+
+    `decimation` is that of the framework's tasks; a match takes the robot's.
+    """
 
     framework: str
     """Framework, and the actuator of it that the profile holds for."""
-    engine: str
-    integrator: str
-    actuator: str
-    law: Literal["explicit", "implicit_damping", "implicit"]
-    iterations: int = 1
     passive_damping: Literal["implicit", "explicit"] = "implicit"
-    timestep_s: float
-    decimation: int
-    """Steps of a command as the framework's tasks have it; a match takes the robot's."""
     delay: Literal["steps", "none"]
     """Delay of a command that can be set: whole physics steps, or none."""
     friction: Friction
@@ -49,7 +44,6 @@ class Profile:
     """True if the torque-speed line of the motor limits the torque, not the effort limit alone."""
     source: str
     """Where timestep, decimation and iterations come from."""
-    name: str = ""
 
     def __post_init__(self) -> None:
         """Refuse an impossible step or law, and friction of an unknown kind."""
@@ -65,18 +59,19 @@ class Profile:
         _ = self.drive_law
 
     @property
+    def name(self) -> str:
+        """Its name in `profiles.yaml`."""
+        return self.profile
+
+    @property
     def drive_law(self) -> DriveLaw:
-        """How stiffness and damping act over a step."""
-        return DriveLaw(
-            kind=self.law, iterations=self.iterations, passive_damping=self.passive_damping
-        )
+        """How stiffness, damping and passive damping act over a step."""
+        return replace(super().drive_law, passive_damping=self.passive_damping)
 
     @property
     def info(self) -> SimulatorInfo:
         """What gains that are matched for the profile hold for."""
-        names = ("engine", "timestep_s", "decimation", "integrator", "actuator")
-        own = {name: getattr(self, name) for name in (*names, "law", "iterations")}
-        return SimulatorInfo(profile=self.name, **own)
+        return SimulatorInfo(**{one.name: getattr(self, one.name) for one in fields(SimulatorInfo)})
 
     def joint(self, joint: Joint) -> Joint:
         """A joint with the limits and the friction that the framework has."""
@@ -90,8 +85,7 @@ class Profile:
     def robot(self, robot: RobotSpec) -> RobotSpec:
         """A robot as the framework simulates it, commanded at the robot's own rate.
 
-        Raises:
-            PronkError: The period of the robot's commands is no multiple of the timestep.
+        A PronkError says that the period of its commands is no multiple of the timestep.
         """
         ticks = 1.0 / (robot.policy_rate_hz * self.timestep_s)
         if round(ticks) < 1 or abs(ticks - round(ticks)) > 1e-6:
@@ -113,14 +107,13 @@ class Profile:
 def profiles() -> Mapping[str, Profile]:
     """All profiles by name, in the order of their file."""
     data = read_yaml(FILE)
-    return {n: converted({**one, "name": n}, Profile, FILE) for n, one in data.items()}
+    return {n: converted({**one, "profile": n}, Profile, FILE) for n, one in data.items()}
 
 
 def profile(text: str) -> Profile:
     """One of `profiles`: NAME, or NAME,timestep_s=S,iterations=N,friction=none with other values.
 
-    Raises:
-        PronkError: Unknown name or setting, or a value out of range.
+    A PronkError names an unknown name or setting, or a value out of range.
     """
     name, *settings = text.split(",")
     if name not in profiles():
@@ -140,10 +133,6 @@ def profile(text: str) -> Profile:
 
 
 def profile_of(info: SimulatorInfo) -> Profile:
-    """The profile that gains hold for, with their own step and iterations.
-
-    Raises:
-        PronkError: They hold for no profile.
-    """
+    """The profile that gains hold for, with their own step and iterations; PronkError if none."""
     name = info.profile or ("mjlab" if info.engine == "mujoco" else info.engine)
     return profile(f"{name},timestep_s={info.timestep_s!r},iterations={info.iterations}")

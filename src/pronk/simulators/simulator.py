@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from pronk import plugins
+from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
@@ -55,6 +56,11 @@ class SimulatorInfo:
     """`DriveLaw.kind`."""
     iterations: int = 1
     """`DriveLaw.iterations`."""
+
+    @property
+    def drive_law(self) -> DriveLaw:
+        """How stiffness and damping act over a step."""
+        return DriveLaw(kind=self.law, iterations=self.iterations)  # type: ignore[arg-type]
 
 
 @runtime_checkable
@@ -112,17 +118,15 @@ class JointRigs(Closing, ABC):
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the excited joint's positions a chunk of simulations at a time.
 
-        A joint that mirrors another is simulated as that other (`Joint.original`).
+        A joint that mirrors another is simulated as that other (`Joint.original`). Yields which
+        simulations, and the original joint's position about the pose at the start of each step
+        [rad], shape (chunk, steps). The array is reused: take what is needed first.
 
         Args:
             traces: Commands to joints of one original; one for all simulations, or one each.
             values: Parameter name to values of the excited joint, shape (b,): stiffness, damping,
                 and armature and frictionloss where they are not the robot's.
             steps: Physics steps to simulate; a shorter command stays where it ends.
-
-        Yields:
-            Which simulations, and the original joint's position about the pose at the start of
-            each step [rad], shape (chunk, steps). The array is reused: take what is needed first.
         """
 
     def play(self, trace: CommandTrace, values: Values) -> Array:
@@ -165,36 +169,47 @@ class RolloutRigs(JointRigs):
                 f"simulator {engine} cannot set {', '.join(sorted(lacking))}; it sets "
                 f"{', '.join(sorted(self.parameters))}."
             )
-        column = names.index(original.name)
-        joints = [self.robot.joint(name) for name in names]
-        own = {
-            "stiffness": [joint.stiffness for joint in joints],
-            "damping": [joint.damping for joint in joints],
-            "armature": [joint.drive.armature for joint in joints],
-            "frictionloss": [joint.drive.frictionloss for joint in joints],
-        }
-        locked = tuple(name for name in names if name != original.name)
-        for begin in range(0, len(values["stiffness"]), CHUNK):
-            part = slice(begin, min(begin + CHUNK, len(values["stiffness"])))
-            command = np.empty((part.stop - part.start, steps, len(names)))
+        column, total = names.index(original.name), len(values["stiffness"])
+        own = {n: np.full(total, v) for n, v in original.parameters.items() if n in self.parameters}
+        values = {**own, **values}
+        for begin in range(0, total, CHUNK):
+            part = slice(begin, min(begin + CHUNK, total))
+            command = np.empty((part.stop - begin, steps, len(names)))
             centre = np.empty((len(command), 1))
-            for row, i in enumerate(range(part.start, part.stop)):
+            for row, i in enumerate(range(begin, part.stop)):
                 pose, offsets = traces[i if len(traces) > 1 else 0].excitation(self.robot, steps)
                 at = dict(zip(original.chain, pose, strict=True))
-                command[row] = [at.get(joint.name, joint.default_position) for joint in joints]
+                command[row] = [at.get(n, self.robot.joint(n).default_position) for n in names]
                 command[row, :, column] += offsets
                 centre[row] = at[original.name]
-            tiled = {n: np.tile(own[n], (len(command), 1)) for n in own if n in self.parameters}
-            for name, array in values.items():
-                tiled[name][:, column] = array[part]
-            position = np.asarray(self._simulator.rollout(command, tiled, locked=locked))
-            if position.shape != command.shape:
-                raise PronkError(
-                    f"the simulator's rollout returned shape {position.shape}; expected that of "
-                    f"the command, {command.shape} (runs, steps, joints)."
-                )
+            drives = {name: value[part] for name, value in values.items()}
+            position = excited(self._simulator, self.robot, original.name, command, drives)
             self.steps += len(command) * steps
-            yield part, position[:, :, column] - centre
+            yield part, position - centre
+
+
+def excited(
+    simulator: Simulator, robot: RobotSpec, joint: str, command: Array, values: Values
+) -> Array:
+    """Positions of one joint while all others are held [rad], shape (B, T).
+
+    The command to all joints has shape (B, T, J), values of the joint (B,); those of the others are
+    the robot's own.
+    """
+    names, drives = simulator.joints, {}
+    column = names.index(joint)
+    for name, value in values.items():
+        own = [robot.joint(one).parameters[name] for one in names]
+        drives[name] = np.tile(own, (len(command), 1))
+        drives[name][:, column] = value
+    locked = tuple(name for name in names if name != joint)
+    position = np.asarray(simulator.rollout(command, drives, locked=locked))
+    if position.shape != command.shape:
+        raise PronkError(
+            f"the simulator's rollout returned shape {position.shape}; expected that of the "
+            f"command, {command.shape} (runs, steps, joints)."
+        )
+    return np.asarray(position[..., column])
 
 
 def factory(choice: str) -> Any:

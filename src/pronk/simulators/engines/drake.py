@@ -47,7 +47,9 @@ class Drake(EngineSimulator):
                 )
             )
             joint = plant.AddJoint(
-                drake.RevoluteJoint(name, at, body.body_frame(), links.axis[i], drives.viscous[i])
+                drake.RevoluteJoint(
+                    name, at, body.body_frame(), links.axis[i], drives.viscous_damping[i]
+                )
             )
             actuator = plant.AddJointActuator(name, joint, effort_limit=drives.effort_limit[i])
             actuator.set_default_rotor_inertia(drives.armature[i])

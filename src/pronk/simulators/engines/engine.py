@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pronk.actuator.law import DriveLaw
+from pronk.actuator.model import voltage_limits
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
@@ -21,31 +22,24 @@ from pronk.simulators.simulator import SimulatorInfo
 
 @dataclass(frozen=True, kw_only=True)
 class Drives:
-    """The drives of a chain; arrays of shape (n,)."""
+    """The drives of a chain; arrays of shape (n,) in the units of `Drive`."""
 
     stiffness: Array
-    """[N m/rad]."""
     damping: Array
-    """[N m s/rad]."""
-    viscous: Array
-    """Passive damping of the joint, which the engine treats as it does [N m s/rad]."""
+    viscous_damping: Array
+    """Of the joint, passive: each engine treats it in its own way [N m s/rad]."""
     armature: Array
-    """[kg m^2]."""
     frictionloss: Array
-    """Dry friction, 0 where the engine has none [N m]."""
+    """0 where the engine has none."""
     effort_limit: Array
-    """[N m]."""
     stall_torque: Array
-    """[N m]."""
     no_load_speed: Array
-    """[rad/s]."""
 
     def torque(self, command: Array, position: Array, speed: Array) -> Array:
-        """The explicit law with mjlab's limits (`pronk.robots.model`) [N m], shape (n,)."""
+        """The explicit law with the limits of the motor and its drive [N m], shape (n,)."""
         wanted = self.stiffness * (command - position) - self.damping * speed
-        share = speed / self.no_load_speed
-        high = np.minimum(self.effort_limit, self.stall_torque * (1.0 - share))
-        low = np.maximum(-self.effort_limit, -self.stall_torque * (1.0 + share))
+        low, high = voltage_limits(speed, self.stall_torque, self.no_load_speed)
+        low, high = np.maximum(low, -self.effort_limit), np.minimum(high, self.effort_limit)
         return np.asarray(np.clip(wanted, low, high))
 
 
@@ -68,10 +62,9 @@ class EngineSimulator(ABC):
     """Those with which its joints have dry friction in N m."""
 
     def __init__(self, robot: RobotSpec, *, law: DriveLaw | None = None) -> None:
-        """Import the engine; without a law the drives have that of the robot.
+        """Import the engine; PronkError if it is not installed, or has no such law.
 
-        Raises:
-            PronkError: It is not installed, or has no such law.
+        Without a law the drives have that of the robot.
         """
         self.robot, self.law, self.joints = robot, law or robot.law, robot.joint_names
         if self.law.kind not in self.laws:
@@ -103,16 +96,10 @@ class EngineSimulator(ABC):
 
     @abstractmethod
     def simulate(self, links: Links, drives: Drives, command: Array, start: Array) -> Array:
-        """Simulate one run of a chain from rest.
+        """Simulate one run of a chain from rest at first positions [rad], shape (n,).
 
-        Args:
-            links: The chain.
-            drives: Its drives.
-            command: Target position during each step [rad], shape (T, n).
-            start: First positions [rad], shape (n,).
-
-        Returns:
-            Position at the start of each step [rad], shape (T, n); NaN once a run diverged.
+        The command is the target position during each step, what is returned the position at its
+        start [rad], both of shape (T, n); NaN once the run diverged.
         """
 
     def rollout(
@@ -128,40 +115,27 @@ class EngineSimulator(ABC):
         delay = np.broadcast_to(values.get("delay", np.zeros(shape)), shape)
         held = delayed(command, delay / self.robot.timestep_s)
         out = np.repeat(command[:, :1], command.shape[1], axis=1)
-        left = [name for name in self.joints if name not in locked]
-        while left:
-            # The shortest chain with most of the joints, as in MujocoSimulator.
-            root = max(
-                (joint for joint in self.robot.joints if left[0] in joint.chain),
-                key=lambda joint: (len(set(joint.chain) & set(left)), -len(joint.chain)),
-            )
-            links = self._links.setdefault(root.name, links_of(self.robot, root.name))
+        for root, _ in self.robot.branches(set(self.joints) - set(locked)):
+            links = self._links.setdefault(root, links_of(self.robot, root))
             columns = [self.joints.index(name) for name in links.joints]
             for run in range(len(command)):
                 drives = self._drives(links, columns, {n: v[run] for n, v in values.items()})
                 track = held[run][:, columns]
                 start = links.rest(track[0], drives.stiffness)
                 out[run][:, columns] = self.simulate(links, drives, track, start)
-            left = [name for name in left if name not in links.joints]
         return out
 
     def _drives(self, links: Links, columns: list[int], values: Mapping[str, Array]) -> Drives:
         """The drives of a chain; those of the robot where a value is missing."""
         joints = [self.robot.joint(name) for name in links.joints]
-
-        def of(name: str, own: list[float]) -> Array:
-            return np.array(values[name][columns] if name in values else own)
-
-        dry = float("frictionloss" in self.parameters)
-        limits = ("effort_limit", "stall_torque", "no_load_speed")
-        return Drives(
-            stiffness=of("stiffness", [joint.stiffness for joint in joints]),
-            damping=of("damping", [joint.damping for joint in joints]),
-            viscous=np.array([joint.drive.viscous_damping for joint in joints]),
-            armature=of("armature", [joint.drive.armature for joint in joints]),
-            frictionloss=dry * of("frictionloss", [joint.drive.frictionloss for joint in joints]),
-            **{n: np.array([getattr(joint.drive, n) for joint in joints]) for n in limits},
-        )
+        fields = ("viscous_damping", "effort_limit", "stall_torque", "no_load_speed")
+        own = {n: np.array([getattr(joint.drive, n) for joint in joints]) for n in fields}
+        for name in joints[0].parameters:
+            own[name] = np.array([joint.parameters[name] for joint in joints])
+            if name in values:
+                own[name] = values[name][columns]
+        own["frictionloss"] *= "frictionloss" in self.parameters
+        return Drives(**own)
 
 
 def delayed(command: Array, steps: Array) -> Array:

@@ -51,7 +51,7 @@ class Genesis(EngineSimulator):
             explicit = self.law.kind == "explicit"
             active = 0.0 if explicit else 1.0
             chain.set_dofs_armature(drives.armature, order)
-            chain.set_dofs_damping(drives.viscous, order)
+            chain.set_dofs_damping(drives.viscous_damping, order)
             chain.set_dofs_frictionloss(drives.frictionloss, order)
             chain.set_dofs_kp(active * drives.stiffness, order)
             chain.set_dofs_kv(active * drives.damping, order)

@@ -45,7 +45,7 @@ class Mujoco(EngineSimulator):
             body.fullinertia = links.inertia[i][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             joint = body.add_joint(name=name, axis=links.axis[i], armature=drives.armature[i])
             joint.frictionloss = drives.frictionloss[i]
-            joint.damping = drives.viscous[i] * np.eye(len(joint.damping))[0]
+            joint.damping = drives.viscous_damping[i] * np.eye(len(joint.damping))[0]
             actuator = spec.add_actuator(
                 name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, forcelimited=True
             )

@@ -56,7 +56,7 @@ class Newton(EngineSimulator):
                     axis=links.axis[i].tolist(),
                     target_ke=float(drives.stiffness[i]),
                     target_kd=float(drives.damping[i]),
-                    damping=float(drives.viscous[i]),
+                    damping=float(drives.viscous_damping[i]),
                     armature=float(drives.armature[i]),
                     effort_limit=float(drives.effort_limit[i]),
                     friction=float(drives.frictionloss[i]),

@@ -126,7 +126,7 @@ class OvPhysx(EngineSimulator):
         # Passive damping is a drive too: PhysX takes both implicitly.
         active = 0.0 if explicit else 1.0
         column("STIFFNESS").write(active * drives.stiffness)
-        column("DAMPING").write(active * drives.damping + drives.viscous)
+        column("DAMPING").write(active * drives.damping + drives.viscous_damping)
         column("ARMATURE").write(drives.armature)
         if not explicit:  # It would limit the sum of torque and passive damping.
             column("MAX_FORCE").write(drives.effort_limit)

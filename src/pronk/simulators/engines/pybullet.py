@@ -73,7 +73,9 @@ class PyBullet(EngineSimulator):
                 speed[order] = [state[1] for state in states]
                 bullet.setJointMotorControlArray(
                     *(chain, index, bullet.TORQUE_CONTROL),
-                    forces=(drives.torque(target, row, speed) - drives.viscous * speed)[order],
+                    forces=(drives.torque(target, row, speed) - drives.viscous_damping * speed)[
+                        order
+                    ],
                     physicsClientId=client,
                 )
                 bullet.stepSimulation(physicsClientId=client)

@@ -40,7 +40,10 @@ class Sapien(EngineSimulator):
             joint.set_friction(0.0)
             # Passive damping is a drive too: PhysX takes both implicitly.
             active = 0.0 if explicit else 1.0
-            gains = active * drives.stiffness[i], active * drives.damping[i] + drives.viscous[i]
+            gains = (
+                active * drives.stiffness[i],
+                active * drives.damping[i] + drives.viscous_damping[i],
+            )
             joint.set_drive_properties(*gains, force_limit=drives.effort_limit[i])
         articulation.set_qpos(start[order].astype(np.float32))
         articulation.set_qvel(np.zeros(len(order), np.float32))
