@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
@@ -31,21 +31,15 @@ class Drake(EngineSimulator):
         joints: list[Any] = []
         for i, (name, up) in enumerate(zip(links.joints, links.parent, strict=True)):
             moments = links.inertia[i]
-            body = plant.AddRigidBody(
-                f"{name} link",
-                instance,
-                drake.SpatialInertia.MakeFromCentralInertia(
-                    links.mass[i],
-                    links.centre[i],
-                    drake.RotationalInertia(*np.diag(moments), *moments[[0, 0, 1], [1, 2, 2]]),
-                ),
+            inertia = drake.SpatialInertia.MakeFromCentralInertia(
+                links.mass[i],
+                links.centre[i],
+                drake.RotationalInertia(*np.diag(moments), *moments[[0, 0, 1], [1, 2, 2]]),
             )
+            body = plant.AddRigidBody(f"{name} link", instance, inertia)
             parent = bodies[up] if up >= 0 else plant.world_body()
-            at = plant.AddFrame(
-                drake.FixedOffsetFrame(
-                    f"{name} hinge", parent, drake.RigidTransform(links.offset[i])
-                )
-            )
+            place = drake.RigidTransform(links.offset[i])
+            at = plant.AddFrame(drake.FixedOffsetFrame(f"{name} hinge", parent, place))
             joint = plant.AddJoint(
                 drake.RevoluteJoint(
                     name, at, body.body_frame(), links.axis[i], drives.viscous_damping[i]
@@ -62,30 +56,23 @@ class Drake(EngineSimulator):
         plant.Finalize()
         context = plant.CreateDefaultContext()
         places = [joint.position_start() for joint in joints]
-        count = len(joints)
-        position, speed, value = np.empty(count), np.empty(count), np.zeros(count)
-        position[places] = start
-        plant.SetPositions(context, position)
-        port = (
-            plant.get_actuation_input_port(instance)
-            if explicit
-            else plant.get_desired_state_input_port(instance)
-        )
-        fixed = port.FixValue(context, np.zeros(count if explicit else 2 * count))
+        plant.SetPositions(context, start[np.argsort(places)])
+        if explicit:
+            port, value = plant.get_actuation_input_port(instance), np.zeros(len(joints))
+        else:
+            port, value = plant.get_desired_state_input_port(instance), np.zeros(2 * len(joints))
+        fixed = port.FixValue(context, value)
         out = np.empty(command.shape)
         for row, target in zip(out, command, strict=True):
-            position = plant.GetPositions(context)
-            speed = plant.GetVelocities(context)
-            row[:] = position[places]
-            value[:] = drives.torque(target, row, speed[places]) if explicit else target
-            data = value if explicit else np.concatenate([value, np.zeros(count)])
-            fixed.GetMutableData().get_mutable_value().SetFromVector(data)
+            row[:] = plant.GetPositions(context)[places]
+            speed = plant.GetVelocities(context)[places]
+            value[: len(joints)] = drives.torque(target, row, speed) if explicit else target
+            fixed.GetMutableData().get_mutable_value().SetFromVector(value)
             after = plant.EvalUniquePeriodicDiscreteUpdate(context)
             # Taking the mutable state, each step, marks what depends on it as changed.
             context.get_mutable_discrete_state().SetFrom(after)
         return out
 
 
-def drive(robot: RobotSpec) -> Drake:
-    """Drives with `PdControllerGains`."""
-    return Drake(robot, law=DriveLaw(kind="implicit"))
+drive = partial(Drake, law=DriveLaw(kind="implicit"))
+"""Drives with `PdControllerGains`."""

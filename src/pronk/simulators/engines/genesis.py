@@ -7,6 +7,7 @@ It computes on the processor in double precision; compiling takes minutes the fi
 from __future__ import annotations
 
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 from pronk.simulators.engines.pybullet import urdf
@@ -31,21 +31,18 @@ class Genesis(EngineSimulator):
         gs: Any = self.engine
         gs.init(backend=gs.cpu, precision="64", logging_level="error")
         try:
+            gravity = tuple(links.gravity.tolist())
+            none = {"enable_collision": False, "enable_joint_limit": False}
             scene = gs.Scene(
-                sim_options=gs.options.SimOptions(
-                    dt=self.robot.timestep_s, gravity=tuple(links.gravity.tolist())
-                ),
-                rigid_options=gs.options.RigidOptions(
-                    enable_collision=False, enable_joint_limit=False
-                ),
+                sim_options=gs.options.SimOptions(dt=self.robot.timestep_s, gravity=gravity),
+                rigid_options=gs.options.RigidOptions(**none),
                 show_viewer=False,
             )
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "chain.urdf"
                 file.write_text(urdf(links, 0.0 * drives.armature), encoding="utf-8")
-                chain = scene.add_entity(
-                    gs.morphs.URDF(file=str(file), fixed=True, merge_fixed_links=False)
-                )
+                shape = gs.morphs.URDF(file=str(file), fixed=True, merge_fixed_links=False)
+                chain = scene.add_entity(shape)
                 scene.build()
             order = [chain.get_joint(name).dofs_idx_local[0] for name in links.joints]
             explicit = self.law.kind == "explicit"
@@ -71,6 +68,5 @@ class Genesis(EngineSimulator):
             gs.destroy()
 
 
-def drive(robot: RobotSpec) -> Genesis:
-    """Drives of `control_dofs_position`."""
-    return Genesis(robot, law=DriveLaw(kind="implicit_damping"))
+drive = partial(Genesis, law=DriveLaw(kind="implicit_damping"))
+"""Drives of `control_dofs_position`."""

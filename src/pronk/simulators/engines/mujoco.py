@@ -15,7 +15,6 @@ import numpy as np
 
 from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
@@ -94,9 +93,5 @@ def _mjx_run() -> Any:
     return jax.jit(run)
 
 
-def position(robot: RobotSpec, engine: type[Mujoco] = Mujoco) -> Mujoco:
-    """Position actuators with implicitfast (law IF)."""
-    return engine(robot, law=DriveLaw(kind="implicit_damping"))
-
-
-mjx_position = partial(position, engine=Mjx)
+position, mjx_position = (partial(e, law=DriveLaw(kind="implicit_damping")) for e in (Mujoco, Mjx))
+"""Position actuators with implicitfast (law IF)."""

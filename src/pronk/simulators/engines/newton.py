@@ -14,7 +14,6 @@ import numpy as np
 
 from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
@@ -81,9 +80,6 @@ class Newton(EngineSimulator):
         return out
 
 
-def solver(robot: RobotSpec, kind: Any = "implicit_damping") -> Newton:
-    """Drives in SolverMuJoCo."""
-    return Newton(robot, law=DriveLaw(kind=kind))
-
-
-featherstone, steel = (partial(solver, kind=kind) for kind in ("explicit", "implicit"))
+solver = partial(Newton, law=DriveLaw(kind="implicit_damping"))
+"""Drives in SolverMuJoCo."""
+featherstone, steel = (partial(Newton, law=DriveLaw(kind=k)) for k in ("explicit", "implicit"))

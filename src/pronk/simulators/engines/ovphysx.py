@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -100,12 +100,8 @@ class OvPhysx(EngineSimulator):
     def simulate(self, links: Links, drives: Drives, command: Array, start: Array) -> Array:
         """See `EngineSimulator.simulate`."""
         stage = self.ovstage.Stage("pronk")
-        self.ovstage.population.open_usd_from_string(
-            stage,
-            usd(links, self.law.iterations),
-            ordinal=1,
-            domains=self.ovstage.PopulationDomain.ALL,
-        )
+        text, every = usd(links, self.law.iterations), self.ovstage.PopulationDomain.ALL
+        self.ovstage.population.open_usd_from_string(stage, text, ordinal=1, domains=every)
         stage.advance_write_floor(ordinal=1).wait()
         self.physx.wait_task(self.physx.attach_ovstage(stage, read_ordinal=1))
         try:
@@ -211,6 +207,5 @@ def usd(links: Links, iterations: int) -> str:
     )
 
 
-def drive(robot: RobotSpec, iterations: int = 4) -> OvPhysx:
-    """Drives with the 4 position iterations of Isaac Lab's robots."""
-    return OvPhysx(robot, law=DriveLaw(kind="implicit", iterations=iterations))
+drive = partial(OvPhysx, law=DriveLaw(kind="implicit", iterations=4))
+"""Drives with the 4 position iterations of Isaac Lab's robots."""

@@ -36,52 +36,37 @@ class PyBullet(EngineSimulator):
                 f"{', '.join(links.joints)} need 0, or one of the other engines."
             )
         bullet = self.engine
-        client = bullet.connect(bullet.DIRECT)
+        client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
         try:
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "chain.urdf"
                 file.write_text(urdf(links, drives.armature), encoding="utf-8")
                 flags = bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_MAINTAIN_LINK_ORDER
-                chain = bullet.loadURDF(
-                    str(file), useFixedBase=True, flags=flags, physicsClientId=client
-                )
-            bullet.setGravity(*links.gravity, physicsClientId=client)
-            bullet.setTimeStep(self.robot.timestep_s, physicsClientId=client)
-            index = range(bullet.getNumJoints(chain, physicsClientId=client))
-            names = [
-                bullet.getJointInfo(chain, i, physicsClientId=client)[1].decode() for i in index
-            ]
+                chain = bullet.loadURDF(str(file), useFixedBase=True, flags=flags, **client)
+            bullet.setGravity(*links.gravity, **client)
+            bullet.setTimeStep(self.robot.timestep_s, **client)
+            index = range(bullet.getNumJoints(chain, **client))
+            names = [bullet.getJointInfo(chain, i, **client)[1].decode() for i in index]
             order = [links.joints.index(name) for name in names]
+            free = {"linearDamping": 0.0, "angularDamping": 0.0, "jointDamping": 0.0, **client}
             for i, row in enumerate(order):
-                bullet.resetJointState(chain, i, start[row], 0.0, physicsClientId=client)
-                bullet.changeDynamics(
-                    *(chain, i),
-                    **{"linearDamping": 0.0, "angularDamping": 0.0, "jointDamping": 0.0},
-                    maxJointVelocity=_MAX_SPEED,
-                    physicsClientId=client,
-                )
+                bullet.resetJointState(chain, i, start[row], 0.0, **client)
+                bullet.changeDynamics(chain, i, maxJointVelocity=_MAX_SPEED, **free)
+            control = bullet.setJointMotorControlArray
             # A velocity motor of speed 0 is dry friction: every joint has one with another force.
-            bullet.setJointMotorControlArray(
-                *(chain, index, bullet.VELOCITY_CONTROL),
-                forces=drives.frictionloss[order],
-                physicsClientId=client,
-            )
+            dry = drives.frictionloss[order]
+            control(chain, index, bullet.VELOCITY_CONTROL, forces=dry, **client)
             out, speed = np.empty(command.shape), np.zeros(len(order))
             for row, target in zip(out, command, strict=True):
-                states = bullet.getJointStates(chain, index, physicsClientId=client)
+                states = bullet.getJointStates(chain, index, **client)
                 row[order] = [state[0] for state in states]
                 speed[order] = [state[1] for state in states]
-                bullet.setJointMotorControlArray(
-                    *(chain, index, bullet.TORQUE_CONTROL),
-                    forces=(drives.torque(target, row, speed) - drives.viscous_damping * speed)[
-                        order
-                    ],
-                    physicsClientId=client,
-                )
-                bullet.stepSimulation(physicsClientId=client)
+                torque = drives.torque(target, row, speed) - drives.viscous_damping * speed
+                control(chain, index, bullet.TORQUE_CONTROL, forces=torque[order], **client)
+                bullet.stepSimulation(**client)
             return out
         finally:
-            bullet.disconnect(client)
+            bullet.disconnect(**client)
 
 
 def urdf(links: Links, armature: Array) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 
 from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links, along_x, principal, quaternion
 
@@ -92,10 +91,7 @@ class Sapien(EngineSimulator):
         return articulation, scene
 
 
-def drive(robot: RobotSpec, iterations: int = 10) -> Sapien:
-    """Drives with SAPIEN's default number of position iterations."""
-    return Sapien(robot, law=DriveLaw(kind="implicit", iterations=iterations))
-
-
-drive_of_isaaclab = partial(drive, iterations=4)
+drive = partial(Sapien, law=DriveLaw(kind="implicit", iterations=10))
+"""Drives with SAPIEN's default number of position iterations."""
+drive_of_isaaclab = partial(Sapien, law=DriveLaw(kind="implicit", iterations=4))
 """Drives with the 4 position iterations of Isaac Lab's robots."""
