@@ -24,9 +24,6 @@ def check_simulator(simulator: Simulator) -> None:
 
     Two runs of 0.2 s are simulated several times: shapes, rest at the first command, causality,
     independent runs, repeatability, locked joints, and an effect of every parameter that it sets.
-
-    Raises:
-        PronkError: A property fails; the message names it.
     """
     info, joints = simulator.info, tuple(simulator.joints)
     _require(info.timestep_s > 0.0 and info.decimation >= 1, "info: timestep and decimation > 0")
@@ -40,11 +37,8 @@ def check_simulator(simulator: Simulator) -> None:
     command = 0.1 * rng.standard_normal((2, 1, len(joints))) * np.ones((2, steps, 1))
     command[:, steps // 2 :] += 0.05
     usual = {"stiffness": 20.0, "damping": 0.5, "armature": 0.01, "frictionloss": 0.1, "delay": 0.0}
-    values = {
-        name: np.full((2, len(joints)), value)
-        for name, value in usual.items()
-        if name in simulator.parameters
-    }
+    shape = (2, len(joints))
+    values = {n: np.full(shape, v) for n, v in usual.items() if n in simulator.parameters}
     before = command.copy()
     out = simulator.rollout(command, values)
     _require(np.shape(out) == command.shape, "rollout: the shape of the command is returned")
@@ -66,15 +60,9 @@ def check_simulator(simulator: Simulator) -> None:
         held = simulator.rollout(command, values, locked=joints[1:])
         _require(bool(np.ptp(held[..., 0], axis=1).min() > 1e-3), "locked: the free joint moves")
         _require(bool(np.isfinite(held).all()), "locked: positions stay finite")
-    other = {
-        "stiffness": 10.0,
-        "damping": 1.0,
-        "armature": 0.05,
-        "frictionloss": 0.5,
-        "delay": 0.02,
-    }
+    other = {"stiffness": 10.0, "damping": 1.0, "armature": 0.05, "frictionloss": 0.5}
     for name in sorted(simulator.parameters):
-        changed = {**values, name: np.full((2, len(joints)), other[name])}
+        changed = {**values, name: np.full(shape, other.get(name, 0.02))}
         effect = np.abs(simulator.rollout(command, changed) - out).max()
         _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
 
@@ -87,9 +75,6 @@ def check_reader(
     The log has two samples or more, one command and one position a joint, finite and increasing
     timestamps in seconds, its source and hash; reading twice gives the same log; a missing
     and an empty file are refused with a LogError. `options` are passed to the reader.
-
-    Raises:
-        PronkError: A property fails; the message names it.
     """
     log = chosen.read(path, robot=robot, **options)
     _require(isinstance(log, JointLog), "read: a JointLog is returned")
@@ -122,16 +107,8 @@ def check_link(
 
     States decode to finite numbers of the robot's joints; cut, empty and foreign bytes are refused;
     commands encode to the same bytes every time, and impossible ones are refused; without an
-    interface the transport is local.
-
-    Args:
-        robot: At the other end.
-        codec: Of its messages.
-        states: Messages of a live robot, two or more.
-        transport: Opens the wire as an address without an interface does.
-
-    Raises:
-        PronkError: A property fails; the message names it.
+    interface the transport is local. `states` are two or more messages of a live robot; `transport`
+    opens the wire as an address without an interface does.
     """
     joints = len(robot.joints)
     _require(len(states) >= 2, "states: two or more are given")
@@ -149,10 +126,9 @@ def check_link(
         _refused(RefusedError, rule, partial(codec.decode, data))
     pose = np.array([joint.default_position for joint in robot.joints])
     command = Command(position=pose, stiffness=np.full(joints, 10.0), damping=np.ones(joints))
-    _require(codec.encode(command) == codec.encode(command), "encode: repeatable")
-    _require(
-        codec.encode(command) != codec.encode(damping_command(joints)), "encode: commands differ"
-    )
+    encoded, damped = codec.encode(command), codec.encode(damping_command(joints))
+    _require(codec.encode(command) == encoded, "encode: repeatable")
+    _require(encoded != damped, "encode: commands differ")
     for value in (np.nan, np.inf):
         wrong = Command(position=pose + value, stiffness=pose * 0, damping=pose * 0)
         rule = f"encode: a position of {value} is refused"

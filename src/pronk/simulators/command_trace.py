@@ -31,7 +31,6 @@ class CommandTrace:
     """One command to one joint, at every physics step of the training simulator."""
 
     joint: str
-    """The excited joint."""
     start: float
     """Instant of the first step, on the clock of the log [s]."""
     timestep: float
@@ -53,13 +52,8 @@ class CommandTrace:
     def excitation(self, robot: RobotSpec, steps: int | None = None) -> tuple[Array, Array]:
         """What the original joint is simulated with, mirrored from this one.
 
-        Args:
-            robot: The robot.
-            steps: Steps of the command, all of them if None; a shorter one stays where it ends.
-
-        Returns:
-            Pose of the original joint's chain [rad], shape (chain,), and the command about it at
-            each step [rad], shape (steps,).
+        Returns the pose of the original joint's chain [rad], shape (chain,), and the command about
+        it at each of `steps` [rad] (all if None); a shorter command stays where it ends.
         """
         excited = robot.joint(self.joint)
         first, sign = excited.original
@@ -75,27 +69,23 @@ class CommandTrace:
     def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
-        One may rest longer than the other at the end. With `sign` -1 the commands are compared
-        with opposite signs.
+        One may rest longer at the end. With `sign` -1 the commands have opposite signs.
         """
         if robot.joint(self.joint).original[0] != robot.joint(other.joint).original[0]:
             return False
         (pose, mine), (other_pose, theirs) = self.excitation(robot), other.excitation(robot)
         short, long = sorted((mine, sign * theirs), key=len)
-        return (
-            bool(np.abs(long[: len(short)] - short).max() < _SAME)
-            and bool(np.abs(long[len(short) :] - short[-1]).max(initial=0.0) < _SAME)
-            and np.allclose(pose, other_pose, atol=1e-3)
-        )
+        short = np.pad(short, (0, len(long) - len(short)), mode="edge")
+        same = bool(np.abs(long - short).max() < _SAME)
+        return same and np.allclose(pose, other_pose, atol=1e-3)
 
 
 def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:
     """Phase of the clock of period `tick` [s] on which a held command changes.
 
-    Returns:
-        An instant at which a tick begins [s], and the median distance of the changes from the
-        ticks as a share of `tick` (0.25 is what changes at random instants give). A command that
-        never changes begins at the first timestamp, at distance 0.
+    Returns an instant at which a tick begins [s], and the median distance of the changes from the
+    ticks as a share of `tick` (0.25 is what changes at random instants give). A command that never
+    changes begins at the first timestamp, at distance 0.
     """
     changes = time[1:][np.diff(command) != 0.0]
     if len(changes) == 0:
@@ -112,9 +102,8 @@ def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float
 def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec) -> CommandTrace:
     """Command to one joint in one segment of a log at every physics step of the robot.
 
-    Raises:
-        LogError: The joint was not excited in the segment, its unit is unknown, or a joint that is
-            clamped in the bench model stood elsewhere.
+    A LogError says that the joint was not excited in the segment, that its unit is unknown, or that
+    a joint that is clamped in the bench model stood elsewhere.
     """
     where = log.source or "log"
     if joint not in segment.joints:

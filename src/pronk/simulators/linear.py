@@ -57,8 +57,9 @@ class Plant:
         Gains [N m/rad, N m s/rad] are scalars or of shape (b,); without the amplitude of the
         command [rad] friction is left out.
         """
-        kp = np.atleast_1d(np.asarray(stiffness, dtype=np.float64))[:, None]
-        kd = np.atleast_1d(np.asarray(damping, dtype=np.float64))[:, None]
+        kp, kd = (
+            np.array(gain, dtype=np.float64, ndmin=1)[:, None] for gain in (stiffness, damping)
+        )
         # The sampled command is a staircase of physics steps; take that hold out.
         half = self.omega * self.timestep / 2.0
         hold = np.exp(-1j * half) * np.sinc(half / np.pi)
@@ -95,14 +96,11 @@ def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
     mujoco.mj_forward(model, data)
     # Hold the excited joint against gravity, so that the linearization is about rest.
     data.ctrl[rig.actuator] = data.qfrc_bias[rig.index]
-    nx, nu = 2 * model.nv + model.na, model.nu
-    a, b = np.zeros((nx, nx)), np.zeros((nx, nu))
+    nx = 2 * model.nv + model.na
+    a, b = np.zeros((nx, nx)), np.zeros((nx, model.nu))
     mujoco.mjd_transitionFD(model, data, _EPS, True, a, b, None, None)
-    z = np.exp(1j * omega * model.opt.timestep)
-    states = np.linalg.solve(
-        z[:, None, None] * np.eye(nx) - a,
-        np.broadcast_to(b[:, rig.actuator, None], (len(z), nx, 1)).astype(np.complex128),
-    )[..., 0]
+    z = np.exp(1j * omega * model.opt.timestep)[:, None, None]
+    states = np.linalg.solve(z * np.eye(nx) - a, b[:, rig.actuator, None])[..., 0]
     return Plant(
         omega=omega,
         position=states[:, rig.index],

@@ -96,16 +96,10 @@ class RemoteSimulator(Closing):
     """A `Simulator` that runs in another Python."""
 
     def __init__(self, choice: str, robot: RobotSpec, python: Path) -> None:
-        """Start the program `python` and make the simulator there.
+        """Start the program `python` and make the simulator there; PronkError if that fails.
 
-        Args:
-            choice: `FILE.py:NAME` or an entry point in `pronk.simulators`, of this installation or
-                of the other one.
-            robot: What the simulator is made for.
-            python: The interpreter.
-
-        Raises:
-            PronkError: It cannot be started, or the simulator cannot be made there.
+        The choice is `FILE.py:NAME` or an entry point in `pronk.simulators`, of this installation
+        or of the other one.
         """
         self._choice, self._python = choice, python
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
@@ -172,17 +166,15 @@ class RemoteSimulator(Closing):
 
 def _as_json(robot: RobotSpec) -> dict[str, Any]:
     """A robot and its chains as JSON has them."""
-
-    def plain(value: Any) -> Any:
-        return value.tolist() if isinstance(value, np.ndarray) else value
-
     chains = {}
     for name in robot.joint_names:
         # What has no links is refused where it is used.
         with suppress(RobotError):
-            chains[name] = {key: plain(one) for key, one in vars(links_of(robot, name)).items()}
+            links = vars(links_of(robot, name))
+            chains[name] = {field: np.asarray(one).tolist() for field, one in links.items()}
     fields = asdict(replace(robot, build_spec=_no_model))
-    return {"robot": {n: v for n, v in fields.items() if n != "build_spec"}, "links": chains}
+    del fields["build_spec"]
+    return {"robot": fields, "links": chains}
 
 
 def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot:
@@ -196,12 +188,9 @@ def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot
         return Links(**arrays | {n: tuple(fields[n]) for n in ("joints", "parent")})
 
     joints = [Joint(**tuples({**one, "drive": Drive(**one["drive"])})) for one in robot["joints"]]
-    changed = {"joints": joints, "law": DriveLaw(**robot["law"])}
-    return SentRobot(
-        **tuples({**robot, **changed}),
-        build_spec=_no_model,
-        links={name: links(fields) for name, fields in chains.items()},
-    )
+    made = {**robot, "joints": joints, "law": DriveLaw(**robot["law"])}
+    known = {name: links(fields) for name, fields in chains.items()}
+    return SentRobot(**tuples(made), build_spec=_no_model, links=known)
 
 
 def _no_model() -> Any:
@@ -230,7 +219,10 @@ def serve() -> None:
         header, arrays = messages.get()
         try:
             if simulator is None:
-                simulator = _made(header)
+                choice, entry = header["choice"], header["entry"]
+                point = EntryPoint(choice, entry, ENTRY_POINTS)
+                own = plugins.load(point) if entry else factory(choice)
+                simulator = own(_from_json(header["robot"], header["links"]))
                 answer = {
                     "info": asdict(simulator.info),
                     "joints": list(simulator.joints),
@@ -246,11 +238,3 @@ def serve() -> None:
         except Exception as error:  # Code of others may fail in any way.
             answer, arrays = {"error": f"{type(error).__name__}: {error}."}, {}
         send(answers, answer, arrays)
-
-
-def _made(header: Mapping[str, Any]) -> Simulator:
-    """The simulator that a first message names."""
-    choice, entry = header["choice"], header["entry"]
-    own = plugins.load(EntryPoint(choice, entry, ENTRY_POINTS)) if entry else factory(choice)
-    made: Simulator = own(_from_json(header["robot"], header["links"]))
-    return made

@@ -9,10 +9,8 @@ stiff knee with little damping, which this chirp makes chaotic, differs visibly:
 moves the double precision just as far.
 
 A step costs a GPU about the same for one simulation as for thousands. So the grid is stepped
-there, and runs of fewer than `LEAST` simulations (the refinement, which takes differences between
-neighbouring gains) stay on the processor, in double precision.
-
-Implicit drive laws are simulated on the processor too.
+there; runs of fewer than `LEAST` simulations (the refinement, which takes differences between
+neighbouring gains) and implicit drive laws stay on the processor, in double precision.
 
 Imported only when used: it needs the extra `pronk[train]`.
 """
@@ -22,6 +20,7 @@ from __future__ import annotations
 import copy
 import gc
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -86,10 +85,7 @@ class WarpTestRig(JointTestRig):
         least: int = LEAST,
         **options: Any,
     ) -> None:
-        """Compile the model and find the device, `cuda` or `warp-cpu`.
-
-        Fewer simulations than `least` run on the processor; `options` are those of `JointTestRig`.
-        """
+        """Compile the model; `device` is `cuda` or `warp-cpu`, `options` are `JointTestRig`'s."""
         self._device = find_device(device)
         super().__init__(robot, joint, **options)
         self._least = least
@@ -158,8 +154,7 @@ class _Worlds:
     def __init__(
         self, rig: JointTestRig, device: Any, count: int, steps: int, shared: bool
     ) -> None:
-        self._device = device
-        self._count, self._steps, self._shared = count, steps, shared
+        self._device, self._count, self._steps, self._shared = device, count, steps, shared
         model = copy.copy(rig.model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         # Rows of friction, limits and equalities; there are no contacts on the rig.
@@ -169,9 +164,8 @@ class _Worlds:
             self._data = mujoco_warp.put_data(
                 model, mujoco.MjData(model), nworld=count, nconmax=0, njmax=rows
             )
-            self._model.actuator_gainprm = wp.zeros(
-                (count, model.nu), dtype=self._model.actuator_gainprm.dtype
-            )
+            kind = self._model.actuator_gainprm.dtype
+            self._model.actuator_gainprm = wp.zeros((count, model.nu), dtype=kind)
             self._clock = wp.zeros(count, dtype=int)
             self._target = wp.zeros((steps, 1 if shared else count), dtype=float)
             self._position = wp.zeros((steps, count), dtype=float)
@@ -187,11 +181,8 @@ class _Worlds:
     def run(self, start: Array, gains: Array, control: Array, target: Array) -> NDArray[np.float32]:
         """Position of the excited joint at the start of each step, shape (steps, n).
 
-        Args:
-            start: Positions at rest, shape (n, nq).
-            gains: Parameters of the actuators, shape (n, nu, parameters).
-            control: Commands of the joints that are held, shape (1 or n, nu).
-            target: Commands of the excited joint, shape (steps, 1 or n).
+        Shapes: positions at rest (n, nq), parameters of the actuators (n, nu, parameters), commands
+        of the joints that are held (1 or n, nu) and of the excited one (steps, 1 or n).
         """
         steps, count = len(target), len(start)
         # Worlds to spare repeat the last simulation; commands to spare are never reached.
@@ -201,30 +192,24 @@ class _Worlds:
         held[:steps] = target
         with wp.ScopedDevice(self._device):
             self._data.qpos.assign(start[spare].astype(np.float32))
-            self._data.ctrl.assign(
-                np.broadcast_to(control[ways], (self._count, control.shape[1])).astype(np.float32)
-            )
+            own = np.broadcast_to(control[ways], (self._count, control.shape[1]))
+            self._data.ctrl.assign(own.astype(np.float32))
             self._data.qvel.zero_()
             self._data.qacc_warmstart.zero_()
             self._data.time.zero_()
             self._model.actuator_gainprm.assign(gains[spare].astype(np.float32))
             self._target.assign(held[:, ways].astype(np.float32))
             self._clock.zero_()
+            step = partial(wp.capture_launch, self._graph) if self._graph else self._step
             for _ in range(steps):
-                if self._graph is None:
-                    self._step()
-                else:
-                    wp.capture_launch(self._graph)
+                step()
             return np.asarray(self._position.numpy()[:steps, :count])
 
     def _step(self) -> None:
         """Read, command, step."""
-        wp.launch(
-            _READ_AND_COMMAND,
-            dim=self._count,
-            inputs=[*self._inputs, self._target, self._data.qpos, self._clock],
-            outputs=[self._data.ctrl, self._position],
-        )
+        inputs = [*self._inputs, self._target, self._data.qpos, self._clock]
+        outputs = [self._data.ctrl, self._position]
+        wp.launch(_READ_AND_COMMAND, dim=self._count, inputs=inputs, outputs=outputs)
         mujoco_warp.step(self._model, self._data)
 
     def _capture(self) -> Any:
