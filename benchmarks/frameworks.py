@@ -11,8 +11,10 @@ amplitude, those that moved together in time.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,10 +35,18 @@ from pronk.match.predict import drives_of
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots import load_robot
-from pronk.simulators.chain import ChainSimulation, branches, moves_together
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.chain import (
+    ChainSimulation,
+    StribeckChain,
+    branches,
+    moves_together,
+    published,
+)
 from pronk.simulators.load import joint_rigs, load_simulator
+from pronk.simulators.mujoco import Drives
 from pronk.simulators.profiles import profile
-from pronk.simulators.simulator import Closing
+from pronk.simulators.simulator import Closing, Simulator
 
 ENGINES = {
     "mjlab": "mujoco",
@@ -99,6 +109,28 @@ def alone(
     return rows
 
 
+class EngineChain(Closing):
+    """A chain in any simulator, from rest at the first command; for `ChainSimulation`."""
+
+    def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str, *, threads: int) -> None:
+        self.joints, self.robot, self.simulator = robot.joint(joint).chain, robot, simulator
+
+    def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
+        """See `pronk.simulators.mujoco.Chain.rollout`; delays are in the command."""
+        names = self.simulator.joints
+        columns = [names.index(name) for name in self.joints]
+        full = np.empty((len(sets), command.shape[1] + 1, len(names)))
+        full[:] = [self.robot.joint(name).default_position for name in names]
+        full[..., columns] = np.concatenate([command, command[:, -1:]], axis=1)
+        drives = [[published(self.robot, n) | dict(one.get(n, {})) for n in names] for one in sets]
+        values: dict[str, Array] = {
+            key: np.array([[joint[key] for joint in one] for one in drives])
+            for key in self.simulator.parameters - {"delay"}
+        }
+        locked = [name for name in names if name not in self.joints]
+        return np.asarray(self.simulator.rollout(full, values, locked=locked)[..., columns])
+
+
 def together(
     log: JointLog, gains: MatchedGains, engine: str, python: Path | None, robot: Any
 ) -> list[dict[str, float]]:
@@ -110,8 +142,10 @@ def together(
     band = (hertz >= BAND_HZ[0]) & (hertz <= BAND_HZ[1])
     for branch in branches([log], robot):
         traces = {}
-        for name, other in (("law", None), ("engine", simulator)):
-            with ChainSimulation(robot, [log], joints=branch, threads=1, simulator=other) as arm:
+        chains: dict[str, Callable[..., Any]] = {"law": StribeckChain}
+        chains["engine"] = partial(EngineChain, simulator)
+        for name, other in chains.items():
+            with ChainSimulation(robot, [log], joints=branch, threads=1, chain=other) as arm:
                 traces[name], measured, joints = arm.run([drives])[0][0], arm.measured(), arm.joints
         traces["recorded"] = measured[0]
         for i, joint in enumerate(joints):

@@ -16,7 +16,7 @@ from pronk.files import save_arrays
 from pronk.links.machine import Command
 from pronk.virtual.capture import SCHEMA, Capture, load, save
 from pronk.virtual.ground import Ground, Start
-from pronk.virtual.plant import Plant, legs_of, motor_of
+from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.robot import VirtualRobot
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains
 
@@ -108,7 +108,7 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
 
 def test_power_is_what_the_battery_gives(seen: Capture) -> None:
     # Before any command, current squared times resistance.
-    constant, resistance = np.array([motor_of(joint.drive) for joint in ROBOT.joints]).T
+    constant, resistance = np.array([joint.drive.motor for joint in ROBOT.joints]).T
     scale = np.array([SIM_PARAMS.joints[name].torque_scale for name in ROBOT.joint_names])
     current = seen.torque[0] / (scale * constant)
     heat = float(current**2 @ resistance)

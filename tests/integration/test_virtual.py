@@ -12,7 +12,6 @@ from scipy import signal
 from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
 from pronk.links.machine import Command, State
-from pronk.virtual.plant import motor_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet, with_joints
@@ -135,7 +134,7 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
     drive, scale = ROBOT.joint("FR_knee").drive, sim_params.joints["FR_knee"].torque_scale
     torque = scale * np.array([state.torque[2] for state in states])
     speed = np.array([state.velocity[2] for state in states])
-    believed, resistance = motor_of(drive)
+    believed, resistance = drive.motor
     constant = scale * believed
     line = -constant / resistance * (voltage + constant * speed)
     slack = 0.02 * np.abs(line).max()  # one physics step of acceleration

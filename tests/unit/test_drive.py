@@ -54,10 +54,10 @@ def test_limits_at_stall_corner_no_load_and_beyond() -> None:
     np.testing.assert_allclose(low, -17.0)
     # An effort limit above stall is never reached.
     assert drive.torque_limits(0.0, 3.0, 6.0, 4.0)[1] == 3.0
-    constant, resistance = drive.motor_constants(
-        stall_torque=62.428, no_load_speed=40.0, bus_voltage=24.0
-    )
+    hip = load_robot("mini_cheetah").joint("FR_hip_pitch").drive
+    constant, resistance = hip.motor
     line = constant * (24.0 - constant * speed[2:5]) / resistance
+    high = drive.torque_limits(speed, hip.stall_torque, hip.no_load_speed, hip.effort_limit)[1]
     np.testing.assert_allclose(high[2:5], line, atol=1e-12)
 
 

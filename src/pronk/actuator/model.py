@@ -13,18 +13,6 @@ from numpy.typing import ArrayLike
 from pronk.arrays import Array
 
 
-def motor_constants(
-    *, stall_torque: float, no_load_speed: float, bus_voltage: float
-) -> tuple[float, float]:
-    """Constants of the gearless one-phase motor with this torque-speed line, joint side.
-
-    `K = V / no_load_speed` [N m/A] = [V s/rad] and `R = K V / stall_torque` [ohm], so that
-    `torque = K (V - K speed) / R`.
-    """
-    constant = bus_voltage / no_load_speed
-    return constant, constant * bus_voltage / stall_torque
-
-
 def voltage_limits(
     speed: ArrayLike, stall_torque: ArrayLike, no_load_speed: ArrayLike
 ) -> tuple[Array, Array]:

@@ -28,7 +28,6 @@ import mujoco
 import numpy as np
 
 from pronk.actuator.law import EXPLICIT, DriveLaw
-from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
@@ -54,7 +53,7 @@ def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for joint in robot.joints:
         _set_passive(spec, joint)
-    _add_default_key(spec, robot, with_command=False)
+    _add_default_key(spec, robot)
     return spec
 
 
@@ -97,7 +96,7 @@ def bench_spec(
     for name in joint.chain:
         _set_passive(spec, robot.joint(name))
     add_drives(spec, robot, joint.chain, **drives)
-    _add_default_key(spec, robot, with_command=True)
+    _add_default_key(spec, robot)
     return spec
 
 
@@ -151,7 +150,7 @@ def add_drives(
     for name in joint_names:
         joint = robot.joint(name)
         drive = joint.drive
-        constant, resistance = _constants(drive)
+        constant, resistance = drive.motor
         kp, kd = stiffness.get(name, joint.stiffness), damping.get(name, joint.damping)
         kp, kd = _voltage_gains(drive, kp, robot.law.damping(kp, kd, step))
         friction = {}
@@ -203,7 +202,7 @@ def set_stribeck(
 ) -> None:
     """Change the dry friction of a joint whose drive was added with `stribeck`, as `lugre`."""
     index = _index(model, "actuator", model.nu, joint_name)
-    inertia = float(model.dof_M0[model.jnt_dofadr[_index(model, "joint", model.njnt, joint_name)]])
+    inertia = float(model.dof_M0[model.joint(joint_name).dofadr[0]])
     values = lugre(drive, inertia, frictionloss, stribeck, model.opt.timestep)
     model.actuator_dynprm[index, _BRISTLE] = values[:2]
     model.actuator_biasprm[index, _FRICTION] = values[2:]
@@ -231,14 +230,9 @@ def _index(model: mujoco.MjModel, kind: str, count: int, name: str) -> int:
     return int(index)
 
 
-def _constants(drive: Drive) -> tuple[float, float]:
-    names = ("stall_torque", "no_load_speed", "bus_voltage")
-    return motor_constants(**{name: getattr(drive, name) for name in names})
-
-
 def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
     """Controller gains in volts that make the torque law `stiffness`, `damping`."""
-    constant, resistance = _constants(drive)
+    constant, resistance = drive.motor
     return resistance * stiffness / constant, resistance * damping / constant - constant
 
 
@@ -268,27 +262,25 @@ def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:
     """Fix a hinge at an angle: turn its body about the hinge, then delete the hinge."""
     joint = spec.joint(joint_name)
     body = joint.parent
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     turn, turned = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, axis, angle)
-    mujoco.mju_mulQuat(turned, np.array(body.quat), turn)
-    anchor, before, after = np.array(joint.pos), np.zeros(3), np.zeros(3)
-    mujoco.mju_rotVecQuat(before, anchor, np.array(body.quat))
-    mujoco.mju_rotVecQuat(after, anchor, turned)
-    body.pos = np.array(body.pos) + before - after
+    mujoco.mju_axisAngle2Quat(turn, joint.axis / np.linalg.norm(joint.axis), angle)
+    mujoco.mju_mulQuat(turned, body.quat, turn)
+    before, after = np.zeros(3), np.zeros(3)
+    mujoco.mju_rotVecQuat(before, joint.pos, body.quat)
+    mujoco.mju_rotVecQuat(after, joint.pos, turned)
+    body.pos = body.pos + before - after
     body.quat = turned
     spec.delete(joint)
 
 
-def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec, *, with_command: bool) -> None:
-    """Keyframe `default`: the default pose, the base where the model puts it."""
+def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    """Keyframe `default`: the default pose and its commands, the base where the model puts it."""
     model = spec.compile()
     qpos = model.qpos0.copy()
     for joint in robot.joints:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint.name)
         if index >= 0:
             qpos[model.jnt_qposadr[index]] = joint.default_position
-    key = spec.add_key(name="default", qpos=qpos)
-    if with_command:
-        names = [model.actuator(i).name for i in range(model.nu)]
-        key.ctrl = [robot.joint(name).default_position for name in names]
+    names = [model.actuator(i).name for i in range(model.nu)]
+    ctrl = [robot.joint(name).default_position for name in names]
+    spec.add_key(name="default", qpos=qpos, ctrl=ctrl)

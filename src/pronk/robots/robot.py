@@ -57,6 +57,16 @@ class Drive:
         """Rotor inertia reflected through the gear, `rotor_inertia * gear_ratio**2` [kg m^2]."""
         return self.rotor_inertia * self.gear_ratio**2
 
+    @property
+    def motor(self) -> tuple[float, float]:
+        """Constants of the gearless one-phase motor with this torque-speed line, joint side.
+
+        `K = V / no_load_speed` [N m/A] = [V s/rad] and `R = K V / stall_torque` [ohm], so that
+        `torque = K (V - K speed) / R`.
+        """
+        constant = self.bus_voltage / self.no_load_speed
+        return constant, constant * self.bus_voltage / self.stall_torque
+
 
 @dataclass(frozen=True, kw_only=True)
 class Joint:

@@ -7,7 +7,8 @@ default position.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +21,7 @@ from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_stribeck
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import Chain, Drives
-from pronk.simulators.simulator import Closing, Simulator
+from pronk.simulators.simulator import Closing
 
 
 def published(robot: RobotSpec, joint: str) -> dict[str, float]:
@@ -81,7 +82,7 @@ def moves_together(log: JointLog) -> bool:
     return int(moving.sum()) > 1
 
 
-class _StribeckChain(Chain):
+class StribeckChain(Chain):
     """A chain in which friction of drives with a Stribeck speed falls with speed."""
 
     def __init__(self, robot: RobotSpec, joint: str, *, threads: int) -> None:
@@ -99,28 +100,6 @@ class _StribeckChain(Chain):
         set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
 
 
-class _Elsewhere(Closing):
-    """A chain in any simulator, from rest."""
-
-    def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str) -> None:
-        self.joints, self.robot, self.simulator = robot.joint(joint).chain, robot, simulator
-
-    def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
-        """See `Chain.rollout`; delays are in the command."""
-        names = self.simulator.joints
-        columns = [names.index(name) for name in self.joints]
-        full = np.empty((len(sets), command.shape[1] + 1, len(names)))
-        full[:] = [self.robot.joint(name).default_position for name in names]
-        full[..., columns] = np.concatenate([command, command[:, -1:]], axis=1)
-        drives = [[published(self.robot, n) | dict(one.get(n, {})) for n in names] for one in sets]
-        values: dict[str, Array] = {
-            key: np.array([[joint[key] for joint in one] for one in drives])
-            for key in self.simulator.parameters - {"delay"}
-        }
-        locked = [name for name in names if name not in self.joints]
-        return np.asarray(self.simulator.rollout(full, values, locked=locked)[..., columns])
-
-
 class ChainSimulation(Closing):
     """The chain with the commands of one or more logs, for many sets of drives."""
 
@@ -131,13 +110,13 @@ class ChainSimulation(Closing):
         *,
         joints: Sequence[str] | None = None,
         threads: int = 2,
-        simulator: Simulator | None = None,
+        chain: Callable[..., Any] = StribeckChain,
     ) -> None:
         """Compile the model of the chain that holds all joints that move, or the given ones.
 
-        `joints` are one of `branches`; logs in which none of them moves are left out. Another
-        `simulator` than MuJoCo starts from rest at the first command. LogError if nothing moves in
-        radians, or joints of different chains move together.
+        `joints` are one of `branches`; logs in which none of them moves are left out; `chain` makes
+        what simulates them. LogError if nothing moves in radians, or joints of different chains
+        move together.
         """
         self.robot, self.logs, self.excluded = robot, list[JointLog](), dict[str, str]()
         self.excited: list[tuple[str, ...]] = []
@@ -156,11 +135,7 @@ class ChainSimulation(Closing):
                 f"{self.logs[0].source or 'log'}: {', '.join(self.joints)} move together but no "
                 f"chain of {robot.name} holds them all; excite the joints of one chain at a time."
             )
-        self._chain: _StribeckChain | _Elsewhere
-        if simulator:
-            self._chain = _Elsewhere(simulator, robot, root.name)
-        else:
-            self._chain = _StribeckChain(robot, root.name, threads=threads)
+        self._chain = chain(robot, root.name, threads=threads)
 
     def close(self) -> None:
         """Stop the threads."""

@@ -35,7 +35,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.actuator.model import motor_constants
 from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, RobotSpec
@@ -132,7 +131,7 @@ class Plant:
         self.stand = _ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES])
         scale = np.array([params.torque_scale for params in true])
         # Motor constants K0 that the drives assume and K [V s/rad], resistance [ohm].
-        self._believed, self.resistance = np.array([motor_of(drive) for drive in drives]).T.copy()
+        self._believed, self.resistance = np.array([drive.motor for drive in drives]).T.copy()
         self.constant = scale * self._believed
         self._effort_limit = scale * np.array([drive.effort_limit for drive in drives])  # [N m]
         self._least_torque = -self._effort_limit
@@ -224,15 +223,6 @@ def leg_of(robot: RobotSpec, name: str) -> str:
     return first.pop() if len(first) == 1 else limb[0]
 
 
-def motor_of(drive: Drive) -> tuple[float, float]:
-    """Constant [V s/rad] and resistance [ohm] of a motor, joint side, as its drive assumes."""
-    return motor_constants(
-        stall_torque=drive.stall_torque,
-        no_load_speed=drive.no_load_speed,
-        bus_voltage=drive.bus_voltage,
-    )
-
-
 def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
     """Give a joint its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
     link = spec.joint(name)
@@ -269,7 +259,7 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: flo
     )
     belt.wrap_joint(f"{name}/rotor", 1.0)
     belt.wrap_joint(name, -1.0)
-    believed, resistance = motor_of(drive)
+    believed, resistance = drive.motor
     # MuJoCo integrates the current exactly over a step h with time constant t, and applies it in
     # that very step: late by h / (exp(h / t) - 1) at low frequency. Solved for t.
     lag = spec.option.timestep / math.log1p(spec.option.timestep / lag_s)
