@@ -7,7 +7,7 @@ path, those of every other simulator call its `rollout`.
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -224,20 +224,18 @@ def factory(choice: str) -> Any:
             )
         return plugins.load(known[choice])
     path = Path(file)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if not path.is_file() or spec is None or spec.loader is None:
+    if not path.is_file():
         raise PronkError(f"simulator {choice}: there is no file {path}.")
-    module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
+        members = runpy.run_path(file, run_name=path.stem)
     except Exception as error:
         raise PronkError(
             f"simulator {choice}: {path} cannot be loaded ({type(error).__name__}: {error})."
         ) from error
-    found = getattr(module, name, None)
+    found = members.get(name)
     if not callable(found):
-        own = [v for v in vars(module).values() if getattr(v, "__module__", "") == path.stem]
-        offers = [v.__name__ for v in own if isinstance(v, type)]
+        types = [one for one in members.values() if isinstance(one, type)]
+        offers = [one.__name__ for one in types if one.__module__ == path.stem]
         raise PronkError(
             f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
             f"{', '.join(offers) or 'none'}."

@@ -131,8 +131,7 @@ def along_x(axis: Array) -> Array:
 def links_of(robot: RobotSpec, joint: str) -> Links:
     """Read the bench model of a joint, as MuJoCo compiles it; see `bench_spec`.
 
-    Raises:
-        RobotError: A joint of the chain is no hinge, or a body has more than one.
+    A RobotError says that a joint of the chain is no hinge, or that a body has more than one.
     """
     unlike = RobotError(f"the chain of {joint} has joints that are no hinges, or two on a body.")
     if isinstance(robot, SentRobot):
@@ -156,25 +155,22 @@ def links_of(robot: RobotSpec, joint: str) -> Links:
         own = int(model.body_jntadr[b])
         link[b] = own if own >= 0 else link[model.body_parentid[b]]
     hinge = np.array(data.xanchor)
-    parent = [link[model.body_parentid[model.jnt_bodyid[i]]] for i in range(count)]
-    mass, moment = np.zeros(count), np.zeros((count, 3))
-    for b in bodies:
-        if (i := link[b]) >= 0:
-            mass[i] += model.body_mass[b]
-            moment[i] += model.body_mass[b] * (data.xipos[b] - hinge[i])
-    centre, inertia = moment / mass[:, None], np.zeros((count, 3, 3))
-    for b in bodies:
-        if (i := link[b]) >= 0:
-            axes = data.ximat[b].reshape(3, 3)
-            arm = data.xipos[b] - hinge[i] - centre[i]
-            inertia[i] += axes @ np.diag(model.body_inertia[b]) @ axes.T
-            inertia[i] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    parent = [link[up] for up in model.body_parentid[model.jnt_bodyid]]
+    moving = [(b, link[b]) for b in bodies if link[b] >= 0]
+    mass, moment, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for b, i in moving:
+        mass[i] += model.body_mass[b]
+        moment[i] += model.body_mass[b] * (data.xipos[b] - hinge[i])
+    centre = moment / mass[:, None]
+    for b, i in moving:
+        axes = data.ximat[b].reshape(3, 3)
+        arm = data.xipos[b] - hinge[i] - centre[i]
+        inertia[i] += axes @ np.diag(model.body_inertia[b]) @ axes.T
+        inertia[i] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return Links(
         joints=tuple(model.joint(i).name for i in range(count)),
         parent=tuple(parent),
-        offset=np.array(
-            [hinge[i] - (hinge[up] if up >= 0 else 0.0) for i, up in enumerate(parent)]
-        ),
+        offset=hinge - np.array([hinge[up] if up >= 0 else np.zeros(3) for up in parent]),
         axis=np.array(data.xaxis),
         mass=mass,
         centre=centre,
