@@ -17,11 +17,7 @@ from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
 
 CHEETAH = legged("mini_cheetah")
-
-
-@pytest.fixture(scope="module")
-def model() -> mujoco.MjModel:
-    return free_spec(load_robot("mini_cheetah")).compile()
+MODELS = {name: free_spec(load_robot(name)).compile() for name in ROBOT_NAMES}
 
 
 def posed(model: mujoco.MjModel) -> mujoco.MjData:
@@ -49,41 +45,34 @@ def test_dimensions_of_legs_come_from_the_model() -> None:
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
-    robot = load_robot(name)
-    model = free_spec(robot).compile()
+    robot, model = load_robot(name), MODELS[name]
     for joint in robot.joints:
-        hinge = model.joint(joint.name)
+        hinge, drive = model.joint(joint.name), joint.drive
         np.testing.assert_allclose(hinge.range, joint.range)
         assert model.jnt_limited[hinge.id]
-        low, high = joint.range
-        assert low < joint.default_position < high
-        assert model.dof_armature[hinge.dofadr[0]] == joint.drive.armature
-        assert model.dof_frictionloss[hinge.dofadr[0]] == joint.drive.frictionloss
-        assert model.dof_damping[hinge.dofadr[0]] == joint.drive.viscous_damping
+        assert joint.range[0] < joint.default_position < joint.range[1]
+        passive = (drive.armature, drive.frictionloss, drive.viscous_damping)
+        assert (hinge.armature, hinge.frictionloss, hinge.damping) == passive
     assert model.opt.timestep == robot.timestep_s
-    assert robot.timestep_s * robot.decimation * robot.policy_rate_hz == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
-    ("name", "armature", "effort", "stall", "free"),
+    ("name", "joint", "figures"),
     [
         # S6 and A12 of the paper; stall torque and no-load speed of the open software.
-        ("mini_cheetah", (0.0026, 0.0063), (17.0, 26.4), (62.4, 97.1), (40.0, 25.7)),
-        ("go2", (0.01, 0.0225), (23.7, 35.55), (23.7, 35.55), (30.1, 20.07)),
+        ("mini_cheetah", "FR_hip_pitch", (0.0026, 17.0, 62.4, 40.0)),
+        ("mini_cheetah", "FR_knee", (0.0063, 26.4, 97.1, 25.7)),
+        ("go2", "FR_hip_pitch", (0.01, 23.7, 23.7, 30.1)),
+        ("go2", "FR_knee", (0.0225, 35.55, 35.55, 20.07)),
     ],
 )
 def test_drives_have_the_published_figures(
-    name: str,
-    armature: tuple[float, ...],
-    effort: tuple[float, ...],
-    stall: tuple[float, ...],
-    free: tuple[float, ...],
+    name: str, joint: str, figures: tuple[float, ...]
 ) -> None:
-    drives = [load_robot(name).joint(joint).drive for joint in ("FR_hip_pitch", "FR_knee")]
-    assert [drive.armature for drive in drives] == pytest.approx(armature, abs=5e-5)
-    assert [drive.effort_limit for drive in drives] == pytest.approx(effort, abs=0.05)
-    assert [drive.stall_torque for drive in drives] == pytest.approx(stall, abs=0.05)
-    assert [drive.no_load_speed for drive in drives] == pytest.approx(free, abs=0.05)
+    drive = load_robot(name).joint(joint).drive
+    assert drive.armature == pytest.approx(figures[0], abs=5e-5)
+    others = (drive.effort_limit, drive.stall_torque, drive.no_load_speed)
+    assert others == pytest.approx(figures[1:], abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -96,39 +85,34 @@ def test_drives_have_the_published_figures(
     ],
 )
 def test_mass_and_order_of_legs(name: str, total: float, legs: tuple[str, ...]) -> None:
-    robot = load_robot(name)
-    assert free_spec(robot).compile().body_mass.sum() == pytest.approx(total, abs=1e-6)
+    assert MODELS[name].body_mass.sum() == pytest.approx(total, abs=1e-6)
     if legs:
-        assert robot.joint_names[::3] == tuple(f"{leg}_hip_roll" for leg in legs)
-        assert robot.joint_names[:3] == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+        joints = ("hip_roll", "hip_pitch", "knee")
+        assert load_robot(name).joint_names == tuple(f"{leg}_{j}" for leg in legs for j in joints)
 
 
-def test_feet_of_go2_are_under_the_hips_and_on_the_floor() -> None:
-    model = free_spec(load_robot("go2")).compile()
-    data = posed(model)
-    for leg in ("FR", "FL", "RR", "RL"):
-        foot, hip = data.site(f"{leg}_foot").xpos, data.body(f"{leg}_thigh").xpos
-        assert foot[0] == pytest.approx(hip[0], abs=0.003)
-        assert foot[1:] == pytest.approx((hip[1], 0.022), abs=1e-9)
+@pytest.mark.parametrize(
+    ("name", "hip", "ahead", "side"),
+    [("mini_cheetah", "hip", 0.015, 0.049 + 0.062 + 0.004), ("go2", "thigh", 0.003, 0.142)],
+)
+def test_feet_are_under_the_hips_and_on_the_floor(
+    name: str, hip: str, ahead: float, side: float
+) -> None:
+    data, body = posed(MODELS[name]), legged(name)
+    for leg in body.legs:
+        x = data.body(f"{leg}_{hip}").xpos[0]
+        outwards = side if leg.endswith("L") else -side
+        foot = data.site(f"{leg}_foot").xpos
+        assert foot[0] == pytest.approx(x, abs=ahead)
+        assert foot[1:] == pytest.approx((outwards, body.foot_radius), abs=1e-9)
+        if name == "mini_cheetah":
+            assert data.body(f"{leg}_shank").xpos[0] < x - 0.1, "knees bend backward"
+    if name == "mini_cheetah":
+        assert data.body("trunk").xpos[2] == pytest.approx(0.30, abs=0.005)  # S1
 
 
-def test_it_stands_thirty_centimetres_tall_on_feet_below_its_hips(model: mujoco.MjModel) -> None:
-    data = posed(model)
-    assert data.body("trunk").xpos[2] == pytest.approx(0.30, abs=0.005)  # S1
-    for leg in CHEETAH.legs:
-        hip, knee, foot = (
-            data.body(f"{leg}_hip").xpos,
-            data.body(f"{leg}_shank").xpos,
-            data.site(f"{leg}_foot").xpos,
-        )
-        assert abs(foot[0] - hip[0]) < 0.015
-        assert knee[0] < hip[0] - 0.1, "knees bend backward"
-        assert foot[2] == pytest.approx(CHEETAH.foot_radius, abs=1e-12), "feet touch the floor"
-        side = 1.0 if leg.endswith("L") else -1.0
-        assert side * foot[1] == pytest.approx(0.049 + 0.062 + 0.004)
-
-
-def test_the_whole_robot_is_symmetric_about_its_middle_plane(model: mujoco.MjModel) -> None:
+def test_the_whole_robot_is_symmetric_about_its_middle_plane() -> None:
+    model = MODELS["mini_cheetah"]
     data = posed(model)
     assert data.subtree_com[0][1] == pytest.approx(0.0, abs=1e-15)
     full = np.zeros((model.nv, model.nv))
@@ -147,30 +131,24 @@ def test_only_feet_legs_and_trunk_touch_a_floor_and_never_each_other() -> None:
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1), pos=(0, 0, 0.5)
     )
     model = spec.compile()
-    data = posed(model)
-    touching = {model.geom(g).name for pair in data.contact.geom for g in pair}
-    expected = {"floor", "trunk_collision"}
-    expected |= {f"{leg}_{part}_collision" for leg in CHEETAH.legs for part in ("thigh", "shank")}
-    expected |= {f"{leg}_foot_collision" for leg in CHEETAH.legs}
-    assert touching == expected
-    assert all("floor" in {model.geom(g).name for g in pair} for pair in data.contact.geom)
-    foot = [c for c in data.contact if "FR_foot_collision" in {model.geom(g).name for g in c.geom}]
-    assert {c.dim for c in foot} == {3}
+    pairs = [({model.geom(g).name for g in c.geom}, c.dim) for c in posed(model).contact]
+    parts = [f"{leg}_{part}" for leg in CHEETAH.legs for part in ("thigh", "shank", "foot")]
+    expected = {"floor", *(f"{part}_collision" for part in ("trunk", *parts))}
+    assert set().union(*(pair for pair, _ in pairs)) == expected
+    assert all("floor" in pair for pair, _ in pairs)
+    assert {dim for pair, dim in pairs if "FR_foot_collision" in pair} == {3}
 
 
 def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
     """The evidence for the signs of SAGE recordings: sag over gravity torque is one stiffness."""
-    robot = load_robot("so101")
-    model = free_spec(robot).compile()
-    data = posed(model)
-    gravity = -data.qfrc_bias
+    model = MODELS["so101"]
+    bias = posed(model).qfrc_bias
+    gravity = {n: -bias[model.joint(n).dofadr[0]] for n in load_robot("so101").joint_names}
     sag = {"Pitch": 0.038, "Elbow": 0.037, "Wrist_Pitch": 0.010}  # means of the four recordings
-    stiffness = [
-        gravity[model.joint(SAGE_JOINTS[name]).dofadr[0]] / offset for name, offset in sag.items()
-    ]
-    assert all(9.0 < k < 14.0 for k in stiffness)
-    assert abs(gravity[model.joint("shoulder_pan").dofadr[0]]) < 1e-3
-    assert abs(gravity[model.joint("wrist_roll").dofadr[0]]) < 1e-3
+    for name, offset in sag.items():
+        assert 9.0 < gravity[SAGE_JOINTS[name]] / offset < 14.0
+    assert abs(gravity["shoulder_pan"]) < 1e-3
+    assert abs(gravity["wrist_roll"]) < 1e-3
 
 
 @pytest.mark.parametrize(
