@@ -22,29 +22,21 @@ PENDULUM = """
 </mujoco>
 """
 
-ARM = """
-<robot name="arm">
-  <link name="base"/>
-  <link name="upper">
-    <inertial><origin xyz="0 0 -0.15"/><mass value="1.0"/>
+LINK = """
+  <link name="{child}">
+    <inertial><origin xyz="0 0 -0.1"/><mass value="{mass}"/>
       <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
   </link>
-  <link name="lower">
-    <inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
-      <inertia ixx="0.004" iyy="0.004" izz="0.0005" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
-  <joint name="shoulder" type="revolute">
-    <parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
-    <limit lower="-2" upper="2" effort="40" velocity="10"/>
-    <dynamics damping="0.05" friction="0.2"/>
+  <joint name="{name}" type="revolute">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 -0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="{effort}" velocity="10"/>
+    <dynamics damping="0.05" friction="0.1"/>
   </joint>
-  <joint name="elbow" type="revolute">
-    <parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.3"/><axis xyz="0 1 0"/>
-    <limit lower="-2" upper="2" effort="20" velocity="10"/>
-    <dynamics damping="0.02" friction="0.1"/>
-  </joint>
-</robot>
 """
+SHOULDER = {"name": "shoulder", "parent": "base", "child": "upper", "mass": 1.0, "effort": 40}
+ELBOW = {"name": "elbow", "parent": "upper", "child": "lower", "mass": 0.5, "effort": 20}
+LINKS = LINK.format(**SHOULDER) + LINK.format(**ELBOW)
+ARM = f'<robot name="arm"><link name="base"/>{LINKS}</robot>'
 
 
 def model_of(kind: str, folder: Path) -> Path:
@@ -91,7 +83,7 @@ def test_new_robot_does_not_replace_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", pronk.robots.ROBOT_NAMES)
 def test_shipped_robots_pass_the_check(name: str) -> None:
-    accepted("robot", "check", name)
+    assert "nothing is inconsistent" in accepted("robot", "check", name)
 
 
 def test_installed_robot_is_found_by_its_entry_point(

@@ -34,26 +34,20 @@ from pronk.simulators.simulator import Closing
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
 BAND = (1.0, 15.0)
-CASES: list[tuple[type[EngineSimulator], DriveLaw]] = [
-    (Sapien, DriveLaw()),
-    *((Sapien, DriveLaw(kind="implicit", iterations=n)) for n in (1, 4, 10)),
-    (OvPhysx, DriveLaw()),
-    *((OvPhysx, DriveLaw(kind="implicit", iterations=n)) for n in (1, 4)),
-    (Drake, DriveLaw()),
-    (Drake, DriveLaw(kind="implicit")),
-    (PyBullet, DriveLaw(passive_damping="explicit")),
-    (Mujoco, DriveLaw()),
-    (Mujoco, DriveLaw(passive_damping="explicit")),
-    (Mujoco, DriveLaw(kind="implicit_damping")),
-    (Mjx, DriveLaw()),
-    (Mjx, DriveLaw(passive_damping="explicit")),
-    (Mjx, DriveLaw(kind="implicit_damping")),
-    (Genesis, DriveLaw()),
-    (Genesis, DriveLaw(kind="implicit_damping")),
-    (Newton, DriveLaw(passive_damping="explicit")),
-    (Newton, DriveLaw(kind="implicit_damping")),
-    (Newton, DriveLaw(kind="implicit")),
-]
+E, EXPLICIT_PASSIVE = DriveLaw(), DriveLaw(passive_damping="explicit")
+IF = DriveLaw(kind="implicit_damping")
+I1, I4, I10 = (DriveLaw(kind="implicit", iterations=n) for n in (1, 4, 10))
+LAWS: dict[type[EngineSimulator], tuple[DriveLaw, ...]] = {
+    Sapien: (E, I1, I4, I10),
+    OvPhysx: (E, I1, I4),
+    Drake: (E, I1),
+    PyBullet: (EXPLICIT_PASSIVE,),
+    Mujoco: (E, EXPLICIT_PASSIVE, IF),
+    Mjx: (E, EXPLICIT_PASSIVE, IF),
+    Genesis: (E, IF),
+    Newton: (EXPLICIT_PASSIVE, IF, I1),
+}
+CASES = [(engine, law) for engine, laws in LAWS.items() for law in laws]
 engines = pytest.mark.parametrize(
     ("engine", "law"),
     CASES,
@@ -62,14 +56,11 @@ engines = pytest.mark.parametrize(
 
 
 def prepared(name: str | Path, law: DriveLaw, **drive: float) -> RobotSpec:
-    """A robot with a law, without dry friction; `drive` replaces values of its drives."""
+    """A robot with a law, without dry friction and limits; `drive` replaces values of drives."""
     robot = load_robot(name)
-    new = {"frictionloss": 0.0, **drive}
-    joints = tuple(replace(one, drive=replace(one.drive, **new)) for one in robot.joints)
-    return replace(robot, law=law, joints=joints)
-
-
-LINEAR = {"effort_limit": 1e4, "stall_torque": 1e4, "no_load_speed": 1e4}
+    linear = {"frictionloss": 0.0, "effort_limit": 1e4, "stall_torque": 1e4, "no_load_speed": 1e4}
+    joints = [replace(one, drive=replace(one.drive, **linear | drive)) for one in robot.joints]
+    return replace(robot, law=law, joints=tuple(joints))
 
 
 def chirp(step: float, *, amplitude: float = 0.25, seconds: float = 20.0) -> Array:
@@ -106,28 +97,25 @@ def both(
 
 def level(command: Array, position: Array, step: float) -> Array:
     """Magnitude of the response to a chirp in half-hertz bins of BAND [dB]."""
-    spectra = [np.fft.rfft(one - one[0], 1 << 15) for one in (command, position)]
+    u, y = (np.fft.rfft(one - one[0], 1 << 15) for one in (command, position))
     hertz = np.fft.rfftfreq(1 << 15, step)
-    out = []
-    for centre in np.arange(*BAND, 0.5):
-        part = np.abs(hertz - centre) <= 0.25
-        u, y = (spectrum[part] for spectrum in spectra)
-        out.append(20.0 * np.log10(abs(np.vdot(u, y)) / np.vdot(u, u).real))
-    return np.array(out)
+    bins = [np.abs(hertz - centre) <= 0.25 for centre in np.arange(*BAND, 0.5)]
+    ratios = [abs(np.vdot(u[one], y[one])) / np.vdot(u[one], u[one]).real for one in bins]
+    return np.asarray(20.0 * np.log10(ratios))
 
 
 @engines
 def test_one_joint_follows_the_law(engine: type[EngineSimulator], law: DriveLaw) -> None:
-    robot = prepared(PENDULUM, law, **LINEAR)
-    command, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s))
-    u, law_db = command[:, 0], level(command[:, 0], expected[:, 0], robot.timestep_s)
+    robot = prepared(PENDULUM, law)
+    step = robot.timestep_s
+    command, expected, got, _ = both(engine, robot, "swing", chirp(step))
+    law_db = level(command[:, 0], expected[:, 0], step)
     assert np.ptp(law_db) > 5.0
-    assert np.abs(level(u, got[:, 0], robot.timestep_s) - law_db).max() < 0.02
-    for hertz in (3.0, 8.0):
-        time = robot.timestep_s * np.arange(800)
-        sine = 0.25 * np.sin(2.0 * np.pi * hertz * time)
-        _, expected, got, _ = both(engine, robot, "swing", sine)
-        spin = np.exp(-2j * np.pi * hertz * time[400:])
+    assert np.abs(level(command[:, 0], got[:, 0], step) - law_db).max() < 0.02
+    for omega in (2.0 * np.pi * 3.0, 2.0 * np.pi * 8.0):
+        time = step * np.arange(800)
+        _, expected, got, _ = both(engine, robot, "swing", 0.25 * np.sin(omega * time))
+        spin = np.exp(-1j * omega * time[400:])
         ratio = (got[400:, 0] @ spin) / (expected[400:, 0] @ spin)
         assert abs(20.0 * np.log10(abs(ratio))) < 0.02
         assert abs(np.angle(ratio)) < 1e-3
@@ -136,21 +124,18 @@ def test_one_joint_follows_the_law(engine: type[EngineSimulator], law: DriveLaw)
 @engines
 @pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
 def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: DriveLaw) -> None:
-    robot = prepared(name, law, **LINEAR)
+    robot = prepared(name, law)
     if engine is PyBullet:  # No armature in chains: stable at 1 ms.
-        robot = replace(
-            prepared(name, law, **LINEAR, rotor_inertia=0.0),
-            **{"timestep_s": 0.001, "decimation": 20},
-        )
+        robot = prepared(name, law, rotor_inertia=0.0)
+        robot = replace(robot, timestep_s=0.001, decimation=20)
     elif engine is Newton and law.kind == "implicit":  # Steel's passive damping is explicit.
-        robot = prepared(name, law, **LINEAR, viscous_damping=0.0)
+        robot = prepared(name, law, viscous_damping=0.0)
     step = robot.timestep_s
     command, expected, got, joints = both(engine, robot, "FR_hip_pitch", chirp(step))
     assert len(joints) == 3
     # PhysX solves joint by joint, the others all joints of a chain at once, as the law does.
-    exact = law.kind != "implicit" or engine not in (Sapien, OvPhysx)
+    exact, u = law.kind != "implicit" or engine not in (Sapien, OvPhysx), command[:, 1]
     for k, joint in enumerate(joints):
-        u = command[:, joints.index("FR_hip_pitch")]
         ours, law_db = level(u, got[:, k], step), level(u, expected[:, k], step)
         if exact or joint == "FR_hip_pitch":
             assert np.abs(ours - law_db).max() < (0.01 if exact else 0.1), joint
@@ -161,12 +146,11 @@ def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: D
 @pytest.mark.parametrize("engine", [Sapien, OvPhysx, Drake, PyBullet])
 def test_explicit_drives_have_the_motors_limits(engine: type[EngineSimulator]) -> None:
     limits = {"effort_limit": 1.0, "stall_torque": 1.4, "no_load_speed": 12.0}
-    law = DriveLaw(passive_damping="explicit" if engine is PyBullet else "implicit")
+    law, wave = LAWS[engine][0], chirp(0.005, seconds=4.0)
     # The motor's limits are those of its torque alone, without passive damping.
-    robot = prepared(PENDULUM, law, **limits, viscous_damping=0.1)
-    _, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
-    robot = prepared(PENDULUM, law, **LINEAR, viscous_damping=0.1)
-    _, free, _, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
+    limited = prepared(PENDULUM, law, **limits, viscous_damping=0.1)
+    _, expected, got, _ = both(engine, limited, "swing", wave)
+    _, free, *_ = both(engine, prepared(PENDULUM, law, viscous_damping=0.1), "swing", wave)
     assert np.abs(expected - free).max() > 0.02
     assert np.abs(expected - got).max() < 1e-4
 
@@ -174,17 +158,17 @@ def test_explicit_drives_have_the_motors_limits(engine: type[EngineSimulator]) -
 @pytest.mark.parametrize("engine", [Sapien, Drake, PyBullet, Mujoco])
 def test_parameters_of_each_run_are_set(engine: type[EngineSimulator]) -> None:
     pytest.importorskip(engine.module, reason=f"{engine.package} is not installed")
-    robot = prepared(PENDULUM, DriveLaw(), **LINEAR)
+    robot = prepared(PENDULUM, E)
     command = np.tile(chirp(0.005, seconds=4.0)[None, :, None], (2, 1, 1))
-    names = ("stiffness", "damping", "armature")
-    values = dict(
-        zip(names, np.array([[[12], [20]], [[0.3], [0.5]], [[0.01], [0.002]]]), strict=True)
-    )
+    sets = [
+        {"stiffness": 12.0, "damping": 0.3, "armature": 0.01},
+        {"stiffness": 20.0, "damping": 0.5, "armature": 0.002},
+    ]
+    values = {name: np.array([[one[name]] for one in sets]) for name in sets[0]}
     got = engine(robot).rollout(command, {**values, "delay": np.array([[0.0], [0.01]])})
-    late = np.pad(command[1], ((2, 0), (0, 0)))[: command.shape[1]]
+    command[1] = np.pad(command[1], ((2, 0), (0, 0)))[:-2]
     with Chain(robot, "swing", threads=1) as chain:
-        sets = [{"swing": {n: v[run, 0] for n, v in values.items()}} for run in range(2)]
-        expected = chain.rollout(np.stack([command[0], late]), sets)[:, :-1]
+        expected = chain.rollout(command, [{"swing": one} for one in sets])[:, :-1]
     assert np.abs(got - expected).max() < 1e-4
     if not engine.dry:
         with pytest.raises(PronkError, match="frictionloss"):
@@ -198,12 +182,11 @@ def test_dry_friction_is_a_torque_where_the_engine_has_it(
     if law.kind not in engine.dry:
         pytest.skip("no dry friction in N m")
     wave = chirp(0.005, seconds=8.0)
-    free, dry = (prepared(PENDULUM, law, **LINEAR, frictionloss=f) for f in (0.0, 0.3))
+    free, dry = (prepared(PENDULUM, law, frictionloss=f) for f in (0.0, 0.3))
     command, without, *_ = both(engine, free, "swing", wave)
     _, expected, got, _ = both(engine, dry, "swing", wave)
-    without_db, law_db, engine_db = (
-        level(command[:, 0], one[:, 0], 0.005) for one in (without, expected, got)
-    )
+    all_three = (without, expected, got)
+    without_db, law_db, engine_db = (level(command[:, 0], y[:, 0], 0.005) for y in all_three)
     assert np.abs(law_db - without_db).max() > 0.7
     # PyBullet's holds a joint at rest, Genesis's is less soft than MuJoCo's, which is the law's.
     assert np.abs(engine_db - law_db).max() < {PyBullet: 0.25, Genesis: 0.4}.get(engine, 0.01)

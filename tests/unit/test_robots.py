@@ -50,7 +50,6 @@ def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
         hinge, drive = model.joint(joint.name), joint.drive
         np.testing.assert_allclose(hinge.range, joint.range)
         assert model.jnt_limited[hinge.id]
-        assert joint.range[0] < joint.default_position < joint.range[1]
         passive = (drive.armature, drive.frictionloss, drive.viscous_damping)
         assert (hinge.armature, hinge.frictionloss, hinge.damping) == passive
     assert model.opt.timestep == robot.timestep_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -110,18 +111,14 @@ def file_of_model(path: Path) -> RobotFile:
 def yaml_of_model(path: Path) -> str:
     """Write the `robot.yaml` of a bare model, with comments on what to check."""
     file = file_of_model(path)
-    drives = "\n".join(
-        f"  {_yaml(name)}:\n"
-        + "\n".join(f"    {field}: {_yaml(getattr(drive, field))}" for field in _FIELDS)
-        for name, drive in file.drives.items()
-    )
-    groups = "\n".join(
-        f"  {_yaml(name)}: {{drive: {_yaml(group.drive)}, stiffness: {_yaml(group.stiffness)}, "
-        f"damping: {_yaml(group.damping)}, band_hz: {list(group.band_hz or _BAND_HZ)}}}"
-        for name, group in file.groups.items()
-    )
-    poses = file.poses["default"].items()
-    pose = "\n".join(f"    {_yaml(name)}: {_yaml(value)}" for name, value in poses)
+    drives = groups = pose = ""
+    for name, drive in file.drives.items():
+        drives += f"  {_yaml(name)}:\n"
+        drives += "".join(f"    {field}: {_yaml(getattr(drive, field))}\n" for field in _FIELDS)
+        fields = ("drive", "stiffness", "damping")
+        group: dict[str, Any] = {field: getattr(file.groups[name], field) for field in fields}
+        groups += f"  {_yaml(name)}: {_yaml({**group, 'band_hz': list(_BAND_HZ)})}\n"
+        pose += f"    {_yaml(name)}: {_yaml(file.poses['default'][name])}\n"
     return f"""\
 # Robot of {_yaml(path.name)}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,
 # then run `pronk robot check` on this file.
@@ -131,22 +128,19 @@ model: {_yaml(file.model)}
 policy_rate_hz: 50.0  # rate of the commands; timestep_s * decimation * rate must be 1
 timestep_s: 0.005     # of the simulator that is matched
 decimation: 4
-grid_stiffness: [{", ".join(map(_yaml, file.grid_stiffness))}]  # range of `pronk match`'s search
-grid_damping: [{", ".join(map(_yaml, file.grid_damping))}]
+grid_stiffness: {_yaml(list(file.grid_stiffness))}  # range of `pronk match`'s search
+grid_damping: {_yaml(list(file.grid_damping))}
 # legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints
 
 drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia
 {drives}
-
 groups:  # CHECK: gains on the real drives; joints built alike may share a group, with
   # a pattern such as {{joints: "*_knee"}}; `clamped: ["*_hip"]` names joints fixed in the
   # bench test.
 {groups}
-
 poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` too
   default:
-{pose}
-"""
+{pose}"""
 
 
 def _short(value: float) -> float:
@@ -155,5 +149,6 @@ def _short(value: float) -> float:
 
 def _yaml(value: object) -> str:
     """A name or number as YAML, quoted and with a decimal point where it needs them."""
-    made: str = yaml.safe_dump([value], default_flow_style=True, width=1000, allow_unicode=True)
+    flow = {"default_flow_style": True, "sort_keys": False, "width": 1000, "allow_unicode": True}
+    made: str = yaml.safe_dump([value], **flow)
     return made.strip()[1:-1]

@@ -35,8 +35,6 @@ class Profile(SimulatorInfo):
     framework: str
     """Framework, and the actuator of it that the profile holds for."""
     passive_damping: Literal["implicit", "explicit"] = "implicit"
-    delay: Literal["steps", "none"]
-    """Delay of a command that can be set: whole physics steps, or none."""
     friction: Friction
     """Dry friction of a joint: a torque, PhysX's coefficient of the joint's constraint force, or
     not there. Only a torque is matched."""
