@@ -10,8 +10,7 @@ import os
 
 _MUJOCO = "MUJOCO_GL"
 _REQUESTED = "PRONK_GL"
-_NONE = "disable"
-"""MuJoCo's name for no OpenGL."""
+_NONE = "disable"  # MuJoCo's name for no OpenGL
 
 
 def keep_out() -> None:

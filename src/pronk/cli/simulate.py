@@ -17,8 +17,7 @@ from pronk.errors import HardwareError
 if TYPE_CHECKING:
     from pronk.virtual.server import ServerTransport
 
-_PRIORITY = 30
-"""Of SCHED_FIFO; below that of the commanding process."""
+_PRIORITY = 30  # of SCHED_FIFO; below that of the commanding process
 _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which the measured timing is not representative."""
 

@@ -25,12 +25,10 @@ class Legged:
     """Axis of the thigh's joint to knee axis, in the plane of the leg [m]."""
     shank_length: float
     """Knee axis to the centre of the foot [m]."""
-    foot_radius: float
-    """[m]"""
+    foot_radius: float  # [m]
     standing_height: float
     """Height of the base over the floor in the default pose [m]."""
-    total_mass: float
-    """[kg]"""
+    total_mass: float  # [kg]
 
 
 @lru_cache

@@ -74,10 +74,9 @@ def bench_spec(
 ) -> mujoco.MjSpec:
     """One joint on the bench: what moves when it is excited, and nothing else.
 
-    The base is fixed, so only the joint's own `chain` feels it: other branches are removed,
-    clamped joints are welded at their default position, the other joints of the chain are held
-    by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
-    computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
+    The base is fixed, other branches are removed, clamped joints are welded at their default
+    position, the other joints of the chain are held by their own drives. There is gravity; there
+    are no contacts and no geoms. Keyframe `default` is the default pose and its commands.
 
     `drives` are `stiffness`, `damping` and `stribeck` of `add_drives`. A RobotError names a joint
     outside the chain that could move with it.
@@ -137,11 +136,10 @@ def add_drives(
     damping: Mapping[str, float] = {},
     stribeck: Mapping[str, float] = {},
 ) -> None:
-    """Give joints of a spec a native dcmotor each.
+    """Give joints of a spec a native dcmotor each, of the same name; commands are positions [rad].
 
-    Actuators have the names of their joints and take position commands [rad]. Gains by joint name
-    [N m/rad, N m s/rad] replace those of the robot's drives. Of joints with a `stribeck` share
-    (see `lugre`) the actuator takes over the dry friction that the joint has.
+    Gains by joint name [N m/rad, N m s/rad] replace those of the robot's drives. Of joints with a
+    `stribeck` share (see `lugre`) the actuator takes over the dry friction that the joint has.
     """
     for name in (*stiffness, *damping):
         robot.joint(name)

@@ -29,8 +29,7 @@ from pronk.simulators.mujoco import JointTestRig
 
 _EPS = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
-_STEP = 1e-3
-"""Step of `Plant.slope` in the logarithm of a gain."""
+_STEP = 1e-3  # step of `Plant.slope` in the logarithm of a gain
 
 
 @dataclass(frozen=True, kw_only=True)

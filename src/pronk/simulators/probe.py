@@ -31,15 +31,12 @@ from pronk.simulators.simulator import Simulator, excited
 
 AMPLITUDE = 0.2
 """Of the commands [rad]; less where the drive's effort limit needs it."""
-_REST = 8
-"""Steps before the command moves."""
-_HOLDS = 40
-"""Longest hold that is looked for [steps]."""
+_REST = 8  # steps before the command moves
+_HOLDS = 40  # longest hold that is looked for [steps]
 _ITERATIONS = (1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 32)
 _SCALES = (1.0, 2.0, 180.0 / math.pi, math.pi / 180.0)
 """Factors on gains that have a usual cause."""
-_HALVINGS = 7
-"""Of the gains, until the simulator is stable."""
+_HALVINGS = 7  # of the gains, until the simulator is stable
 _ROUNDS = 25
 _IMPEDANCE, _RATE = 0.9, 2.0 / (0.95 * 0.02)
 """Of MuJoCo's dry friction: solimp 0.9 to 0.95, and the rate [1/s] of solref's 0.02 s (MuJoCo,
@@ -47,12 +44,9 @@ Computation, Solver parameters)."""
 _FAR = 30.0
 """A law that leaves so many times what another leaves is not followed further: iterations change
 what is left by less."""
-_CLEAR = 0.7
-"""Of what the next law leaves, the best one leaves less."""
-_LEFT = 0.01
-"""Share of the motion that a right answer leaves at most."""
-_GRAVITY = 0.002
-"""Torque of gravity over stiffness [rad] from which on it shows."""
+_CLEAR = 0.7  # of what the next law leaves, the best one leaves less
+_LEFT = 0.01  # share of the motion that a right answer leaves at most
+_GRAVITY = 0.002  # torque of gravity over stiffness [rad] from which on it shows
 _NAMES = ("damping", "inertia", "viscous", "friction", "delay", "applied", "gravity")
 """Fitted, as gains, inertia, friction and gravity of any common factor move alike, to a stiffness
 that acts as it is set: the factor on damping, inertia, passive damping, dry friction, delay in
@@ -70,13 +64,11 @@ class Probe:
     stiffness_factor: float
     """Stiffness that acts over the one that is set."""
     damping_factor: float
-    armature: float
-    """[kg m^2]."""
+    armature: float  # [kg m^2]
     armature_set: float
     armature_applied: float | None
     """Share of a change of the armature that acts; None where it cannot be set."""
-    viscous_damping: float
-    """[N m s/rad]."""
+    viscous_damping: float  # [N m s/rad]
     frictionloss: float
     """Dry friction [N m]."""
     frictionloss_set: float

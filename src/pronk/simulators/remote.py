@@ -61,8 +61,7 @@ from pronk.simulators.remote import serve
 serve()
 """
 """What the child runs. Its own packages are used, so only pronk comes from here."""
-_CLOSING_S = 5.0
-"""Time that a child has to end after its standard input was closed [s]."""
+_CLOSING_S = 5.0  # time that a child has to end after its standard input was closed [s]
 
 
 def send(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:

@@ -44,8 +44,7 @@ simulations as for 500 (measured), and two cores have simulated some 200 by then
 MOST = 8192
 """Simulations in flight at once: 8,192 x 5,000 steps are 160 MB on the device, or twice that when
 each has its own command."""
-_GRAPH_DRIVER = (12, 4)
-"""CUDA driver from which a captured step may hold the solver's loop."""
+_GRAPH_DRIVER = (12, 4)  # CUDA driver from which a captured step may hold the solver's loop
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 

@@ -18,8 +18,7 @@ from pronk.errors import PronkError
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links
 
-_MAX_SPEED = 1e4
-"""Above every speed of a joint [rad/s]; PyBullet clips at 100 by default."""
+_MAX_SPEED = 1e4  # above every speed of a joint [rad/s]; PyBullet clips at 100 by default
 
 
 class PyBullet(EngineSimulator):

@@ -16,8 +16,7 @@ from pronk.arrays import Array
 from pronk.simulators.engines.engine import Drives, EngineSimulator
 from pronk.simulators.engines.links import Links, along_x, principal, quaternion
 
-_MAX_SPEED = 1e4
-"""Above every speed of a joint [rad/s]; PhysX clips at 100 by default."""
+_MAX_SPEED = 1e4  # above every speed of a joint [rad/s]; PhysX clips at 100 by default
 
 
 class Sapien(EngineSimulator):
