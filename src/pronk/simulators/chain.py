@@ -178,9 +178,8 @@ class ChainSimulation(Closing):
         out = []
         for log, excited in zip(self.logs, self.excited, strict=True):
             columns = np.full((len(log.time), len(self.joints)), np.nan)
-            for i, name in enumerate(self.joints):
-                if name in excited:
-                    columns[:, i] = log.position[:, log.column(name)]
+            for name in excited:
+                columns[:, self.joints.index(name)] = log.position[:, log.column(name)]
             out.append(columns)
         return out
 

@@ -17,6 +17,7 @@ optimum correct.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -88,18 +89,25 @@ class Plant:
 
 def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
     """Linearize a rig about the pose of its chain [rad], at frequencies `omega` [rad/s]."""
-    model = rig.torque_model()
+    # The excited joint takes a torque in place of its drive, and has no dry friction.
+    model, i = copy.copy(rig.model), rig.actuator
+    model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
+    model.actuator_biastype[i] = mujoco.mjtBias.mjBIAS_NONE
+    model.actuator_dyntype[i] = mujoco.mjtDyn.mjDYN_NONE
+    model.actuator_gainprm[i] = np.eye(model.actuator_gainprm.shape[1])[0]
+    model.actuator_ctrllimited[i] = model.actuator_forcelimited[i] = False
+    model.dof_frictionloss[rig.index] = 0.0
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     data.ctrl[:] = rig.control(pose)
     mujoco.mj_forward(model, data)
-    # Hold the excited joint against gravity, so that the linearization is about rest.
-    data.ctrl[rig.actuator] = data.qfrc_bias[rig.index]
+    # Hold the joint against gravity, so that the linearization is about rest.
+    data.ctrl[i] = data.qfrc_bias[rig.index]
     nx = 2 * model.nv + model.na
     a, b = np.zeros((nx, nx)), np.zeros((nx, model.nu))
     mujoco.mjd_transitionFD(model, data, _EPS, True, a, b, None, None)
     z = np.exp(1j * omega * model.opt.timestep)[:, None, None]
-    states = np.linalg.solve(z * np.eye(nx) - a, b[:, rig.actuator, None])[..., 0]
+    states = np.linalg.solve(z * np.eye(nx) - a, b[:, i, None])[..., 0]
     return Plant(
         omega=omega,
         position=states[:, rig.index],

@@ -181,17 +181,6 @@ class JointTestRig(Chain):
         out[self._columns] = pose
         return out
 
-    def torque_model(self) -> mujoco.MjModel:
-        """A copy whose excited joint takes a torque [N m] and has no dry friction of its own."""
-        model, i = copy.copy(self.model), self.actuator
-        model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
-        model.actuator_biastype[i] = mujoco.mjtBias.mjBIAS_NONE
-        model.actuator_dyntype[i] = mujoco.mjtDyn.mjDYN_NONE
-        model.actuator_gainprm[i] = np.eye(model.actuator_gainprm.shape[1])[0]
-        model.actuator_ctrllimited[i] = model.actuator_forcelimited[i] = False
-        model.dof_frictionloss[self.index] = 0.0
-        return model
-
     def equilibrium(self, target: Array, stiffness: float) -> Array:
         """Positions at rest with this stiffness at the excited joint [rad], shape (chain,)."""
         gains = self._stiffness.copy()
@@ -254,8 +243,7 @@ def rig_on(device: str) -> Callable[..., JointTestRig]:
             f'device "{device}" needs MuJoCo Warp, and {error.name} is not installed; '
             'pip install "pronk[train]", or use device "cpu".'
         ) from error
-    find_device(device)
-    return partial(WarpTestRig, device=device)
+    return partial(WarpTestRig, device=find_device(device))
 
 
 class MujocoSimulator(JointRigs):

@@ -80,12 +80,12 @@ class WarpTestRig(JointTestRig):
         robot: RobotSpec,
         joint: str,
         *,
-        device: str = "cuda",
+        device: Any,
         least: int = LEAST,
         **options: Any,
     ) -> None:
-        """Compile the model; `device` is `cuda` or `warp-cpu`, `options` are `JointTestRig`'s."""
-        self._device = find_device(device)
+        """Compile the model; the device is Warp's, `options` are those of `JointTestRig`."""
+        self._device = device
         super().__init__(robot, joint, **options)
         self._least = least
         self._worlds: _Worlds | None = None
