@@ -34,19 +34,17 @@ def probe(
     found = look(made, known, joint)
     info, one = made.info, known.joint(found.joint)
     beside = "E, beside it " if found.beside_explicit else ""
+    # Adding 0 makes -0 a 0.
+    passive, delay_ms = round(found.viscous_damping, 6) + 0.0, round(1e3 * found.delay_s, 4) + 0.0
     rows: list[list[Any]] = [
         ["law", info.drive_law.label, beside + found.law.label],
         ["stiffness [N m/rad]", one.stiffness, one.stiffness * found.stiffness_factor],
         ["damping [N m s/rad]", one.damping, one.damping * found.damping_factor],
         ["armature [kg m^2]", found.armature_set, found.armature],
-        [
-            "passive damping [N m s/rad]",
-            one.drive.viscous_damping,
-            round(found.viscous_damping, 6) + 0.0,
-        ],
+        ["passive damping [N m s/rad]", one.drive.viscous_damping, passive],
         ["dry friction [N m]", one.drive.frictionloss, found.frictionloss],
         ["gravity [of the model's]", 1.0, max(found.gravity, 0.0)],
-        ["delay [ms]", 0.0, round(1000.0 * found.delay_s, 4) + 0.0],
+        ["delay [ms]", 0.0, delay_ms],
         ["hold [steps]", 1, found.hold],
     ]
     console.show_table(

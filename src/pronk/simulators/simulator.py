@@ -226,8 +226,10 @@ def factory(choice: str) -> Any:
     path = Path(file)
     if not path.is_file():
         raise PronkError(f"simulator {choice}: there is no file {path}.")
+    # Not the name of the file, which may be that of the engine that it imports.
+    module = f"simulator in {path.name}"
     try:
-        members = runpy.run_path(file, run_name=path.stem)
+        members = runpy.run_path(file, run_name=module)
     except Exception as error:
         raise PronkError(
             f"simulator {choice}: {path} cannot be loaded ({type(error).__name__}: {error})."
@@ -235,7 +237,7 @@ def factory(choice: str) -> Any:
     found = members.get(name)
     if not callable(found):
         types = [one for one in members.values() if isinstance(one, type)]
-        offers = [one.__name__ for one in types if one.__module__ == path.stem]
+        offers = [one.__name__ for one in types if one.__module__ == module]
         raise PronkError(
             f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
             f"{', '.join(offers) or 'none'}."
