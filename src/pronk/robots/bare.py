@@ -149,6 +149,6 @@ def _short(value: float) -> float:
 
 def _yaml(value: object) -> str:
     """A name or number as YAML, quoted and with a decimal point where it needs them."""
-    flow = {"default_flow_style": True, "sort_keys": False, "width": 1000, "allow_unicode": True}
-    made: str = yaml.safe_dump([value], **flow)
+    flow: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": 1000}
+    made: str = yaml.safe_dump([value], allow_unicode=True, **flow)
     return made.strip()[1:-1]

@@ -25,17 +25,22 @@ class Legged:
     """Axis of the thigh's joint to knee axis, in the plane of the leg [m]."""
     shank_length: float
     """Knee axis to the centre of the foot [m]."""
-    foot_radius: float  # [m]
+    foot_radius: float
+    """[m]"""
     standing_height: float
     """Height of the base over the floor in the default pose [m]."""
-    total_mass: float  # [kg]
+    total_mass: float
+    """[kg]"""
+    base_mass: float
+    """[kg]"""
 
 
 @lru_cache
 def legged(name: str | Path) -> Legged:
     """Read the dimensions of a robot from its first leg, whose foot is a sphere on the shank.
 
-    A RobotError says that the robot has no legs, or its first leg no such foot.
+    Raises:
+        RobotError: The robot has no legs, or its first leg has no such foot.
     """
     robot = load_robot(name)
     if not robot.legs:
@@ -48,6 +53,7 @@ def legged(name: str | Path) -> Legged:
     feet = np.flatnonzero(spheres & (model.geom_bodyid == shank))
     if not len(feet):
         raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
+    base = model.body(robot.base_body)
     return Legged(
         legs=robot.legs,
         leg_joints=tuple(joint.name.removeprefix(leg) for joint in joints),
@@ -55,6 +61,7 @@ def legged(name: str | Path) -> Legged:
         thigh_length=float(-model.body_pos[shank, 2]),
         shank_length=float(-model.geom_pos[feet[-1], 2]),
         foot_radius=float(model.geom_size[feet[-1], 0]),
-        standing_height=float(model.body(robot.base_body).pos[2]),
+        standing_height=float(base.pos[2]),
         total_mass=float(np.sum(model.body_mass)),
+        base_mass=float(base.mass[0]),
     )

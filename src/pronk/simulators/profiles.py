@@ -8,7 +8,7 @@ the same gains.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -26,15 +26,22 @@ _NO_CURVE = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Profile(SimulatorInfo):
-    """The joint of one framework.
-
-    `decimation` is that of the framework's tasks; a match takes the robot's.
-    """
+class Profile:
+    """The joint of one framework."""
 
     framework: str
     """Framework, and the actuator of it that the profile holds for."""
+    engine: str
+    integrator: str
+    actuator: str
+    law: Literal["explicit", "implicit_damping", "implicit"]
+    iterations: int = 1
     passive_damping: Literal["implicit", "explicit"] = "implicit"
+    timestep_s: float
+    decimation: int
+    """Steps of a command as the framework's tasks have it; a match takes the robot's."""
+    delay: Literal["steps", "none"]
+    """Delay of a command that can be set: whole physics steps, or none."""
     friction: Friction
     """Dry friction of a joint: a torque, PhysX's coefficient of the joint's constraint force, or
     not there. Only a torque is matched."""
@@ -42,6 +49,7 @@ class Profile(SimulatorInfo):
     """True if the torque-speed line of the motor limits the torque, not the effort limit alone."""
     source: str
     """Where timestep, decimation and iterations come from."""
+    name: str = ""
 
     def __post_init__(self) -> None:
         """Refuse an impossible step or law, and friction of an unknown kind."""
@@ -57,19 +65,18 @@ class Profile(SimulatorInfo):
         _ = self.drive_law
 
     @property
-    def name(self) -> str:
-        """Its name in `profiles.yaml`."""
-        return self.profile
-
-    @property
     def drive_law(self) -> DriveLaw:
         """How stiffness, damping and passive damping act over a step."""
-        return replace(super().drive_law, passive_damping=self.passive_damping)
+        return DriveLaw(
+            kind=self.law, iterations=self.iterations, passive_damping=self.passive_damping
+        )
 
     @property
     def info(self) -> SimulatorInfo:
         """What gains that are matched for the profile hold for."""
-        return SimulatorInfo(**{one.name: getattr(self, one.name) for one in fields(SimulatorInfo)})
+        names = ("engine", "timestep_s", "decimation", "integrator", "actuator")
+        own = {name: getattr(self, name) for name in (*names, "law", "iterations")}
+        return SimulatorInfo(profile=self.name, **own)
 
     def joint(self, joint: Joint) -> Joint:
         """A joint with the limits and the friction that the framework has."""
@@ -105,7 +112,7 @@ class Profile(SimulatorInfo):
 def profiles() -> Mapping[str, Profile]:
     """All profiles by name, in the order of their file."""
     data = read_yaml(FILE)
-    return {n: converted({**one, "profile": n}, Profile, FILE) for n, one in data.items()}
+    return {n: converted({**one, "name": n}, Profile, FILE) for n, one in data.items()}
 
 
 def profile(text: str) -> Profile:
