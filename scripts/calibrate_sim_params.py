@@ -20,7 +20,7 @@ import numpy as np
 
 from pronk.excitation.plan import make_plan
 from pronk.files import write_text
-from pronk.logs.mcap_log import read_mcap
+from pronk.logs.mcap_reader import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.report.paper import TABLE_I

@@ -22,7 +22,8 @@ from log_files import example, write_mcap
 from pronk.errors import LogError
 from pronk.logs import mcap_log
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_log import LogHeader, McapLogWriter, read_mcap
+from pronk.logs.mcap_log import LogHeader, McapLogWriter
+from pronk.logs.mcap_reader import read_mcap
 from pronk.logs.readers import read_log
 
 TIMELESS = ("robot", "joints", "segments", "units", "virtual", "metadata", "complete")

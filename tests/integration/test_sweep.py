@@ -13,7 +13,7 @@ from pronk.errors import HardwareError, PlanError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.machine import Command, State
-from pronk.logs.mcap_log import read_mcap
+from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import load_robot
 from pronk.runtime.safety import SafetyFilter
 from pronk.runtime.sweep import SweepTask, record

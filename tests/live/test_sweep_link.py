@@ -28,7 +28,7 @@ from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.address import Address
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_log import read_mcap
+from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import load_robot
 from pronk.runtime.plan import Link
 from wire import ROBOT, over_lcm

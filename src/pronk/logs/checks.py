@@ -104,25 +104,17 @@ def examine(time: Array) -> Timing:
 
 
 def check_unit(time: Array, where: str, unit: str) -> None:
-    """Refuse timestamps [s], converted from `unit`, whose rate fits another unit.
-
-    The LogError names the likely unit.
-    """
+    """Refuse timestamps [s], converted from `unit`, whose rate fits another, which is named."""
     rate = 1.0 / float(np.median(np.diff(time)))
     low, high = PLAUSIBLE_HZ
     if low <= rate <= high:
         return
     rates = {name: rate * TIME_UNITS[unit] / scale for name, scale in TIME_UNITS.items()}
-    # Where several fit, the one nearest to the 500 Hz at which joints are usually logged.
-    likely = sorted(
-        (name for name, hz in rates.items() if low <= hz <= high),
-        key=lambda name: abs(np.log(rates[name] / 500.0)),
-    )
-    hint = (
-        f"the timestamps are probably in {likely[0]} (--time-unit {likely[0]}, or convert them)"
-        if likely
-        else "no unit of time fits them"
-    )
+    hint = "no unit of time fits them"
+    if fitting := [name for name, hz in rates.items() if low <= hz <= high]:
+        # Where several fit, the one nearest to the 500 Hz at which joints are usually logged.
+        likely = min(fitting, key=lambda name: abs(np.log(rates[name] / 500.0)))
+        hint = f"the timestamps are probably in {likely} (--time-unit {likely}, or convert them)"
     raise LogError(
         f"{where}: read in {unit!r}, its samples come at {rate:.4g} Hz; expected {low:g} to "
         f"{high:g} Hz; {hint}."
@@ -193,8 +185,9 @@ def check_radians(log: JointLog, joint: str) -> None:
     farthest = float(max(np.abs(position).max(), np.abs(command).max()))
     if log.unit(joint) != "rad" or (peak <= LARGEST_COMMAND and farthest <= LARGEST_POSITION):
         return
-    swings = peak > LARGEST_COMMAND
-    what = f"its command swings by {peak:.3g}" if swings else f"it reaches {farthest:.3g}"
+    what = f"it reaches {farthest:.3g}"
+    if peak > LARGEST_COMMAND:
+        what = f"its command swings by {peak:.3g}"
     raise LogError(
         f"{log.source or 'log'}: {joint} is read in radians and {what}, more than a joint "
         "turns; the file is probably in degrees (--unit deg, or convert it)."
@@ -202,13 +195,11 @@ def check_radians(log: JointLog, joint: str) -> None:
 
 
 def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
-    """A warning naming the two most alike commands, or "" where none exceeds the limit.
+    """A warning naming the two most alike commands (n, joints), or "" where none exceeds the limit.
 
     The largest absolute correlation over lags up to half a second counts. With correlated commands,
     the motion that one joint causes in another looks like a response to the other's own command:
-    the coherence stays near one while the response is wrong.
-
-    Commands are held from each timestamp [s] to the next, shape (n, joints); one that never changes
+    the coherence stays near one while the response is wrong. A command that never changes
     correlates with nothing.
     """
     from scipy.signal import correlate  # slow to import

@@ -30,9 +30,9 @@ class Columns:
     joints: tuple[str, ...] = ()
     """Names of the columns; empty if the file has none."""
     time: Array
-    command: Array | None
-    """None where the drives were commanded in torque."""
     position: Array
+    command: Array | None = None
+    """None where the drives were commanded in torque."""
     velocity: Array | None = None
     torque: Array | None = None
     unit: str | None = None
@@ -70,7 +70,7 @@ def import_columns(
     full. `scale` gives radians per unit of joints whose unit is unknown, by (new) joint name, for
     command and position; the velocity is left as it is.
     """
-    where, sent = columns.where, columns.command
+    where, sent, scale = columns.where, columns.command, scale or {}
     unit, time_unit = unit or columns.unit, time_unit or columns.time_unit
     if unit is None:
         raise LogError(
@@ -105,18 +105,17 @@ def import_columns(
         # Before the unit is changed: nothing is rounded away.
         time = time - time[0]
     time = time * seconds
-    scale = scale or {}
     for joint, factor in scale.items():
         if joint not in joints:
             raise LogError(f"{where}: --scale names {joint}; the joints are {', '.join(joints)}.")
         if not (np.isfinite(factor) and factor != 0.0):
             raise LogError(f"{where}: the scale of {joint} is {factor}; expected a number.")
+    renamed = dict(zip(columns.joints, joints, strict=False))
+    other = {renamed[name] for name in columns.no_angles if name in renamed}
+    angle = {joint: 1.0 if joint in other else UNITS[unit] for joint in joints}
+    factors = np.array([scale.get(joint, angle[joint]) for joint in joints])
     # A scale defines the unit of position; the velocity beside it may be an angle already.
-    own = columns.joints if columns.no_angles else joints
-    other = [name in columns.no_angles for name in own]
-    factors = np.where(other, 1.0, UNITS[unit])
-    rates = np.where([joint in scale for joint in joints], 1.0, factors)
-    factors = np.array([scale.get(j, factor) for j, factor in zip(joints, factors, strict=True)])
+    rates = np.array([1.0 if joint in scale else angle[joint] for joint in joints])
     command = sent[keep] * factors
     # A command that is not finite is refused below, by name.
     if np.isfinite(command).all() and (note := correlation_note(time, command, joints)):
@@ -130,8 +129,7 @@ def import_columns(
         velocity=None if columns.velocity is None else columns.velocity[keep] * rates,
         torque=None if columns.torque is None else columns.torque[keep],
         units=tuple(
-            "unknown" if off and joint not in scale else "rad"
-            for joint, off in zip(joints, other, strict=True)
+            "unknown" if joint in other and joint not in scale else "rad" for joint in joints
         ),
         source=where,
         sha256=columns.sha256,
@@ -174,18 +172,11 @@ def ordered(
     order: Sequence[str] | None,
     joints: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Joint of each of several values: by the file, or in the order that the user states.
+    """Joint of each of several values (`what`): by the file, or in the order that the user states.
 
-    Args:
-        what: The values, for messages.
-        count: How many there are.
-        robot: The robot.
-        order: Joint names, one a value (a list, or text with commas), or `default`: the robot's
-            joints in its own order. An order of joints is never assumed.
-        joints: Names in the file, if it has any.
-
-    Raises:
-        LogError: Neither the file nor the user names the joints, or they differ.
+    `order` is joint names, one a value (a list, or text with commas), or `default`: the robot's
+    joints in its own order. An order is never assumed: a LogError says that neither the file
+    (`joints`) nor the user names the joints, or that they differ.
     """
     own = () if robot is None else robot.joint_names
     stated = tuple(order.split(",") if isinstance(order, str) else order or ())

@@ -95,13 +95,13 @@ def read_csv(
 
     def numbers(name: str) -> Array:
         index = header.index(names[name])
-        for i, row in enumerate(rows):
-            if not _is_finite(row[index]):
-                raise LogError(
-                    f"{path}: row {i + 2} holds {row[index][:40]!r} in column {names[name]!r}; "
-                    "expected a finite number; repair or remove that row."
-                )
-        return np.array([float(row[index]) for row in rows])
+        values = np.array([_number(row[index]) for row in rows])
+        if len(wrong := np.flatnonzero(~np.isfinite(values))):
+            raise LogError(
+                f"{path}: row {wrong[0] + 2} holds {rows[wrong[0]][index][:40]!r} in column "
+                f"{names[name]!r}; expected a finite number; repair or remove that row."
+            )
+        return values
 
     found = {
         quantity: np.stack([numbers(f"{quantity}.{joint}") for joint in joints], axis=1)
@@ -114,7 +114,7 @@ def read_csv(
         time=numbers("time"),
         row=lambda i: f"row {i + 2}",
         sha256=sha256(path),
-        **({"command": None} | found),  # type: ignore[arg-type]
+        **found,  # type: ignore[arg-type]
     )
 
 
@@ -127,13 +127,8 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     try:
         check_archive(path, LogError)
         with np.load(path, allow_pickle=False) as stored:
-            arrays = {
-                name: np.asarray(stored[name])
-                for name in ("time", *QUANTITIES, "joints")
-                if name in stored.files
-            }
-            others = stored.files
-            extra = [name for name in others if name not in arrays]
+            others, known = stored.files, ("time", *QUANTITIES, "joints")
+            arrays = {name: np.asarray(stored[name]) for name in known if name in others}
     except LogError:
         raise
     except OSError as error:
@@ -143,6 +138,7 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         # zipfile, zlib and the npy parser fail in many ways on a damaged file.
         reason = f"{type(error).__name__}: {error}"[:120]
         raise LogError(f"{path}: not a readable NPZ file ({reason}).") from error
+    extra = ", ".join(name for name in others if name not in arrays)
     needed = ("time", "position", *["command"] * ("torque" not in arrays))
     if missing := [name for name in needed if name not in arrays]:
         raise LogError(
@@ -171,10 +167,10 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     return Columns(
         where=str(path),
         joints=tuple(map(str, names)),
-        notes=(f"arrays that are not read: {printable(', '.join(extra)[:200])}",) if extra else (),
+        notes=(f"arrays that are not read: {printable(extra[:200])}",) if extra else (),
         time=time,
         sha256=sha256(path),
-        **({"command": None} | found),  # type: ignore[arg-type]
+        **found,  # type: ignore[arg-type]
     )
 
 
@@ -183,8 +179,8 @@ def _is_ours(name: str) -> bool:
     return name == "time" or (kind in QUANTITIES and bool(joint))
 
 
-def _is_finite(cell: str) -> bool:
+def _number(cell: str) -> float:
     try:
-        return math.isfinite(float(cell))
+        return float(cell)
     except ValueError:
-        return False
+        return math.nan

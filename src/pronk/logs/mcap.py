@@ -106,14 +106,9 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[list[Record]]:
     """Messages of a file, chunk by chunk, in the order written.
 
-    Args:
-        stream: The file.
-        size: Its length [bytes]; no record can be longer.
-        most: Largest size that all its messages may take [bytes]; `most_bytes` if left out.
-
-    Raises:
-        DamagedError: The file ends early, or a chunk's checksum does not fit. What was yielded
-            before is sound.
+    No record can be longer than the file's `size`, and all messages may take `most` [bytes];
+    `most_bytes` if left out. A DamagedError says that the file ends early, or a chunk's checksum
+    does not fit; what was yielded before is sound.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -206,8 +201,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
 def read_records(path: Path) -> tuple[list[Record], str]:
     """Every readable message of a file, and what ended the reading early ("" if nothing did).
 
-    Raises:
-        LogError: There is no such file, no message in it, or it is larger than the limit.
+    No such file, no message in it, and more than the limit are LogErrors.
     """
     found: list[Record] = []
     damage = ""

@@ -32,10 +32,7 @@ from pronk.logs.mcap import (
     STRINGS,
     McapWriter,
     Record,
-    read_records,
 )
-from pronk.logs.rosbag_reader import MEASURED_TOPIC, read_joint_states
-from pronk.robots.robot import RobotSpec
 
 Floats = Sequence[float] | Array
 
@@ -73,10 +70,7 @@ class LogHeader:
 
 
 class McapLogWriter:
-    """Writes a log as it is recorded.
-
-    The file is not written aside and renamed: a recording that is interrupted must stay.
-    """
+    """Writes a log as it is recorded, in its place: a recording that is interrupted must stay."""
 
     def __init__(self, path: Path, header: LogHeader) -> None:
         """Open `path`, which is replaced, and write the header."""
@@ -129,49 +123,11 @@ def reason_of(error: BaseException | None) -> str:
     return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")
 
 
-def read_mcap(
-    path: Path,
-    *,
-    robot: RobotSpec | None = None,
-    measured_topic: str | None = None,
-    command_topic: str | None = None,
-    command_field: str = "position",
-    joint_order: Sequence[str] | None = None,
-) -> JointLog:
-    """Read a log of pronk, or the JointState messages of a rosbag2 MCAP.
+def read_sweep(path: Path, found: Iterable[Record], damage: str) -> JointLog:
+    """Make the log of the messages of a file, with `complete` False if it was cut anywhere.
 
-    A file that was cut anywhere gives the log of what came before, with `complete` False.
-
-    Args:
-        path: The file.
-        robot: The robot, for a file that does not name it.
-        measured_topic: Topic of the measured sensor_msgs/msg/JointState (rosbag2 only).
-        command_topic: Topic of the commands: JointState, or any message with the field below
-            (rosbag2 only).
-        command_field: Where in a command message the positions are, dots between names, numbers
-            for indices (rosbag2 only), for instance `points.0.positions`.
-        joint_order: Joints of a command without names (rosbag2 only), see `columns.ordered`.
-
-    Raises:
-        LogError: Not MCAP, nothing usable in it, or a topic that is not there.
+    `damage` says why reading ended early, or is "".
     """
-    found, damage = read_records(path)
-    if not any(record.topic.startswith("/sweep/") for record in found):
-        return read_joint_states(
-            path,
-            found,
-            damage,
-            robot=robot,
-            measured_topic=measured_topic or MEASURED_TOPIC,
-            command_topic=command_topic,
-            command_field=command_field,
-            joint_order=joint_order,
-        )
-    if measured_topic or command_topic or joint_order not in (None, "default"):
-        raise LogError(
-            f"{path}: a log of pronk needs no --measured-topic, --command-topic or --joint-order; "
-            "leave them out."
-        )
     try:
         return _read_sweep(path, found, damage)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

@@ -27,18 +27,16 @@ from pronk.logs.columns import Columns
 from pronk.robots.robot import RobotSpec
 
 KEYS = ("time", "dof_pos", "des_dof_pos")
-
+_Storage = Callable[[np.dtype[Any], str, int], NDArray[Any]]
+"""Numbers of a storage: their type, its key, how many."""
 _STORAGES = {
-    "DoubleStorage": "<f8",
-    "FloatStorage": "<f4",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-    "ShortStorage": "<i2",
-    "CharStorage": "i1",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
+    f"{name}Storage": np.dtype(code)
+    for name, code in (
+        *(("Double", "<f8"), ("Float", "<f4"), ("Half", "<f2"), ("Long", "<i8"), ("Int", "<i4")),
+        *(("Short", "<i2"), ("Char", "i1"), ("Byte", "u1"), ("Bool", "?")),
+    )
 }
+"""By the name of a torch storage class, which a dtype replaces: not callable, so it cannot run."""
 _OPCODES = (
     *("PROTO", "FRAME", "STOP", "MARK", "GLOBAL", "STACK_GLOBAL", "REDUCE", "BINPERSID"),
     *("BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET", "LONG_BINGET"),
@@ -50,13 +48,6 @@ _OPCODES = (
 """Opcodes that torch.save uses for a dictionary of tensors."""
 _MOST_PICKLE = 2**20
 """Largest `data.pkl` [bytes]; that of a PACE file has 500."""
-
-
-class _Dtype:
-    """Stands for a torch storage class. Not callable, so a pickle cannot run it."""
-
-    def __init__(self, code: str) -> None:
-        self.code = code
 
 
 class _Dispatch(dict[int, Callable[..., None]]):
@@ -71,10 +62,7 @@ class _Dispatch(dict[int, Callable[..., None]]):
 
 
 class _Unpickler(pickle._Unpickler):
-    """Interprets a pickle of tensors, and nothing else.
-
-    Pure Python: a number in the file cannot make its memo allocate memory.
-    """
+    """Interprets a pickle of tensors, in Python: no number in it makes a memo allocate memory."""
 
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]
@@ -85,14 +73,14 @@ class _Unpickler(pickle._Unpickler):
         }
     )
 
-    def __init__(self, data: bytes, storage: Callable[[str, str, int], NDArray[Any]]) -> None:
+    def __init__(self, data: bytes, storage: _Storage) -> None:
         super().__init__(io.BytesIO(data))
         self._storage = storage
 
     def find_class(self, module: str, name: str) -> Any:
         """Replace the three names that torch.save writes; refuse every other."""
         if module == "torch" and name in _STORAGES:
-            return _Dtype(_STORAGES[name])
+            return _STORAGES[name]
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
             return _rebuild_tensor
         if (module, name) == ("collections", "OrderedDict"):
@@ -105,9 +93,9 @@ class _Unpickler(pickle._Unpickler):
     def persistent_load(self, pid: Any) -> NDArray[Any]:
         """The numbers of one storage."""
         kind, dtype, key, _, count = pid
-        if kind != "storage" or not isinstance(dtype, _Dtype) or not isinstance(key, str):
+        if kind != "storage" or not isinstance(dtype, np.dtype) or not isinstance(key, str):
             raise ValueError
-        return self._storage(dtype.code, key, int(count))
+        return self._storage(dtype, key, int(count))
 
     def _put(self, key: Any, value: Any) -> None:
         """Fill a dictionary with text keys only: nested tuples take too long to hash."""
@@ -152,11 +140,7 @@ def _rebuild_tensor(storage: Any, offset: Any, size: Any, stride: Any, *_: Any) 
 
 
 def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
-    """Tensors by name from a file that `torch.save` wrote of a dictionary.
-
-    Raises:
-        LogError: Not such a file, or its pickle names something else.
-    """
+    """Tensors by name from a file that `torch.save` wrote of a dictionary; any other: LogError."""
     expected = f"expected a dictionary of {', '.join(KEYS)} saved with torch.save"
     try:
         check_archive(path, LogError)
@@ -173,9 +157,8 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
                 raise LogError("it was written on a big-endian machine")
 
             @functools.cache
-            def storage(code: str, key: str, count: int) -> NDArray[Any]:
-                numbers = np.frombuffer(archive.read(f"{root}/data/{key}"), dtype=code)
-                return numbers[:count]
+            def storage(dtype: np.dtype[Any], key: str, count: int) -> NDArray[Any]:
+                return np.frombuffer(archive.read(f"{root}/data/{key}"), dtype)[:count]
 
             found = _Unpickler(archive.read(pickles[0]), storage).load()
         if not isinstance(found, dict):

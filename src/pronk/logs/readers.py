@@ -20,7 +20,7 @@ from pronk.logs.columns import Columns, import_columns
 from pronk.logs.csv_npz_reader import read_csv, read_npz
 from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_log import read_mcap
+from pronk.logs.mcap_reader import read_mcap
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage
 from pronk.processes import in_processes
@@ -78,8 +78,7 @@ _BUILT_IN = (
 def readers() -> dict[str, Reader]:
     """Return the readers of pronk and of installed packages, by format.
 
-    Raises:
-        LogError: An entry point is not a reader, or takes the name or a suffix of another.
+    An entry point that is no reader, or takes the name or a suffix of another, is a LogError.
     """
     found = {each.name: each for each in _BUILT_IN}
     for point in entry_points(group=GROUP):
@@ -123,12 +122,8 @@ def read_log(
         robot: The robot, to check the joint names against.
         format: One of `readers()`; from the name if None.
         rate_hz: Expected rate; an error if the timestamps disagree.
-        options: Of the format: `unit`, `time_unit`, `joint_names`, `joint_order`,
-            `drop_duplicates`, `scale` (see `import_columns`), `columns` (CSV), `measured_topic`,
-            `command_topic`, `command_field` (rosbag2).
-
-    Returns:
-        The log; `notes` list what was found.
+        options: Of the format: those of `import_columns`, `columns` of `read_csv`, and those of
+            `read_mcap` for rosbag2.
 
     Raises:
         LogError: The file cannot be read or is not plausible; the message names the remedy.
@@ -199,11 +194,7 @@ def _examined(
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
-    """The logs that some paths stand for; a folder that is no log itself means those in it.
-
-    Raises:
-        LogError: No path is given, or a folder holds no log.
-    """
+    """The logs that some paths stand for; a folder that is no log itself means those in it."""
     suffixes = _suffixes(readers())
     found: list[Path] = []
     for path in map(Path, paths):

@@ -12,22 +12,14 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.evaluation import bodies as bodies_file
 from pronk.evaluation import results as results_file
+from pronk.evaluation import tables
 from pronk.evaluation import variation as varied
 from pronk.evaluation.bodies import Bodies, Body
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
 from pronk.evaluation.jumps import FIGURES
 from pronk.evaluation.results import Results, Spread, share_interval
-from pronk.evaluation.tables import (
-    Sheet,
-    definitions,
-    number,
-    of_figures,
-    place,
-    table,
-    tally,
-    verdict,
-)
+from pronk.evaluation.tables import Sheet, definitions, number, place, table, tally
 from pronk.evaluation.variation import VARIATION, parameters_of
 from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
 from pronk.report import trial_figures as draw
@@ -45,9 +37,11 @@ _WALK_TABLE = (
 _OF_POLICY = "training gains of "
 
 
-def _part(origin: Results | Bodies, content: dict[str, Any], **fields: Any) -> Part:
+def _part(
+    kind: str, title: str, origin: Results | Bodies, content: dict[str, Any], **fields: Any
+) -> Part:
     content |= {"results": origin, "where": place(origin)}
-    return Part(virtual=origin.virtual, content=content, **fields)
+    return Part(kind=kind, title=title, virtual=origin.virtual, content=content, **fields)
 
 
 def walk_tables(walks: Results) -> tuple[Sheet, ...]:
@@ -56,14 +50,13 @@ def walk_tables(walks: Results) -> tuple[Sheet, ...]:
         "non-foot contact: walks in which something but a foot touched the ground. The first "
         f"{SETTLE_S:g} s after the command are left out."
     )
-    sheets = []
+    sheets, figures = [], [WALK_FIGURES[name] for name in _WALK_TABLE]
     counts = {"walks": "n", "fell": "fell", "non-foot contact": "non_foot_contact"}
     for subject in walks.subjects:
         own = [cell for cell in walks.cells if cell.policy == subject.name]
         rows = [(name, *(str(getattr(c, field)) for c in own)) for name, field in counts.items()]
-        figures = [WALK_FIGURES[name] for name in _WALK_TABLE]
         title = f"{subject.name}: mean +- standard deviation"
-        sheet = of_figures(figures, own, note, title=title, digits=2)
+        sheet = tables.of_figures(figures, own, note, title=title, digits=2)
         sheets.append(replace(sheet, rows=(*rows, *sheet.rows)))
     return tuple(sheets)
 
@@ -83,8 +76,7 @@ def walk_part(path: Path) -> Part:
         "definitions": definitions(WALK_FIGURES.values()),
     }
     summary = f"{first}, {place(walks)}: {fell} of {n} walks ended in a fall."
-    fields = {"kind": "walk", "title": "Walking", "warning": fell > 0}
-    return _part(walks, content, summary=summary, **fields)
+    return _part("walk", "Walking", walks, content, summary=summary, warning=fell > 0)
 
 
 def climb_line(climb: Climb) -> Array:
@@ -141,8 +133,7 @@ def crossing_part(path: Path) -> Part:
     figure = draw.lines(panels, columns=len(crossings.cases), mark=mark, bar="95 % interval")
     content = {"curves": picture(figure), "sheet": crossing_table(crossings)}
     summary = f"{first}, {place(crossings)}: gaps crossed {crossed or 'none'}."
-    fields = {"kind": "crossing", "title": "Crossing gaps and steps"}
-    return _part(crossings, content, summary=summary, **fields)
+    return _part("crossing", "Crossing gaps and steps", crossings, content, summary=summary)
 
 
 def varied_line(variation: Results, parameter: str, policy: str, figure: str) -> Array:
@@ -167,21 +158,20 @@ def varied_line(variation: Results, parameter: str, policy: str, figure: str) ->
 
 def variation_panels(variation: Results) -> list[Panel]:
     """Return a column for each parameter, rows of height, distance and landed."""
-    found = []
-    for figure, unit in (("height", "m"), ("distance", "m"), ("landed", "1")):
-        for each in parameters_of(variation):
-            name = each.name.removesuffix("_s").replace("_", " ")
-            policies = trial_page.policies(variation)
-            panel = Panel(
-                title=name if figure == "height" else "",
-                x_label=f"{name} [{each.unit}]" if figure == "landed" else "",
-                y_label=f"{figure} [{unit}]",
-                lines={one: varied_line(variation, each.name, one, figure) for one in policies},
-                marks=(variation.settings["nominal"][each.name],),
-                share=figure == "landed",
-            )
-            found.append(panel)
-    return found
+    policies, parameters = trial_page.policies(variation), parameters_of(variation)
+    named = [(each, each.name.removesuffix("_s").replace("_", " ")) for each in parameters]
+    return [
+        Panel(
+            title=name if figure == "height" else "",
+            x_label=f"{name} [{each.unit}]" if figure == "landed" else "",
+            y_label=f"{figure} [{unit}]",
+            lines={one: varied_line(variation, each.name, one, figure) for one in policies},
+            marks=(variation.settings["nominal"][each.name],),
+            share=figure == "landed",
+        )
+        for figure, unit in (("height", "m"), ("distance", "m"), ("landed", "1"))
+        for each, name in named
+    ]
 
 
 def variation_part(path: Path) -> Part:
@@ -197,7 +187,7 @@ def variation_part(path: Path) -> Part:
         "definitions": definitions(FIGURES[name] for name in varied.VARIED_FIGURES),
     }
     summary = f"{first}, {place(variation)}: {landed} of {n} jumps on varied robots landed."
-    return _part(variation, content, kind="variation", title="Variation", summary=summary)
+    return _part("variation", "Variation", variation, content, summary=summary)
 
 
 def errors_db(bodies: Bodies) -> dict[str, float]:
@@ -215,7 +205,7 @@ def _verdict(body: Body) -> str:
     checks = trial_checks(body.trial)
     passed = sum(check.passed for check in checks)
     own = f"{body.name}: {passed} of {len(checks)} acceptance criteria passed by {first}"
-    return "; ".join([own, *(verdict(body.trial, other) for other in others)])
+    return "; ".join([own, *(tables.verdict(body.trial, other) for other in others)])
 
 
 def _gains_table(bodies: Bodies) -> Sheet:
@@ -247,4 +237,4 @@ def bodies_part(path: Path) -> Part:
         "cells": figures,
     }
     summary = f"{len(bodies.bodies)} other {place(bodies)}s: {landed} of {n} jumps landed."
-    return _part(bodies, content, kind="bodies", title="Randomized robots", summary=summary)
+    return _part("bodies", "Randomized robots", bodies, content, summary=summary)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -165,28 +165,32 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     """Return the matched gains of each joint, beside the paper's for its robot."""
     paper, joints = _comparable(gains), gains.joints.values()
     delays = any(one.delay_s > 0.0 for one in joints)
-    friction = any(np.isfinite(one.frictionloss) for one in joints)
-    falls = any(one.stribeck > 0.0 for one in joints)
     total = any(np.isfinite(one.stiffness_total95).all() for one in joints)
     searched = total and any(np.isfinite(one.grid_stiffness) for one in joints)
-    interval = "repeat 95 %;2 | total 95 %;2" if total else "95 %;2"
-    columns = f"joint | stiffness [N m/rad];2 | {interval} | damping [N m s/rad] | "
-    columns += interval.replace(";2", "")
-    columns += (
-        " | friction [N m]" * friction + " | in motion [N m]" * falls + " | delay [ms];1" * delays
-    )
-    columns += " | by magnitude alone" * searched + " | paper, Table I" * paper
-    columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
-    rows = []
-    for name, one in gains.joints.items():
-        row: list[Any] = [joint_words(name) + " (flagged)" * bool(one.flags)]
-        row += [one.stiffness, one.stiffness_ci95] + [one.stiffness_total95] * total
-        row += [one.damping, one.damping_ci95] + [one.damping_total95] * total
-        row += [one.frictionloss] * friction + [one.frictionloss * (1.0 - one.stribeck)] * falls
-        row += [1000.0 * one.delay_s] * delays
-        row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * searched
-        row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
-        rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
+    friction = any(np.isfinite(one.frictionloss) for one in joints)
+    falls = any(one.stribeck > 0.0 for one in joints)
+    names = (joint_words(k) + " (flagged)" * bool(v.flags) for k, v in gains.joints.items())
+    published = (" / ".join(map(str, TABLE_I.get(name, ("-",)))) for name in gains.joints)
+    repeats = "repeat 95 %" if total else "95 %"
+    by_grid = (f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}" for one in joints)
+    columns: list[tuple[bool, str, Iterable[Any]]] = [
+        (True, "joint", names),
+        (True, "stiffness [N m/rad];2", (one.stiffness for one in joints)),
+        (True, f"{repeats};2", (one.stiffness_ci95 for one in joints)),
+        (total, "total 95 %;2", (one.stiffness_total95 for one in joints)),
+        (True, "damping [N m s/rad]", (one.damping for one in joints)),
+        (True, repeats, (one.damping_ci95 for one in joints)),
+        (total, "total 95 %", (one.damping_total95 for one in joints)),
+        (friction, "friction [N m]", (one.frictionloss for one in joints)),
+        (falls, "in motion [N m]", (one.frictionloss * (1.0 - one.stribeck) for one in joints)),
+        (delays, "delay [ms];1", (1000.0 * one.delay_s for one in joints)),
+        (searched, "by magnitude alone", by_grid),
+        (paper, "paper, Table I", published),
+        (True, "nominal error [dB];2", (one.naive_error_db for one in joints)),
+        (True, "error [dB];2", (one.error_db for one in joints)),
+        (True, "lowest coherence", (one.coherence_min for one in joints)),
+    ]
+    shown = [(head, cells) for wanted, head, cells in columns if wanted]
     simulator = gains.simulator
     notes = [
         f"Equivalent gains of {simulator.engine} at a step of {1000.0 * simulator.timestep_s:g} ms "
@@ -206,7 +210,8 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
             "Table I was measured on the paper's robot; the virtual robot's hidden parameters were "
             "set so that a match by magnitude lands near it."
         )
-    return table(columns, rows, *notes)
+    rows = zip(*(cells for _, cells in shown), strict=True)
+    return table(" | ".join(head for head, _ in shown), rows, *notes)
 
 
 def _comparable(gains: MatchedGains) -> bool:

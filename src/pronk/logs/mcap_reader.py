@@ -1,7 +1,4 @@
-"""JointState recordings of ROS 2 (rosbag2 in MCAP) as a JointLog.
-
-A bag does not say which topic is the command, so the command topic must be named.
-"""
+"""MCAP files: logs of pronk, and JointState recordings of ROS 2 (rosbag2)."""
 
 from __future__ import annotations
 
@@ -18,7 +15,8 @@ from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import in_force, ordered
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap import Record
+from pronk.logs.mcap import Record, read_records
+from pronk.logs.mcap_log import read_sweep
 from pronk.robots.robot import RobotSpec
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -26,26 +24,35 @@ MEASURED_TOPIC = "/joint_states"
 """Where ROS 2 publishes measured joint states by convention."""
 
 
-def read_joint_states(
+def read_mcap(
     path: Path,
-    found: Sequence[Record],
-    damage: str,
     *,
-    robot: RobotSpec | None,
-    measured_topic: str,
-    command_topic: str | None,
-    command_field: str,
-    joint_order: Sequence[str] | None,
+    robot: RobotSpec | None = None,
+    measured_topic: str | None = None,
+    command_topic: str | None = None,
+    command_field: str = "position",
+    joint_order: Sequence[str] | None = None,
 ) -> JointLog:
-    """Join the measured states of one topic with the commands of another; see `read_mcap`.
+    """Read a log of pronk, or join the JointStates of a rosbag2 with the commands on another topic.
+
+    A file that was cut anywhere gives the log of what came before, with `complete` False. The
+    options are of rosbag2 alone. A bag does not say which topic is the command: `command_topic` is
+    of JointStates, or of any messages with the positions at `command_field` (dots between names,
+    numbers for indices, as in `points.0.positions`). `joint_order` names the joints of commands
+    without names, as of `columns.ordered`.
 
     Header stamps are used where both topics have them, times of reception otherwise: two clocks
-    are never mixed. The command in force at a state is the last one at or before it. `damage` says
-    why reading ended early, or is "".
-
-    Raises:
-        LogError: A topic is missing or holds something else; the message lists what there is.
+    are never mixed. The command in force at a state is the last one at or before it.
     """
+    found, damage = read_records(path)
+    if any(record.topic.startswith("/sweep/") for record in found):
+        if measured_topic or command_topic or joint_order not in (None, "default"):
+            raise LogError(
+                f"{path}: a log of pronk needs no --measured-topic, --command-topic or "
+                "--joint-order; leave them out."
+            )
+        return read_sweep(path, found, damage)
+    measured_topic = measured_topic or MEASURED_TOPIC
     topics = {r.topic: r.schema.name if r.schema else r.encoding for r in found}
     listed = ", ".join(f"{topic} ({name})" for topic, name in sorted(topics.items()))
     if topics.get(measured_topic) != JOINT_STATE:
