@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,39 +17,26 @@ LEG = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
 
 def example(n: int = 2000, joints: tuple[str, ...] = LEG) -> JointLog:
     """Joints that jump about, logged at 500 Hz with everything that a log can hold."""
-    rng = np.random.default_rng(1)
+    rng, width = np.random.default_rng(1), len(joints)
     seconds = np.arange(n) / 500.0 + rng.uniform(0.0, 1e-5, n)
     frequency = np.linspace(0.1, 25.0, n)
     frequency[: n // 10] = np.nan
-    segments = tuple(
-        Segment(
-            kind="multisine",
-            joints=joints[:1],
-            start=seconds[-1] * k / 4.0 + 0.01,
-            stop=seconds[-1] * (k + 1) / 4.0,
-            amplitude=0.25,
-            repeat=k,
-            band_hz=(0.1, 25.0),
-            period_s=10.0,
-            clamped=joints[1:2],
-        )
-        for k in range(4)
-    )
-    columns = {
-        name: rng.normal(size=(n, len(joints)))
-        for name in ("command", "position", "velocity", "torque")
-    }
+    signal: dict[str, Any] = {"kind": "multisine", "band_hz": (0.1, 25.0), "period_s": 10.0}
+    signal |= {"joints": joints[:1], "clamped": joints[1:2], "amplitude": 0.25}
+    ends = seconds[-1] * np.arange(5) / 4.0
     return JointLog(
         robot="mini_cheetah",
         joints=joints,
         time=seconds,
-        **columns,
+        **{name: rng.normal(size=(n, width)) for name in QUANTITIES},
         frequency=frequency,
-        segments=segments,
-        stiffness=np.full(len(joints), 17.0),
-        damping=np.full(len(joints), 0.4),
-        pose=np.linspace(-1.0, 1.0, len(joints)),
-        units=("rad",) * len(joints),
+        segments=tuple(
+            Segment(start=ends[k] + 0.01, stop=ends[k + 1], repeat=k, **signal) for k in range(4)
+        ),
+        stiffness=np.full(width, 17.0),
+        damping=np.full(width, 0.4),
+        pose=np.linspace(-1.0, 1.0, width),
+        units=("rad",) * width,
         virtual=True,
         metadata={"note": "a line\nbreak"},
     )
@@ -67,18 +55,15 @@ def write_npz(path: Path, log: JointLog) -> None:
 
 
 def write_mcap(path: Path, log: JointLog) -> None:
-    lists = {
-        name: values.tolist() if isinstance(values, np.ndarray) else values
-        for name, values in vars(log).items()
-    }
-    header = LogHeader(**{field.name: lists[field.name] for field in fields(LogHeader)})
-    columns = {
-        name: lists[name] for name in ("time", *QUANTITIES, "frequency") if lists[name] is not None
-    }
+    about = {field.name: getattr(log, field.name) for field in fields(LogHeader)}
+    columns = {"time": log.time}
+    for name in (*QUANTITIES, "frequency"):
+        if (values := getattr(log, name)) is not None:
+            columns[name] = values
     columns["segment"] = np.full(len(log.time), -1)
     for i, segment in enumerate(log.segments):
         columns["segment"][(log.time >= segment.start) & (log.time <= segment.stop)] = i
-    writer = McapLogWriter(path, header)
+    writer = McapLogWriter(path, LogHeader(**about))
     for segment in log.segments:
         writer.segment(segment)
     for row in zip(*columns.values(), strict=True):

@@ -15,35 +15,26 @@ from pronk import __version__
 from pronk.cli import main as cli
 from pronk.cli.demo import find_policies
 from pronk.errors import ArtefactError, PronkError
-from pronk.logs.readers import find_logs
 
-KNEE = ("--joints", "FR_knee")
+KNEE = ("mini_cheetah", "--joints", "FR_knee", "--amplitude", "0.25")
 MATCH = ("--robot", "mini_cheetah", "--method", "paper")
 
 
-def test_help_names_every_command_and_loads_no_heavy_library():
-    code = (
-        "import sys, pronk.cli.main as m; m.run(['--help']);"
-        "heavy = ('numpy', 'scipy', 'matplotlib', 'mujoco', 'jinja2', 'tyro', 'msgspec');"
-        "print([name for name in heavy if name in sys.modules])"
-    )
+COMMANDS = "[pkgutil.resolve_name(where) for where, _ in m.COMMANDS.values()]"
+
+
+@pytest.mark.parametrize(
+    ("runs", "more"), [("m.run(['--help'])", "numpy jinja2 tyro msgspec"), (COMMANDS, "")]
+)
+def test_help_and_options_are_read_without_the_libraries_that_a_command_runs_with(runs, more):
+    heavy = {*f"scipy matplotlib mujoco torch mjlab warp onnxruntime {more}".split()}
+    code = f"import pkgutil, sys, pronk.cli.main as m; {runs}; print({heavy} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    *printed, loaded = done.stdout.strip().splitlines()
-    assert loaded == "[]"
-    words = " ".join(printed).split()
-    assert set(cli.COMMANDS) <= set(words)
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_version():
     assert accepted("--version").strip() == f"pronk {__version__}"
-
-
-def test_options_of_every_command_are_read_without_the_libraries_that_it_runs_with():
-    code = (
-        "import pkgutil, sys, pronk.cli.main as m;"
-        "[pkgutil.resolve_name(where) for where, _ in m.COMMANDS.values()];"
-        "heavy = ('scipy', 'matplotlib', 'mujoco', 'torch', 'mjlab', 'warp', 'onnxruntime');"
-        "print([name for name in heavy if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
@@ -51,23 +42,7 @@ def test_every_command_has_help(command):
     printed = accepted(command, "--help")
     assert len(printed) > 200
     assert "--json" in printed or command == "robot"
-
-
-@pytest.mark.parametrize(
-    ("words", "hint"),
-    [
-        (["twin"], "pronk simulate"),
-        (["bench"], "python -m benchmarks"),
-        (["sweep", "mini_cheetah", "--out", "x", "--link", "twin"], "sim, lcm, dds"),
-        (["sweep", "mini_cheetah", "--out", "x", "--truth", "y"], "--sim-params"),
-        (["sweep", "mini_cheetah", "--out", "x", "--release"], "--disable-onboard-controller"),
-        (["match", "a.mcap", "--robot", "go2", "--free", "armature"], "--fit"),
-        (["deploy", "a.onnx", "--any-delay"], "--ignore-latency-check"),
-        (["deploy", "a.onnx", "--blend=0.1"], "--blend-time-s"),
-    ],
-)
-def test_former_names_give_a_hint(words, hint):
-    assert hint in refused(*words)
+    assert f" {command} " in accepted("--help")
 
 
 @pytest.mark.parametrize(
@@ -96,8 +71,7 @@ def test_exit_statuses(monkeypatch, raised, status):
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One knee of the virtual robot, swept by the command line."""
     out = tmp_path_factory.mktemp("sweep")
-    accepted("sweep", "mini_cheetah", "--out", out, *KNEE, "--repeats", "2", "--amplitude", "0.25",
-             "--json", out / "sweep.json")  # fmt: skip
+    accepted("sweep", *KNEE, "--out", out, "--repeats", "2", "--json", out / "sweep.json")
     return out
 
 
@@ -113,11 +87,11 @@ def test_sweep_writes_a_log_of_the_virtual_robot(swept):
     assert [Path(p).name for p in figures["logs"]] == ["FR_knee.mcap"]
     assert (swept / "FR_knee.mcap").stat().st_size > 1e5
     assert figures["plan"][0]["torque_nm"] < figures["plan"][0]["effort_limit_nm"]
-    assert "FR_knee.mcap" in refused("sweep", "mini_cheetah", "--out", swept, *KNEE)
+    assert "FR_knee.mcap" in refused("sweep", *KNEE, "--out", swept)
 
 
 def test_plan_only_writes_nothing(tmp_path):
-    printed = accepted("sweep", "mini_cheetah", "--out", tmp_path / "x", *KNEE, "--plan-only")
+    printed = accepted("sweep", *KNEE, "--out", tmp_path / "x", "--plan-only")
     assert "torque [N m]" in printed
     assert not (tmp_path / "x").exists()
 
@@ -147,16 +121,10 @@ def test_match_finds_table_one(matched):
     assert "virtual robot" in (matched / "match.html").read_text(encoding="utf-8")
 
 
-def test_files_beside_the_logs_are_no_logs(matched):
-    accepted("response", matched, "--no-plots")
-    assert (matched / "FR_knee.response.npz").exists()
-    assert [p.name for p in find_logs([matched])] == ["FR_knee.mcap"]
-
-
 def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path):
     fresh, figures = tmp_path / "fresh", tmp_path / "predict.json"
-    accepted("sweep", "mini_cheetah", "--out", fresh, *KNEE, "--repeats", "1", "--amplitude",
-             "0.25", "--signal", "log-chirp", "--seed", "5")  # fmt: skip
+    chirp = ("--signal", "log-chirp", "--repeats", "1", "--seed", "5")
+    accepted("sweep", *KNEE, "--out", fresh, *chirp)
     gains = ("--robot", "mini_cheetah", "--gains", matched / "gains.yaml")
     accepted("predict", fresh, *gains, "--json", figures)
     found = json.loads(figures.read_text())
@@ -172,9 +140,8 @@ def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path
     assert "warning" in done.stderr
 
 
-@pytest.mark.parametrize("target", ["mjlab", "mjcf", "isaaclab-dcmotor"])
-def test_export(matched, tmp_path, target):
-    accepted("export", matched / "gains.yaml", "--to", target, "--out", tmp_path / "exported")
+def test_export(matched, tmp_path):
+    accepted("export", matched / "gains.yaml", "--to", "mjcf", "--out", tmp_path / "exported")
     assert len((tmp_path / "exported").read_text()) > 200
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from log_files import example, write_mcap
 from pronk.errors import LogError
@@ -26,6 +23,7 @@ from pronk.logs.mcap_log import LogHeader, McapLogWriter
 from pronk.logs.mcap_reader import read_mcap
 from pronk.logs.readers import read_log
 
+LOG = example()
 TIMELESS = ("robot", "joints", "segments", "units", "virtual", "metadata", "complete")
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 
@@ -36,8 +34,8 @@ def assert_same(a: JointLog, b: JointLog) -> None:
 
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a.mcap", example())
-    assert_same(example(), read_mcap(tmp_path / "a.mcap"))
+    write_mcap(tmp_path / "a.mcap", LOG)
+    assert_same(LOG, read_mcap(tmp_path / "a.mcap"))
     with pytest.raises(LogError, match="leave them out"):
         read_log(tmp_path / "a.mcap", command_topic="/sweep/sample")
 
@@ -62,7 +60,7 @@ def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.Dat
 
 
 def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a.mcap", example())
+    write_mcap(tmp_path / "a.mcap", LOG)
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -81,17 +79,16 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
     assert order.index((mcap_log.SEGMENT, None)) < order.index((mcap_log.SAMPLE, 0))
 
 
-Whole = tuple[JointLog, bytes, Path]
-
-
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
-    folder, log = tmp_path_factory.mktemp("cut"), example()
-    write_mcap(folder / "whole.mcap", log)
-    return log, (folder / "whole.mcap").read_bytes(), folder
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cut") / "whole.mcap"
+    write_mcap(path, LOG)
+    return path
 
 
-def read_or_one_sentence(path: Path) -> JointLog | None:
+def read_or_one_sentence(path: Path, data: bytes) -> JointLog | None:
+    """The log of a file with these bytes, if it can be read."""
+    path.write_bytes(data)
     try:
         return read_log(path)
     except LogError as error:
@@ -103,11 +100,9 @@ def read_or_one_sentence(path: Path) -> JointLog | None:
 
 @settings(max_examples=150, deadline=None)
 @given(share=st.floats(0.0, 1.0, exclude_max=True))
-def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Whole, share: float) -> None:
-    log, data, folder = whole
-    path = folder / "cut.mcap"
-    path.write_bytes(data[: int(share * len(data))])
-    short = read_or_one_sentence(path)
+def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Path, share: float) -> None:
+    data, log = whole.read_bytes(), LOG
+    short = read_or_one_sentence(whole.with_name("cut.mcap"), data[: int(share * len(data))])
     if short is None:
         # Only what lies before the second sample may be lost altogether.
         assert share < 0.25
@@ -125,17 +120,14 @@ def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Whole, shar
 
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
-def test_a_damaged_file_never_gives_wrong_numbers(whole: Whole, data: st.DataObject) -> None:
-    log, good, folder = whole
-    bad = bytearray(good)
+def test_a_damaged_file_never_gives_wrong_numbers(whole: Path, data: st.DataObject) -> None:
+    bad = bytearray(whole.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         bad[data.draw(st.integers(0, len(bad) - 1))] ^= data.draw(st.integers(1, 255))
-    path = folder / "bad.mcap"
-    path.write_bytes(bytes(bad))
-    if (found := read_or_one_sentence(path)) is not None:
+    if (found := read_or_one_sentence(whole.with_name("bad.mcap"), bytes(bad))) is not None:
         count = len(found.time)
-        np.testing.assert_array_equal(found.time, log.time[:count])
-        np.testing.assert_array_equal(found.command, log.command[:count])
+        np.testing.assert_array_equal(found.time, LOG.time[:count])
+        np.testing.assert_array_equal(found.command, LOG.command[:count])
 
 
 KILLED = """
@@ -153,14 +145,12 @@ time.sleep(60.0)
 
 
 def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    code = KILLED.format(path=str(path))
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    log = read_mcap(path)
+    command = [sys.executable, "-c", KILLED.format(path=str(tmp_path / "a.mcap"))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+    log = read_mcap(tmp_path / "a.mcap")
     assert not log.complete
     assert len(log.time) == 768  # Whole chunks of 256 samples.
     assert log.segments[0].kind == "chirp"
@@ -178,15 +168,9 @@ def test_the_reason_of_an_early_end_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
-    path = tmp_path / "bomb.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema("x", "jsonschema", b"{}")
-        writer.add_message(writer.register_channel("/x", "json", schema), 0, b"x" * 1000, 0)
-        writer.finish()
+    path, size = tmp_path / "bomb.mcap", 300 * 2**20
+    McapLogWriter(path, LogHeader(robot="r", joints=("a",))).end()
     data = path.read_bytes()
-    size = 300 * 2**20
     bomb = zstandard.compress(bytes(size))
 
     def number(value: int, width: int = 8) -> bytes:

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -17,49 +17,36 @@ from pronk.errors import ArtefactError
 from pronk.evaluation import results, tables
 from pronk.evaluation.jumps import JumpFigures
 from pronk.match import gains as gains_file
-from pronk.report import build, match_page, trial_page
+from pronk.report import build, match_page
 from report_cases import CASES, match, walks, write_match, write_tree, write_trial
 
 NASTY = "<img src=x onerror=alert(1)>"
 
 
-class Checker(HTMLParser):
-    """Tags that are open, anchors, links, images and text of a page."""
-
-    VOID = frozenset({"meta", "link", "img", "br"})
+class Checker:
+    """Anchors, pictures and text of a page that is whole and needs no network."""
 
     def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.pictures: list[dict[str, str]] = []
-        self.text = ""
-        self.feed(html)
-        self.close()
-        assert self.open == []
+        opened: list[str] = []
+        for end, tag in re.findall(r"<(/?)(\w+)", html):
+            if end:
+                assert opened.pop() == tag
+            elif tag not in ("meta", "link", "img", "br"):
+                opened.append(tag)
+        assert opened == []
+        self.ids = re.findall(r' id="([^"]*)"', html)
         assert len(self.ids) == len(set(self.ids))
-        assert {link.removeprefix("#") for link in self.links} <= set(self.ids)
+        links = re.findall(r' href="#([^"]*)"', html)
+        assert set(links) <= set(self.ids)
+        # Each address is an anchor or holds what it is of.
+        addresses = re.findall(r' (?:src|href)="([^"]*)"', html)
+        assert all(one.startswith(("data:", "#")) for one in addresses)
         for word in ("<script", "@import", "http://", "https://", "<iframe", "<object", "url("):
             assert word not in html
-        assert "nan" not in re.sub(r"[A-Za-z]+nan|nan[a-z]+", "", self.text).lower()
-        self.text = re.sub(r"\s+", " ", self.text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        fields = {name: value or "" for name, value in attrs}
-        self.open += [tag] * (tag not in self.VOID)
-        self.ids += [fields["id"]] if "id" in fields else []
-        self.links += [fields["href"]] if tag == "a" else []
-        self.pictures += [fields] if tag == "img" else []
-        for name in {"src", "href"} & set(fields):
-            assert fields[name].startswith(("data:", "#")), fields[name]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open, f"</{tag}> closes nothing"
-        assert self.open.pop() == tag, f"</{tag}> closes another tag"
-
-    def handle_data(self, data: str) -> None:
-        self.text += f" {data}"
+        self.pictures: list[tuple[str, str]] = re.findall(r'<img src="([^"]*)" alt="([^"]*)"', html)
+        text = unescape(re.sub(r"(?s)<style>.*?</style>|<[^>]*>", " ", html))
+        assert "nan" not in re.sub(r"[A-Za-z]+nan|nan[a-z]+", "", text).lower()
+        self.text = re.sub(r"\s+", " ", text)
 
 
 def report(folder: Path) -> Checker:
@@ -90,8 +77,8 @@ def test_the_page_of_everything(tree: Path, html: str) -> None:
     assert "match-matched-gains" in page.ids
     assert len(html.encode()) < 8e6
     assert len(page.pictures) > 12
-    assert all(len(one["alt"]) > 20 for one in page.pictures)
-    kinds = {one["src"].split(";")[0] for one in page.pictures}
+    assert all(len(alt) > 20 for _, alt in page.pictures)
+    kinds = {address.split(";")[0] for address, _ in page.pictures}
     assert kinds == {"data:image/svg+xml", "data:image/png", "data:image/gif"}
 
 
@@ -113,19 +100,17 @@ def test_numbers_of_the_virtual_robot_are_called_so(html: str, tmp_path: Path) -
     assert "virtual robot" not in real.text
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_outcomes_of_the_parts(html: str) -> None:
+    text = Checker(html).text
+    for words in (
         *("matched, virtual robot", "paper, matched", "hardware", "a simulated machine"),
         "matched, virtual robot: 0 of 2 walks ended in a fall.",
         "matched, virtual robot: gaps crossed 0.20 m (forward 2).",
         "a foot was in the gap (5)",
         "12 of 12 jumps on varied robots landed",
         "2 other virtual robots: 24 of 24 jumps landed",
-    ],
-)
-def test_outcomes_of_the_parts(html: str, words: str) -> None:
-    assert words in Checker(html).text
+    ):
+        assert words in text
 
 
 def test_the_page_of_a_match(tmp_path: Path) -> None:
@@ -184,10 +169,9 @@ def test_one_policy_that_never_jumps_without_captures_or_match(tmp_path: Path) -
 def test_missing_captures_are_counted(tmp_path: Path) -> None:
     trial = write_trial(tmp_path, ("matched",), CASES[:1], keep=True)
     (tmp_path / trial.rows[1].capture).unlink()
-    found = trial_page.traces(trial, tmp_path)
-    assert found is not None
-    assert (found[1], len(found[0]["height"]["matched"]["forward 1"])) == (1, 2)
-    assert "2 of 3 jumps" in report(tmp_path).text
+    text = report(tmp_path).text
+    assert "2 of 3 jumps, those with a capture" in text
+    assert "1 captures are missing" in text
 
 
 @pytest.mark.parametrize(
@@ -215,14 +199,10 @@ def test_damage_is_one_sentence_and_no_page(
 
 
 def test_missing_artefacts_are_named(tmp_path: Path) -> None:
-    for write, folder, named in (
-        (build.write_report, tmp_path, "nothing to report"),
-        (build.write_report, tmp_path / "nowhere", "no such folder"),
-        (match_page.write_page, tmp_path / "nowhere", "no such folder"),
-        (match_page.write_page, tmp_path, r"gains\.yaml"),
-    ):
-        with pytest.raises(ArtefactError, match=named):
-            write(folder)
+    with pytest.raises(ArtefactError, match="no such folder"):
+        match_page.write_page(tmp_path / "nowhere")
+    with pytest.raises(ArtefactError, match=r"gains\.yaml"):
+        match_page.write_page(tmp_path)
     gains_file.save(tmp_path / "gains.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match=r"match\.npz"):
         match_page.write_page(tmp_path)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from command_line import invoke
+from command_line import accepted
 from pronk.errors import LogError
 from pronk.report import build, deploy_page, deploy_run
 from pronk.report.deploy_page import part
@@ -32,14 +32,12 @@ TICK_S = 0.002
 
 def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
     """A tick in which all goes well; the joints do not move."""
-    one = np.zeros((), dtype=TICK)
+    one, begun = np.zeros((), dtype=TICK), number * TICK_S
     measured = {n: changes.pop(n) for n in ("torque", "orientation", "temperature") if n in changes}
-    put_state(one, still(time=number * TICK_S, sequence=number, **measured))
-    one["tick"], one["deadline"] = number, number * TICK_S
-    one["begun"], one["done"] = number * TICK_S + 1e-4, number * TICK_S + 4e-4
-    one["mode"], one["latency"] = Mode.POLICY, np.nan
-    one["desired"] = one["sent"] = target
-    for name, value in changes.items():
+    put_state(one, still(time=begun, sequence=number, **measured))
+    usual = {"tick": number, "deadline": begun, "begun": begun + 1e-4, "done": begun + 4e-4}
+    usual |= {"mode": Mode.POLICY, "latency": np.nan, "desired": target, "sent": target}
+    for name, value in (usual | changes).items():
         one[name] = value
     return np.frombuffer(one.tobytes(), dtype=TICK)[0]
 
@@ -74,15 +72,8 @@ def faulted(path: Path, *, end: bool = True) -> Path:
     say(writer, 0.0, "robot", REAL)
     moved = POSE + np.eye(12)[5] * 0.25
     limited = {"level": FilterAction.LIMIT, "reason": Reason.POSITION, "sent": POSE}
-    damped = {
-        "sent": np.nan,
-        "desired": np.nan,
-        "damped": 1,
-        "level": FilterAction.LATCH,
-        "reason": Reason.TILT,
-        "mode": Mode.FAULT,
-        "orientation": rolled(1.0),
-    }
+    damped = {"sent": np.nan, "desired": np.nan, "damped": 1, "mode": Mode.FAULT}
+    damped |= {"level": FilterAction.LATCH, "reason": Reason.TILT, "orientation": rolled(1.0)}
     for k in range(100):
         writer.write(record(k, POSE + 0.01, mode=Mode.STAND))
     for k in range(100, 200):
@@ -124,8 +115,7 @@ def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> N
     path = flown(tmp_path / "run.mcap", torque=np.full(12, np.nan))
     found = delay(read_deploy_log(path), ROBOT)
     assert np.isnan(found.drives).all()
-    assert found.longest == pytest.approx(0.003)
-    assert found.within is True
+    assert (found.longest, found.within) == (pytest.approx(0.003), True)
 
 
 def test_measures_of_a_fault(tmp_path: Path) -> None:
@@ -157,11 +147,11 @@ def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
 
 
 def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) -> None:
-    cold = read_deploy_log(flown(tmp_path / "cold.mcap", count=5))
-    hot = read_deploy_log(flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0))
-    panels = [len(deploy_page.overview(log).axes) for log in (cold, hot)]
+    cold = flown(tmp_path / "cold.mcap", count=5)
+    hot = flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0)
+    panels = [len(deploy_page.overview(read_deploy_log(path)).axes) for path in (cold, hot)]
     assert panels[1] == panels[0] + 1
-    np.testing.assert_array_equal(hot.temperature[4], np.arange(12.0) + 30.0)
+    np.testing.assert_array_equal(read_deploy_log(hot).temperature[4], np.arange(12.0) + 30.0)
 
 
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
@@ -187,9 +177,7 @@ def test_the_page_of_a_refusal(tmp_path: Path) -> None:
 
 
 def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
-    faulted(tmp_path / "a.mcap")
-    one = invoke(["report", str(tmp_path / "a.mcap"), "--json", str(tmp_path / "a.json")])
-    assert one.exit_code == 0, one.output
+    accepted("report", faulted(tmp_path / "a.mcap"))
     written = (tmp_path / "a.html").read_text()
     assert "virtual robot</span>" not in written
     assert "at 0.40 s" in written
@@ -197,8 +185,10 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     flown(tmp_path / "deep" / "b.mcap")
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
     _, found = build.write_report(tmp_path)
-    assert [one.source for one in found] == ["a.mcap", "deep/b.mcap"]
-    assert [one.virtual for one in found] == [False, True]
+    assert [(one.source, one.virtual) for one in found] == [
+        ("a.mcap", False),
+        ("deep/b.mcap", True),
+    ]
     assert found[1].figures["delay"]["within"] is True
     with pytest.raises(LogError, match="not a log of a deployment"):
         build.write_report(tmp_path / "other.mcap")

@@ -34,14 +34,6 @@ def result():
     return match()
 
 
-@pytest.fixture(scope="module")
-def captured(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("trial")
-    traces, missing = trial_page.traces(write_trial(folder, keep=True), folder)
-    assert missing == 0
-    return traces
-
-
 def curve(axes, colour):
     return next(line for line in axes.lines if line.get_color() == colour)
 
@@ -135,8 +127,9 @@ def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
     assert paper["matched"]["forward 2"] == (0.969, 0.026)
 
 
-def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
-    assert set(captured["roll"]["naive"]) == {CASES[2].name}
+def test_rates_are_of_the_acceleration_at_the_papers_speed(tmp_path) -> None:
+    captured, missing = trial_page.traces(write_trial(tmp_path, keep=True), tmp_path)
+    assert (missing, set(captured["roll"]["naive"])) == (0, {CASES[2].name})
     runs = captured["roll"]["naive"][CASES[2].name]
     time, rate = runs[0]
     assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
