@@ -51,12 +51,10 @@ def second_order(omega, stiffness, damping, inertia, viscous=0.01):
     return stiffness / (inertia * s**2 + (damping + viscous) * s + stiffness)
 
 
-def gap_db(measured, simulated):
-    return 20.0 * np.log10(np.abs(measured) / np.abs(simulated))
-
-
 def error_db(measured, simulated, band):
-    return float(np.sqrt(np.mean(gap_db(measured, simulated)[band] ** 2)))
+    """Return the RMS over a band of the difference of two gains [dB]."""
+    gap = 20.0 * np.log10(np.abs(measured) / np.abs(simulated))
+    return np.sqrt(np.mean(gap[..., band] ** 2, axis=-1))
 
 
 def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
@@ -67,29 +65,31 @@ def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
     omega = 2.0 * np.pi * np.arange(0.25, 22.6, 0.25)
     matched = second_order(omega, stiffness, damping, inertia)
     naive = second_order(omega, *NOMINAL_GAINS, inertia)
-    responses = []
     known: dict[str, Any] = {"joint": f"{LEGS[leg]}_{name}", "omega": omega, "virtual": virtual}
     known |= {"estimator": "H1", "window": "hann 4 s, 75 % overlap", "segment_s": 4.0}
     known |= {"coherence": 1.0 - 0.3 * (omega / omega[-1]) ** 3, "delay_s": 0.002}
     known |= {"averages": np.full(omega.size, 12.0), "third_harmonic": 0.02}
+    responses = []
     for amplitude in (0.25, 0.125):
         noise = 0.01 * (rng.normal(size=(3, omega.size)) + 1j * rng.normal(size=(3, omega.size)))
         repeats = matched * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
-        mean = repeats.mean(axis=0)
-        one = FrequencyResponse(amplitude=amplitude, response=mean, repeats=repeats, **known)
-        responses.append(one)
-    first = responses[0]
-    band = first.band(*band_hz)
+        found = {"amplitude": amplitude, "response": repeats.mean(axis=0), "repeats": repeats}
+        responses.append(FrequencyResponse(**found, **known))
+    first, band = responses[0].response, responses[0].band(*band_hz)
     k, d = np.linspace(13, 27, 21), np.linspace(0.1, 0.7, 21)
     grid = second_order(omega, k[:, None, None], d[None, :, None], inertia)
-    surface = np.mean(gap_db(first.response, grid)[..., band] ** 2, axis=-1)
-    is_knee = name == "knee"
+    flags = ["zero armature: no match, the best node misses by 2.9 dB RMS, 30 times the match"]
+    extra: dict[str, Any] = {"zero_armature": None, "zero_armature_error_db": float("nan")}
+    if name == "knee":
+        flags.insert(0, "3 of 60 frequencies left out for low coherence")
+        bare = second_order(omega, 27.0, 0.62, 0.0012)
+        extra = {"zero_armature": bare, "zero_armature_error_db": 2.9}
     return JointFit(
-        joint=first.joint,
+        joint=known["joint"],
         responses=tuple(responses),
         grid_stiffness=k,
         grid_damping=d,
-        grid_error=surface,
+        grid_error=error_db(first, grid, band) ** 2,
         stiffness=stiffness,
         damping=damping,
         ci95={
@@ -102,17 +102,13 @@ def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
         naive=naive,
         coherence_min=0.91,
         armature=0.0026,
-        error_db=error_db(first.response, matched, band),
-        naive_error_db=error_db(first.response, naive, band),
-        zero_armature_error_db=2.9 if is_knee else float("nan"),
-        zero_armature=second_order(omega, 27.0, 0.62, 0.0012) if is_knee else None,
+        error_db=float(error_db(first, matched, band)),
+        naive_error_db=float(error_db(first, naive, band)),
         amplitude_gains=np.array(
             [[0.25, stiffness, damping], [0.125, stiffness * 0.98, damping * 1.03]]
         ),
-        flags=(
-            *(("3 of 60 frequencies left out for low coherence",) if is_knee else ()),
-            "zero armature: no match, the best node misses by 2.9 dB RMS, 30 times the match",
-        ),
+        flags=tuple(flags),
+        **extra,
     )
 
 

@@ -156,11 +156,7 @@ def test_random_bytes(tmp_path: Path, suffix: str, data: bytes) -> None:
     reads_or_refuses(path, **OPTIONS[suffix])
 
 
-cell = st.one_of(
-    st.floats().map(repr),
-    st.integers(-5, 5).map(str),
-    st.text("0123456789.,;eE-+nai\"'\t", max_size=8),
-)
+cell = st.one_of(st.floats().map(repr), st.text("0123456789.,;eE-+nai\"'\t", max_size=8))
 
 
 @quick
@@ -174,9 +170,7 @@ def test_random_csv(tmp_path: Path, rows: list[str], header: str) -> None:
 
 @quick
 @given(
-    cells=st.lists(
-        st.one_of(st.just(""), st.text("[]0123456789.,eE-\"'x() ", max_size=30)), max_size=4
-    ),
+    cells=st.lists(st.text("[]0123456789.,eE-\"'x() ", max_size=30), max_size=4),
     stamp=st.one_of(st.floats(), st.text(max_size=5)),
 )
 @example(cells=["__import__('os').getcwd()"], stamp=0.0)
@@ -317,21 +311,21 @@ def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], na
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({}, "unit"),
+        ({"unit": None}, "unit"),
         ({"unit": "grad"}, "rad, deg"),
-        ({"unit": "rad", "time_unit": "h"}, "s, ms, us, ns"),
-        ({"unit": "rad", "columns": {"time": "t"}}, "'t'"),
-        ({"unit": "rad", "columns": {"speed.FR_knee": "x"}}, "speed.FR_knee"),
-        ({"unit": "rad", "rate_hz": 100.0}, r"50\.00 Hz"),
-        ({"unit": "rad", "joint_order": ["a", "b"]}, "by the file"),
-        ({"unit": "rad", "command_topic": "/x"}, "command_topic"),
+        ({"time_unit": "h"}, "s, ms, us, ns"),
+        ({"columns": {"time": "t"}}, "'t'"),
+        ({"columns": {"speed.FR_knee": "x"}}, "speed.FR_knee"),
+        ({"rate_hz": 100.0}, r"50\.00 Hz"),
+        ({"joint_order": ["a", "b"]}, "by the file"),
+        ({"command_topic": "/x"}, "command_topic"),
         ({"units": "rad"}, "units"),
         ({"format": "hdf5"}, "mcap, csv, sage, pace, npz"),
     ],
 )
 def test_wrong_options_are_named(tmp_path: Path, options: dict[str, Any], named: str) -> None:
     with pytest.raises(LogError, match=named):
-        read_log(csv(tmp_path / "a.csv", *GOOD), **options)
+        read_log(csv(tmp_path / "a.csv", *GOOD), **{"unit": "rad"} | options)
 
 
 def test_files_that_are_not_there(tmp_path: Path) -> None:

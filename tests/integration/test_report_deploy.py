@@ -138,14 +138,6 @@ def test_measures_of_a_fault(tmp_path: Path) -> None:
     assert (content["moved"], content["given"], list(content["damped"])) == (100, 200, [True] * 100)
 
 
-def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
-    writer = DeployLogWriter(tmp_path / "run.mcap", HEADER)
-    for k in (0, 1, 2, 5, 6, 10):
-        writer.write(record(k, POSE))
-    writer.end(complete=True, figures={})
-    assert deploy_run.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
-
-
 def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) -> None:
     cold = flown(tmp_path / "cold.mcap", count=5)
     hot = flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0)
@@ -163,17 +155,18 @@ def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
     assert "The log was cut" in build.page("cut", [made])
 
 
-def test_the_page_of_a_refusal(tmp_path: Path) -> None:
+def test_the_page_of_a_refusal_with_missed_ticks(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     writer = DeployLogWriter(path, HEADER | {"robot": "unheard_of"})
     nothing = {"desired": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
-    for k in range(3):
+    for k in (0, 1, 2, 5, 6, 10):
         writer.write(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
     made = part(path)
     assert made.summary.endswith("the battery gives 12.0 V; charge it.")
     assert made.figures["delay"]["within"] is None
+    assert made.figures["missed_ticks"] == 5
 
 
 def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:

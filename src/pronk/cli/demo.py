@@ -194,8 +194,7 @@ def show_match(
 ) -> dict[str, tuple[float, float]]:
     """Print matched gains beside the paper's Table I, and the errors with both sets of gains.
 
-    Returns:
-        Distance of each joint's stiffness and damping from Table I, in cells of the grid.
+    Return the distance of each joint's stiffness and damping from Table I, in cells of the grid.
     """
     from pronk.report.paper import TABLE_I
 

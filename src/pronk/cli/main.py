@@ -84,12 +84,10 @@ def run(
     except Exception as error:
         if os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
-        status, text = (
-            1,
-            (
-                f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
-                "PRONK_DEBUG=1 shows where it happened."
-            ),
+        status = 1
+        text = (
+            f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
+            "PRONK_DEBUG=1 shows where it happened."
         )
     print(f"pronk: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
     return status
@@ -99,12 +97,10 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
         width = max(map(len, commands))
-        lines = [f"  {name:{width}}  {text}" for name, (_, text) in commands.items()]
-        print(  # noqa: T201
-            f"usage: {program} [--version] COMMAND ...\n\ncommands:\n"
-            + "\n".join(lines)
-            + f"\n\n`{program} COMMAND --help` lists the options of a command."
-        )
+        lines = [f"usage: {program} [--version] COMMAND ...", "", "commands:"]
+        lines += [f"  {name:{width}}  {text}" for name, (_, text) in commands.items()]
+        lines += ["", f"`{program} COMMAND --help` lists the options of a command."]
+        print("\n".join(lines))  # noqa: T201
         return 0
     if name == "--version":
         print(f"pronk {__version__}")  # noqa: T201
@@ -143,10 +139,8 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> d
     for name, kind in kinds.items():
         if kind == bool | None:  # tyro wants a value there: --x True.
             option = name.replace("_", "-")
-            values = {f"--{option}": "True", f"--no-{option}": "False"}
-            arguments = [
-                f"--{option}={values[word]}" if word in values else word for word in arguments
-            ]
+            words = {f"--{option}": f"--{option}=True", f"--no-{option}": f"--{option}=False"}
+            arguments = [words.get(word, word) for word in arguments]
     config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
     messages = io.StringIO()
     try:
