@@ -158,10 +158,9 @@ def _sentence(box: str, arguments: list[str], program: str) -> str:
     for old, hint in RENAMED.items():
         if old.startswith("-") and re.search(rf"(?:^| ){re.escape(old)}(?:[ =]|$)", words):
             return hint
-    lines = [re.sub(r"[│╭╮╰╯─]", " ", line).strip() for line in box.splitlines()]
-    text = " ".join(line for line in lines if line)
-    text = text.split("For full helptext")[0].strip().rstrip(".")
-    title = r"^(Parsing error|Required options|Unrecognized options|Value error)\s+"
+    text = " ".join(re.sub(r"[│╭╮╰╯─]|-{3,}", " ", box).split())
+    text = text.split("For full helptext")[0].rstrip(". ")
+    title = r"^(Parsing error|Required options|Unrecognized options|Value error|Invalid choice) "
     return f"{re.sub(title, '', text)}; `{program} --help` lists the options."
 
 

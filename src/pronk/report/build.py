@@ -50,8 +50,7 @@ def write_report(
     """Write the page of everything in `root`; return its path and its parts.
 
     `root` is a folder, which gets `report.html`, or the log of one deployment, which gets a page of
-    its name beside it. What is missing or damaged is an ArtefactError or LogError. `progress` is
-    called with the stage and the share of it that is done, 0 to 1.
+    its name beside it. What is missing or damaged is an ArtefactError or LogError.
     """
     if not root.exists():
         raise ArtefactError(

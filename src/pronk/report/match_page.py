@@ -104,10 +104,7 @@ def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
 
 
 def part(path: Path, gains: str | None = None) -> Part:
-    """Make the part of the match in `path`, a `match.npz`, with a gains file beside it.
-
-    `gains` is the name of that file, found if None.
-    """
+    """Make the part of a `match.npz` and the gains file beside it, of this name or found."""
     gains_path = path.parent / gains if gains else find_gains(path.parent)
     result = result_file.load(path, gains_file.load(gains_path))
     own, found, drives = result.gains, verdict(result), drives_table(result)
