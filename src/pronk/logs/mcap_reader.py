@@ -53,20 +53,7 @@ def read_mcap(
             )
         return read_sweep(path, found, damage)
     measured_topic = measured_topic or MEASURED_TOPIC
-    topics = {r.topic: r.schema.name if r.schema else r.encoding for r in found}
-    listed = ", ".join(f"{topic} ({name})" for topic, name in sorted(topics.items()))
-    if topics.get(measured_topic) != JOINT_STATE:
-        raise LogError(
-            f"{path}: no {JOINT_STATE} on {measured_topic}; it holds {listed}; name the topic "
-            "with --measured-topic."
-        )
-    if command_topic is None:
-        raise LogError(
-            f"{path}: --command-topic is missing; the file holds {listed}; name the topic of the "
-            "commands (and --command-field where the positions are not in `position`)."
-        )
-    if command_topic not in topics or command_topic == measured_topic:
-        raise LogError(f"{path}: no commands on {command_topic}; it holds {listed}.")
+    command_topic = _checked(path, found, measured_topic, command_topic)
     states, received = _decoded(path, found, measured_topic)
     commands, arrived = _decoded(path, found, command_topic)
     stamps = [np.array([_stamp(message) for message in each]) for each in (states, commands)]
@@ -123,6 +110,27 @@ def read_mcap(
         notes=tuple(note for note, applies in notes.items() if applies),
         metadata={"measured_topic": measured_topic, "command_topic": command_topic},
     )
+
+
+def _checked(
+    path: Path, found: Sequence[Record], measured_topic: str, command_topic: str | None
+) -> str:
+    """Return the topic of the commands; where one of both is wrong, a LogError lists all topics."""
+    topics = {r.topic: r.schema.name if r.schema else r.encoding for r in found}
+    listed = ", ".join(f"{topic} ({name})" for topic, name in sorted(topics.items()))
+    if topics.get(measured_topic) != JOINT_STATE:
+        raise LogError(
+            f"{path}: no {JOINT_STATE} on {measured_topic}; it holds {listed}; name the topic "
+            "with --measured-topic."
+        )
+    if command_topic is None:
+        raise LogError(
+            f"{path}: --command-topic is missing; the file holds {listed}; name the topic of the "
+            "commands (and --command-field where the positions are not in `position`)."
+        )
+    if command_topic not in topics or command_topic == measured_topic:
+        raise LogError(f"{path}: no commands on {command_topic}; it holds {listed}.")
+    return command_topic
 
 
 def _decoded(path: Path, found: Sequence[Record], topic: str) -> tuple[list[Any], Array]:
