@@ -30,13 +30,17 @@ KEYS = ("time", "dof_pos", "des_dof_pos")
 _Storage = Callable[[np.dtype[Any], str, int], NDArray[Any]]
 """Numbers of a storage: their type, its key, how many."""
 _STORAGES = {
-    f"{name}Storage": np.dtype(code)
-    for name, code in (
-        *(("Double", "<f8"), ("Float", "<f4"), ("Half", "<f2"), ("Long", "<i8"), ("Int", "<i4")),
-        *(("Short", "<i2"), ("Char", "i1"), ("Byte", "u1"), ("Bool", "?")),
-    )
+    "DoubleStorage": "<f8",
+    "FloatStorage": "<f4",
+    "HalfStorage": "<f2",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ShortStorage": "<i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
+    "BoolStorage": "?",
 }
-"""By the name of a torch storage class, which a dtype replaces: not callable, so it cannot run."""
+"""Storage classes of torch; a dtype stands for each, which a pickle cannot call."""
 _OPCODES = (
     *("PROTO", "FRAME", "STOP", "MARK", "GLOBAL", "STACK_GLOBAL", "REDUCE", "BINPERSID"),
     *("BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET", "LONG_BINGET"),
@@ -80,7 +84,7 @@ class _Unpickler(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Replace the three names that torch.save writes; refuse every other."""
         if module == "torch" and name in _STORAGES:
-            return _STORAGES[name]
+            return np.dtype(_STORAGES[name])
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
             return _rebuild_tensor
         if (module, name) == ("collections", "OrderedDict"):
