@@ -438,7 +438,8 @@ from pronk.logs.readers import reader
 def read_turns(path, *, robot=None, joint="knee", sign: float = 1.0):
     """Time; command; position: the angles of one joint in turns."""
     try:
-        time, command, position = np.loadtxt(path, delimiter=";").T
+        rows = [list(map(float, line.split(";"))) for line in path.read_text().splitlines()]
+        time, command, position = np.array(rows).T
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: no log in turns ({error}).") from None
     scale = 2.0 * np.pi * sign
