@@ -315,7 +315,9 @@ class _Match:
             self.ready()
             with self.clock.stage("fit"):
                 self.joints, self.excluded = fit_together(
-                    *(logs, self.robot, self.fitted),
+                    logs,
+                    self.robot,
+                    self.fitted,
                     threads=settings.threads,
                     progress=self.clock.report,
                 )
@@ -355,7 +357,10 @@ class _Match:
             flags, unchecked = wrong.get(name, ((), ()))
             joints[name] = replace(fit, flags=(*fit.flags, *flags), unchecked=unchecked)
         return _result(
-            *(self.robot, joints, logs, self.info),
+            self.robot,
+            joints,
+            logs,
+            self.info,
             seconds=self.clock.seconds,
             grid_steps_per_second=self.rate,
             excluded=self.excluded,
