@@ -181,7 +181,6 @@ class Target:
     """Class of the configuration."""
     delay: tuple[str, ...] = ()
     """Arguments that take a delay in physics steps."""
-
     no_delay: str = "delay the actions in the environment"
     """What to do about a delay that the target cannot express."""
     stribeck: bool = False
