@@ -27,9 +27,9 @@ from benchmarks.runner import finish
 from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import LogError
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
-from pronk.match.torque import (
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match.torque import (
     BLOCK_S,
     FIT_HZ,
     SIGN_RAD_S,

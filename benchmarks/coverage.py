@@ -18,16 +18,16 @@ from benchmarks.runner import Progress, finish
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
-from pronk.match.measured_joint import measured_joints
-from pronk.match.parameters import GAINS
-from pronk.match.response_fit import refine
-from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import gain_interval
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.measured_joint import measured_joints
+from pronk.identify.match.parameters import GAINS
+from pronk.identify.match.response_fit import refine
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.uncertainty import gain_interval
+from pronk.identify.response.estimate import operators
+from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
-from pronk.response.estimate import operators
 from pronk.robots import load_robot
-from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")

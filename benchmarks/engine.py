@@ -14,14 +14,14 @@ import numpy as np
 from benchmarks.runner import finish
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
-from pronk.excitation.signals import Chirp
-from pronk.match.grid import axes, quick_search
-from pronk.match.measured_joint import DB, measured_joints
-from pronk.match.settings import MatchSettings
-from pronk.match.simulated import SimRequest, responses
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.grid import axes, quick_search
+from pronk.identify.match.measured_joint import DB, measured_joints
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.simulated import SimRequest, responses
+from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")

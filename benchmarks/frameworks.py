@@ -25,28 +25,34 @@ from benchmarks.runner import machine
 from pronk.arrays import Array, ComplexArray
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.evaluation.tables import table
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.readers import read_logs
-from pronk.match.gains import MatchedGains
-from pronk.match.measured_joint import DB, MeasuredJoint, logs_by_joint, measured_joints, merged
-from pronk.match.pipeline import match_frameworks
-from pronk.match.predict import drives_of
-from pronk.match.settings import MatchSettings
-from pronk.match.simulated import SimRequest, responses
-from pronk.robots import load_robot
-from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import (
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.readers import read_logs
+from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.measured_joint import (
+    DB,
+    MeasuredJoint,
+    logs_by_joint,
+    measured_joints,
+    merged,
+)
+from pronk.identify.match.pipeline import match_frameworks
+from pronk.identify.match.predict import drives_of
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.simulated import SimRequest, responses
+from pronk.identify.simulators.chain import (
     ChainSimulation,
     StribeckChain,
     branches,
     moves_together,
     published,
 )
-from pronk.simulators.load import joint_rigs, load_simulator
-from pronk.simulators.mujoco import Drives
-from pronk.simulators.profiles import profile
-from pronk.simulators.simulator import Closing, Simulator
+from pronk.identify.simulators.load import joint_rigs, load_simulator
+from pronk.identify.simulators.mujoco import Drives
+from pronk.identify.simulators.profiles import profile
+from pronk.identify.simulators.simulator import Closing, Simulator
+from pronk.jump.trial.tables import table
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
 
 ENGINES = {
     "mjlab": "mujoco",
@@ -116,7 +122,7 @@ class EngineChain(Closing):
         self.joints, self.robot, self.simulator = robot.joint(joint).chain, robot, simulator
 
     def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
-        """See `pronk.simulators.mujoco.Chain.rollout`; delays are in the command."""
+        """See `pronk.identify.simulators.mujoco.Chain.rollout`; delays are in the command."""
         names = self.simulator.joints
         columns = [names.index(name) for name in self.joints]
         full = np.empty((len(sets), command.shape[1] + 1, len(names)))

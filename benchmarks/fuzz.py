@@ -35,36 +35,36 @@ from typing import Any, get_args
 import numpy as np
 from mcap.writer import Writer
 
-import pronk.match.gains as gains_file
+import pronk.identify.match.gains as gains_file
 from pronk.cli import console
 from pronk.cli.export import Target
 from pronk.cli.main import run
+from pronk.deploy.runtime.ipc import STEP, TICK, Mode
+from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
 from pronk.errors import PronkError
-from pronk.evaluation import bodies, results
-from pronk.evaluation.crossing import CROSSING
-from pronk.evaluation.training_sim.results import SCHEMA as EVALUATION
-from pronk.evaluation.training_sim.results import load_speed_errors
-from pronk.evaluation.variation import VARIATION
-from pronk.evaluation.walk import WALK
 from pronk.files import write_text
-from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap import records
-from pronk.logs.readers import read_log
-from pronk.match import result as match_file
-from pronk.match.export import export_text
-from pronk.match.predict import load_prediction
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.mcap import records
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match import result as match_file
+from pronk.identify.match.export import export_text
+from pronk.identify.match.predict import load_prediction
+from pronk.identify.response import response as response_file
+from pronk.jump.trial import bodies, results
+from pronk.jump.trial.crossing import CROSSING
+from pronk.jump.trial.training_sim.results import SCHEMA as EVALUATION
+from pronk.jump.trial.training_sim.results import load_speed_errors
+from pronk.jump.trial.variation import VARIATION
+from pronk.jump.trial.walk import WALK
+from pronk.jump.virtual import capture
+from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params
 from pronk.policy.contract import from_json, to_json
 from pronk.policy.runtime import load_policy
 from pronk.processes import die_with_parent
 from pronk.report import deploy_run
-from pronk.response import response as response_file
 from pronk.robots import load_robot
 from pronk.robots.bare import yaml_of_model
 from pronk.robots.load import read_model, read_robot
-from pronk.runtime.ipc import STEP, TICK, Mode
-from pronk.runtime.log import DeployLogWriter, read_deploy_log
-from pronk.virtual import capture
-from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 _TORCH = importlib.util.find_spec("torch") is not None
 ROOT = Path(__file__).parents[1]

@@ -21,14 +21,14 @@ import numpy as np
 from benchmarks.runner import Progress, finish
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
-from pronk.excitation.signals import Chirp
-from pronk.match.grid import GridSearch, alike, axes, quick_search, search
-from pronk.match.measured_joint import MeasuredJoint, measured_joints
-from pronk.match.response_fit import refine
-from pronk.match.settings import MatchSettings
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.grid import GridSearch, alike, axes, quick_search, search
+from pronk.identify.match.measured_joint import MeasuredJoint, measured_joints
+from pronk.identify.match.response_fit import refine
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.simulators.mujoco import JointTestRig, MujocoSimulator
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
-from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
 Gains = tuple[float, float]
 """Stiffness [N m/rad] and damping [N m s/rad]."""

@@ -28,19 +28,19 @@ import numpy as np
 
 from benchmarks import sensor_faults
 from pronk.cli import console
+from pronk.deploy.links.address import Address
+from pronk.deploy.links.lcm.codec import CHEETAH, decode_command
+from pronk.deploy.links.lcm.link import url_of
+from pronk.deploy.runtime.log import is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.run import Deployment
 from pronk.errors import PronkError
-from pronk.evaluation import results
 from pronk.files import read_yaml
-from pronk.links.address import Address
-from pronk.links.lcm.codec import CHEETAH, decode_command
-from pronk.links.lcm.link import url_of
-from pronk.logs.readers import read_log
-from pronk.match import gains as gains_file
-from pronk.match import result as match_file
-from pronk.runtime.log import is_deploy_log, read_deploy_log
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.run import Deployment
-from pronk.virtual import capture
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match import gains as gains_file
+from pronk.identify.match import result as match_file
+from pronk.jump.trial import results
+from pronk.jump.virtual import capture
 
 Program = Literal["sweep", "sweep-lcm", "match", "trial", "deploy"]
 PROGRAMS: tuple[Program, ...] = ("sweep", "sweep-lcm", "match", "trial", "deploy")

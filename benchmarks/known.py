@@ -27,10 +27,10 @@ from benchmarks.runner import Progress, finish, machine
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import JointLog
-from pronk.match.pipeline import match_logs
-from pronk.match.settings import MatchSettings
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 

@@ -6,7 +6,7 @@ ONNX Runtime within), in three ways:
 
 - back to back, a thousand times;
 - at ticks 20 ms apart, woken by an absolute deadline;
-- the same after the warm-up of `pronk deploy` (`warm_up_until` in `pronk.runtime.policy_process`).
+- the same after the warm-up of `pronk deploy` (`warm_up_until` in `pronk.deploy.runtime.policy_process`).
 
 Ticks of both kinds alternate in one loop. Quantiles are the upper edges of the bins of
 `Histogram`, 4.7 % wide.
@@ -27,14 +27,14 @@ import tyro
 
 from benchmarks.runner import Progress, finish
 from pronk.cli import console
+from pronk.deploy.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
+from pronk.deploy.runtime.policy_process import WARM_UP, standing, warm_up_until
 from pronk.errors import PronkError
-from pronk.evaluation.criteria import Check
-from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
+from pronk.jump.trial.criteria import Check
+from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
-from pronk.runtime.policy_process import WARM_UP, standing, warm_up_until
-from pronk.runtime.rollout import measurement
-from pronk.runtime.script import STILL
+from pronk.policy.script import STILL
+from pronk.robots.machine import State
 
 RATE_HZ = 50.0
 PRIORITY = 50

@@ -45,16 +45,16 @@ from benchmarks.time_fit import (
 )
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
-from pronk.match.pipeline import match_logs
-from pronk.match.predict import drives_of
-from pronk.match.settings import MatchSettings
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.predict import drives_of
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.simulators.chain import ChainSimulation
+from pronk.identify.simulators.load import joint_rigs
+from pronk.identify.simulators.mujoco import Drives
+from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots import load_robot
-from pronk.simulators.chain import ChainSimulation
-from pronk.simulators.load import joint_rigs
-from pronk.simulators.mujoco import Drives
-from pronk.simulators.simulator import JointRigs
 
 Kind = Literal["hip_roll", "hip_pitch", "knee"]
 JOINTS: tuple[Kind, ...] = ("hip_roll", "hip_pitch", "knee")

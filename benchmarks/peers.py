@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog
 from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import RobotSpec
 

@@ -1,8 +1,8 @@
 """`python -m benchmarks probe`: name the laws, parameters and faults of random simulators, blind.
 
 A simulator is drawn with its law, step, armature, friction, delay and hold, and half of them with a
-fault. It is an integrator of its own in NumPy, MuJoCo, or an engine of `pronk.simulators.engines`
-that is installed. `pronk.simulators.probe` sees the `Simulator` only.
+fault. It is an integrator of its own in NumPy, MuJoCo, or an engine of `pronk.identify.simulators.engines`
+that is installed. `pronk.identify.simulators.probe` sees the `Simulator` only.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.runner import finish, in_parallel
-from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.identify.simulators.engines.drake import Drake
+from pronk.identify.simulators.engines.engine import EngineSimulator, delayed
+from pronk.identify.simulators.engines.links import links_of
+from pronk.identify.simulators.engines.pybullet import PyBullet
+from pronk.identify.simulators.engines.sapien import Sapien
+from pronk.identify.simulators.mujoco import Chain
+from pronk.identify.simulators.probe import Probe
+from pronk.identify.simulators.probe import probe as look
+from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.robots import load_robot
+from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.engines.drake import Drake
-from pronk.simulators.engines.engine import EngineSimulator, delayed
-from pronk.simulators.engines.links import links_of
-from pronk.simulators.engines.pybullet import PyBullet
-from pronk.simulators.engines.sapien import Sapien
-from pronk.simulators.mujoco import Chain
-from pronk.simulators.probe import Probe
-from pronk.simulators.probe import probe as look
-from pronk.simulators.simulator import SimulatorInfo
 
 ROBOTS = (
     (str(Path(__file__).parents[1] / "examples" / "pendulum"), "swing"),
@@ -105,7 +105,7 @@ class Drawn:
         return out
 
     def _numpy(self, command: Array, kp: Array, kd: Array, armature: Array) -> Array:
-        """The laws of `pronk.actuator.law` for one joint with Coulomb friction, shape (B, T)."""
+        """The laws of `pronk.robots.drive_law` for one joint with Coulomb friction, shape (B, T)."""
         truth, drive = self.truth, self.truth.robot.joint(self.truth.joint).drive
         links = links_of(truth.robot, truth.joint)
         arm = np.cross(links.axis[0], links.centre[0])

@@ -19,13 +19,13 @@ from benchmarks.frameworks import SETTINGS
 from benchmarks.runner import Progress, machine
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.evaluation.tables import table
-from pronk.logs.readers import read_logs
-from pronk.match.pipeline import match_frameworks
-from pronk.match.result import MatchResult
-from pronk.match.settings import MatchSettings
+from pronk.identify.logs.readers import read_logs
+from pronk.identify.match.pipeline import match_frameworks
+from pronk.identify.match.result import MatchResult
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.simulators.profiles import profiles as known_profiles
+from pronk.jump.trial.tables import table
 from pronk.robots import load_robot
-from pronk.simulators.profiles import profiles as known_profiles
 
 
 def compared(

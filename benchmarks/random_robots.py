@@ -18,15 +18,15 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.cli.sweep import AMPLITUDES
-from pronk.excitation.plan import Excitation, SweepPlan, make_plan
-from pronk.excitation.signals import Chirp, Multisine, Signal
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
+from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.identify.excitation.plan import Excitation, SweepPlan, make_plan
+from pronk.identify.excitation.signals import Chirp, Multisine, Signal
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.jump.virtual.plant import legs_of
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import JointParams, SimParams, load_sim_params
 from pronk.robots import load_robot
-from pronk.runtime.sweep import SweepTask, record
-from pronk.virtual.plant import legs_of
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import JointParams, SimParams, load_sim_params
 
 ROBOT = "mini_cheetah"
 FRICTION = (0.0, 3.0)

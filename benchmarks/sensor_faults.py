@@ -37,21 +37,21 @@ from benchmarks.linear_policy import stiff_go2, write_swaying
 from benchmarks.runner import Progress, Row, finish, rows_in, rows_of
 from pronk.cli import console
 from pronk.cli.simulate import _PRIORITY, _SERVERS
+from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
+from pronk.deploy.bench.server import RobotServer
+from pronk.deploy.links.address import Address
+from pronk.deploy.links.realtime import Wanted, enter
+from pronk.deploy.runtime.ipc import Event, Mode, OperatorRequest
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.run import Deployment
+from pronk.deploy.runtime.state_machine import Timing
+from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import HardwareError
-from pronk.links.address import Address
-from pronk.links.realtime import Wanted, enter
+from pronk.jump.virtual.robot import VirtualRobot, hold_of
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Velocity
 from pronk.processes import die_with_parent
 from pronk.robots import load_robot
-from pronk.runtime.ipc import Event, Mode, OperatorRequest
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.run import Deployment
-from pronk.runtime.script import STILL, Velocity
-from pronk.runtime.state_machine import Timing
-from pronk.runtime.teleop import OperatorCommand
-from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED
-from pronk.virtual.robot import VirtualRobot, hold_of
-from pronk.virtual.server import RobotServer
-from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = "mini_cheetah"
 PROCESSES = {

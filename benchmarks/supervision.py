@@ -27,19 +27,19 @@ import tyro
 from benchmarks.runner import Row, finish, rows_in, rows_of
 from pronk.arrays import Array
 from pronk.cli import console
+from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from pronk.deploy.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
+from pronk.deploy.runtime.safety import Decision, Limits, Reason, SafetyFilter
+from pronk.deploy.runtime.state_machine import StateMachine, Timing
 from pronk.errors import HardwareError
-from pronk.links.machine import State
+from pronk.jump.virtual.ground import Start
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import SimParams, load_sim_params
+from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
+from pronk.policy.script import STILL, Velocity
 from pronk.robots import load_robot
-from pronk.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
-from pronk.runtime.rollout import measurement
-from pronk.runtime.safety import Decision, Limits, Reason, SafetyFilter
-from pronk.runtime.script import STILL, Velocity
-from pronk.runtime.state_machine import StateMachine, Timing
-from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled
-from pronk.virtual.ground import Start
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SimParams, load_sim_params
+from pronk.robots.machine import State
 
 SERVO_HZ = 500
 STEP_TICKS = 10

@@ -12,11 +12,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from pronk.arrays import Array
-from pronk.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.simulators.command_trace import CommandTrace
+from pronk.identify.simulators.mujoco import MujocoSimulator
+from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.command_trace import CommandTrace
-from pronk.simulators.mujoco import MujocoSimulator
-from pronk.simulators.simulator import JointRigs
 
 
 @dataclass(frozen=True, kw_only=True)

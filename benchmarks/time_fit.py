@@ -17,15 +17,15 @@ from scipy.optimize import least_squares
 
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.arrays import Array
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.match.arm import ArmProblem, trusted
-from pronk.match.fit import solve
-from pronk.match.parameters import PARAMETERS
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.match.arm import ArmProblem, trusted
+from pronk.identify.match.fit import solve
+from pronk.identify.match.parameters import PARAMETERS
+from pronk.identify.simulators.chain import ChainSimulation, published
+from pronk.identify.simulators.command_trace import CommandTrace, command_trace
+from pronk.identify.simulators.mujoco import Drives
+from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, published
-from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.mujoco import Drives
-from pronk.simulators.simulator import JointRigs
 
 FREE = ("stiffness", "damping", "delay")
 MAX_DELAY_S = 0.04

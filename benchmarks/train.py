@@ -118,7 +118,7 @@ def _build(task: str, envs: int, device: str, seed: int, folder: str) -> tuple[A
     from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, load_runner_cls
     from mjlab.utils.torch import configure_torch_backends
 
-    import pronk.train.tasks  # noqa: F401 - registers pronk's
+    import pronk.jump.train.tasks  # noqa: F401 - registers pronk's
 
     if task not in list_tasks():
         raise PronkError(f"mjlab knows no task {task!r}; it knows {', '.join(list_tasks())}.")

@@ -22,23 +22,23 @@ import tyro
 from mjlab.envs import ManagerBasedRlEnv
 
 from benchmarks.runner import machine
-from pronk.actuator.law import DriveLaw
 from pronk.cli import console
-from pronk.evaluation.tables import table
-from pronk.evaluation.training_sim import adapter
-from pronk.evaluation.training_sim.evaluation import JUMPS, WALKS, Evaluation, Plan
-from pronk.evaluation.training_sim.run import evaluate_policy
-from pronk.match.gains import MatchedGains
-from pronk.match.translate import stated_gains, translate
+from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.translate import stated_gains, translate
+from pronk.identify.simulators.profiles import Profile, profile
+from pronk.jump.train.devices import find_devices
+from pronk.jump.train.gains import TrainingGains, training_gains
+from pronk.jump.train.mdp import actions
+from pronk.jump.train.mdp.actuators import PositionDrive, PositionDriveCfg
+from pronk.jump.train.phases import TASKS
+from pronk.jump.train.tasks import load_task
+from pronk.jump.train.tasks.jump_env_cfg import DELAY_STEPS
+from pronk.jump.trial.tables import table
+from pronk.jump.trial.training_sim import adapter
+from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Evaluation, Plan
+from pronk.jump.trial.training_sim.run import evaluate_policy
+from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.profiles import Profile, profile
-from pronk.train.devices import find_devices
-from pronk.train.gains import TrainingGains, training_gains
-from pronk.train.mdp import actions
-from pronk.train.mdp.actuators import PositionDrive, PositionDriveCfg
-from pronk.train.phases import TASKS
-from pronk.train.tasks import load_task
-from pronk.train.tasks.jump_env_cfg import DELAY_STEPS
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -23,10 +23,10 @@ from benchmarks.runner import Progress, finish, in_turn, machine, paired_ratio, 
 from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.evaluation.protocol import PAPER_COMMANDS
-from pronk.evaluation.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
+from pronk.jump.trial.protocol import PAPER_COMMANDS
+from pronk.jump.trial.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
+from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
-from pronk.virtual.sim_params import SimParams, load_sim_params
 
 LIMIT = 0.6
 """Least speed over that of the bare loop."""

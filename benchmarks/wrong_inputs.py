@@ -28,20 +28,20 @@ from scipy import signal
 from benchmarks.runner import Progress, finish, in_parallel
 from pronk.arrays import Array
 from pronk.cli import console
+from pronk.deploy.runtime.sweep import SweepTask, record
 from pronk.errors import PronkError
-from pronk.excitation.plan import make_plan
-from pronk.logs.checks import check_radians
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_logs
-from pronk.match.pipeline import match_logs
-from pronk.match.plausibility import CAUSES, findings, require_plausible
-from pronk.match.settings import MatchSettings
+from pronk.identify.excitation.plan import make_plan
+from pronk.identify.logs.checks import check_radians
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_logs
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.plausibility import CAUSES, findings, require_plausible
+from pronk.identify.match.settings import MatchSettings
+from pronk.jump.virtual.plant import leg_of
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.sweep import SweepTask, record
-from pronk.virtual.plant import leg_of
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SimParams, load_sim_params
 
 ROBOT = "mini_cheetah"
 FRICTION = {"random": 0, "wrong": 1, "right": 2}

@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.identify.simulators.simulator import PARAMETERS, SimulatorInfo
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.simulator import PARAMETERS, SimulatorInfo
 
 Array = NDArray[np.float64]
 

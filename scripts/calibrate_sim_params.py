@@ -18,16 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pronk.excitation.plan import make_plan
+from pronk.deploy.runtime.sweep import SweepTask, record
 from pronk.files import write_text
-from pronk.logs.mcap_reader import read_mcap
-from pronk.match.pipeline import match_logs
-from pronk.match.settings import MatchSettings
-from pronk.report.paper import TABLE_I
-from pronk.robots import load_robot
-from pronk.runtime.sweep import SweepTask, record
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import (
+from pronk.identify.excitation.plan import make_plan
+from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.settings import MatchSettings
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import (
     SCHEMA,
     SHIPPED,
     JointParams,
@@ -35,6 +33,8 @@ from pronk.virtual.sim_params import (
     load_sim_params,
     parse_sim_params,
 )
+from pronk.report.paper import TABLE_I
+from pronk.robots import load_robot
 
 LEGS = ("FR", "FL", "HR", "HL")
 # Spacing of the paper's grid: 13 to 27 and 0.1 to 0.7 in 50 points (F7).

@@ -13,10 +13,10 @@ from pathlib import Path
 import yaml
 
 import pronk
-from pronk.logs.readers import readers
-from pronk.match.translate import stated_gains, translate
+from pronk.identify.logs.readers import readers
+from pronk.identify.match.translate import stated_gains, translate
+from pronk.identify.simulators.profiles import profile, profiles
 from pronk.robots import ROBOT_NAMES, load_robot
-from pronk.simulators.profiles import profile, profiles
 
 ROBOTS = Path(pronk.__file__).parent / "robots"
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pronk.links.machine import State
-from pronk.virtual.faults import flip_bit
+from pronk.deploy.bench.faults import flip_bit
+from pronk.robots.machine import State
 
 
 def some_state(**changes: Any) -> State:

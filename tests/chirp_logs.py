@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
-from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import JointLog
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.joint_log import JointLog
 from pronk.robots.robot import RobotSpec
 
 

@@ -10,12 +10,12 @@ import sys
 from pathlib import Path
 
 from deploy_runs import PATIENT, QUICK
-from pronk.links.address import Address
-from pronk.runtime.ipc import Event
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.run import run
-from pronk.runtime.script import Script
-from pronk.runtime.teleop import ScriptedOperator
+from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.ipc import Event
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.run import run
+from pronk.deploy.runtime.teleop import ScriptedOperator
+from pronk.policy.script import Script
 
 
 def tell(notice: Event) -> None:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.plan import Link
 from pronk.errors import HardwareError
-from pronk.links.address import Address
-from pronk.links.machine import Command, State
-from pronk.runtime.plan import Link
+from pronk.robots.machine import Command, State
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pronk.links.link import Freshness
-from pronk.runtime.ipc import Mode, OperatorRequest
-from pronk.runtime.run import Deployment
-from pronk.runtime.state_machine import Timing
-from pronk.runtime.teleop import OperatorCommand
+from pronk.deploy.links.link import Freshness
+from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.run import Deployment
+from pronk.deploy.runtime.state_machine import Timing
+from pronk.deploy.runtime.teleop import OperatorCommand
 
 QUICK = Timing(
     damp_s=0.05, fold_s=0.3, check_s=0.0, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3

@@ -11,8 +11,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from pronk.train.rl.networks import EstimatorActorCfg, JumpCriticCfg
-from pronk.train.rl.ppo import EstimatorPPO, EstimatorPpoCfg
+from pronk.jump.train.rl.networks import EstimatorActorCfg, JumpCriticCfg
+from pronk.jump.train.rl.ppo import EstimatorPPO, EstimatorPpoCfg
 
 ROBOTS = 32
 STEPS = 4

@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pronk.evaluation import bodies, results, variation, walk
-from pronk.evaluation.bodies import Bodies, Body
-from pronk.evaluation.crossing import CROSSING, CrossingFigures
-from pronk.evaluation.jumps import JumpFigures, JumpRules, measure
-from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.evaluation.results import Kind, Results, Row, Subject
-from pronk.evaluation.variation import NOMINAL, VARIATION
-from pronk.evaluation.walk import WALK, WalkFigures, walk_script
-from pronk.match import gains as gains_file
-from pronk.match import result as match_file
-from pronk.match.gains import GroupGains, MatchedGains
-from pronk.match.predict import JointPrediction, Prediction, save_prediction
-from pronk.match.result import JointFit, MatchResult
-from pronk.response.response import FrequencyResponse
+from pronk.identify.match import gains as gains_file
+from pronk.identify.match import result as match_file
+from pronk.identify.match.gains import GroupGains, MatchedGains
+from pronk.identify.match.predict import JointPrediction, Prediction, save_prediction
+from pronk.identify.match.result import JointFit, MatchResult
+from pronk.identify.response.response import FrequencyResponse
+from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.jump.trial import bodies, results, variation, walk
+from pronk.jump.trial.bodies import Bodies, Body
+from pronk.jump.trial.crossing import CROSSING, CrossingFigures
+from pronk.jump.trial.jumps import JumpFigures, JumpRules, measure
+from pronk.jump.trial.protocol import PAPER_COMMANDS, RATES, Case
+from pronk.jump.trial.results import Kind, Results, Row, Subject
+from pronk.jump.trial.variation import NOMINAL, VARIATION
+from pronk.jump.trial.walk import WALK, WalkFigures, walk_script
+from pronk.jump.virtual import capture as captures
+from pronk.jump.virtual.capture import Capture
 from pronk.robots import load_robot
-from pronk.simulators.simulator import SimulatorInfo
-from pronk.virtual import capture as captures
-from pronk.virtual.capture import Capture
 from seen_jump import SCRIPT, STANDING, G, seen_jump
 
 LEGS = ("FR", "FL", "HR", "HL")
@@ -201,7 +201,7 @@ def write_trial(
     *,
     keep: bool = False,
 ) -> Results:
-    """Write a trial measured by `pronk.evaluation.jumps` on closed-form jumps, and read it."""
+    """Write a trial measured by `pronk.jump.trial.jumps` on closed-form jumps, and read it."""
     rules, rows = JumpRules(standing_height=STANDING), []
     for name in policies:
         for case in cases:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from pronk.jump.virtual.capture import Capture
+from pronk.policy.script import Script
 from pronk.robots.legged import legged
-from pronk.runtime.script import Script
-from pronk.virtual.capture import Capture
 
 BODY = legged("mini_cheetah")
 

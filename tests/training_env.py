@@ -14,14 +14,14 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from torch import Tensor
 
-from pronk.match.gains import GroupGains
+from pronk.identify.match.gains import GroupGains
+from pronk.jump.train.gains import TrainingGains, training_gains
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.observations import RANDOMIZED, randomized_parameters
+from pronk.jump.train.phases import PHASES, STEPS_PER_ITERATION
+from pronk.jump.train.tasks import load_task
+from pronk.jump.train.tasks.jump_env_cfg import without_randomization
 from pronk.robots import load_robot
-from pronk.train.gains import TrainingGains, training_gains
-from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.observations import RANDOMIZED, randomized_parameters
-from pronk.train.phases import PHASES, STEPS_PER_ITERATION
-from pronk.train.tasks import load_task
-from pronk.train.tasks.jump_env_cfg import without_randomization
 
 N = 8
 """Robots of the nominal environment."""

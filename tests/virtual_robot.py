@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from pronk.links.machine import State
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import AttitudeParams, SimParams, load_sim_params
 from pronk.robots import load_robot
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import AttitudeParams, SimParams, load_sim_params
+from pronk.robots.machine import State
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])

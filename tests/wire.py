@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pronk.links.machine import Command
+from pronk.jump.virtual.robot import hold_of
 from pronk.robots import load_robot
-from pronk.virtual.robot import hold_of
+from pronk.robots.machine import Command
 
 ROBOT = load_robot("mini_cheetah")
 OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
@@ -77,8 +77,8 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
-    from pronk.links.lcm.link import url_of
+    from pronk.deploy.links.lcm.codec import CHEETAH, decode_command, encode_command
+    from pronk.deploy.links.lcm.link import url_of
 
     sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []
@@ -101,9 +101,9 @@ def over_lcm(port: int) -> Wire:
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.links.dds import codec as idl
-    from pronk.links.dds.codec import decode_command, encode_command, joint_map
-    from pronk.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
+    from pronk.deploy.links.dds import codec as idl
+    from pronk.deploy.links.dds.codec import decode_command, encode_command, joint_map
+    from pronk.deploy.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     sender = own.writer(COMMANDS, idl.LowCmd)

@@ -8,16 +8,17 @@
     result = pronk.match([log], robot)
     replay = pronk.predict(pronk.read_log("fresh.mcap", robot=robot), robot, result.gains)
 
-Names are imported when they are first used. `pronk.response` and `pronk.match` are packages that
-can be called.
+Each name is imported from the module that defines it when it is first used.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pronk.logs.readers import read_log, read_logs
-    from pronk.match.predict import predict
+    from pronk.identify.logs.readers import read_log, read_logs
+    from pronk.identify.match.pipeline import match_logs as match
+    from pronk.identify.match.predict import predict
+    from pronk.identify.response.estimate import estimate as response
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
 
@@ -25,19 +26,20 @@ __version__ = "0.1.0"
 __all__ = ["load_policy", "load_robot", "match", "predict", "read_log", "read_logs", "response"]
 
 _HOMES = {
-    "load_policy": "pronk.policy.runtime",
-    "load_robot": "pronk.robots",
-    "match": "",
-    "predict": "pronk.match.predict",
-    "read_log": "pronk.logs.readers",
-    "read_logs": "pronk.logs.readers",
-    "response": "",
+    "load_policy": ("pronk.policy.runtime", "load_policy"),
+    "load_robot": ("pronk.robots", "load_robot"),
+    "match": ("pronk.identify.match.pipeline", "match_logs"),
+    "predict": ("pronk.identify.match.predict", "predict"),
+    "read_log": ("pronk.identify.logs.readers", "read_log"),
+    "read_logs": ("pronk.identify.logs.readers", "read_logs"),
+    "response": ("pronk.identify.response.estimate", "estimate"),
 }
+"""Module and name of each public function."""
 
 
 def __getattr__(name: str) -> Any:
     """Import a name of `__all__` from the module that defines it."""
     if name not in _HOMES:
         raise AttributeError(f"module 'pronk' has no attribute {name!r}")
-    home = _HOMES[name]
-    return getattr(import_module(home), name) if home else import_module(f"pronk.{name}")
+    module, attribute = _HOMES[name]
+    return getattr(import_module(module), attribute)

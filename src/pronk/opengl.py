@@ -1,7 +1,7 @@
 """OpenGL for rendering, kept out of processes that do not render.
 
 MuJoCo loads the OpenGL that MUJOCO_GL names as it is imported, and cannot be imported where that is
-missing. Only the rendering process needs one (`pronk.evaluation.pictures.render`).
+missing. Only the rendering process needs one (`pronk.jump.trial.films.render`).
 """
 
 from __future__ import annotations

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from pronk.deploy.links.link import Codec, Transport
 from pronk.errors import HardwareError, LogError, PronkError
-from pronk.links.link import Codec, Transport
-from pronk.links.machine import Command, RefusedError, damping_command
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import Reader
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import Reader
+from pronk.identify.simulators.simulator import PARAMETERS, Simulator
+from pronk.robots.machine import Command, RefusedError, damping_command
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.simulator import PARAMETERS, Simulator
 
 
 def check_simulator(simulator: Simulator) -> None:

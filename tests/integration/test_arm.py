@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.readers import read_log
-from pronk.match import gains as gains_file
-from pronk.match import match_logs
-from pronk.match.arm import fit_together, trusted_frequency, trusted_samples
-from pronk.match.parameters import DRIVE_MODE
-from pronk.match.predict import drives_of, predict
-from pronk.match.result import MatchResult
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match import gains as gains_file
+from pronk.identify.match import match_logs
+from pronk.identify.match.arm import fit_together, trusted_frequency, trusted_samples
+from pronk.identify.match.parameters import DRIVE_MODE
+from pronk.identify.match.predict import drives_of, predict
+from pronk.identify.match.result import MatchResult
+from pronk.identify.simulators.chain import ChainSimulation, moves_together
 from pronk.robots import load_robot
-from pronk.simulators.chain import ChainSimulation, moves_together
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")

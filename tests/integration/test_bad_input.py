@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from command_line import refused
 from pronk.errors import LogError, PronkError
-from pronk.logs.readers import read_log, read_logs
+from pronk.identify.logs.readers import read_log, read_logs
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -37,13 +37,13 @@ from chirp_logs import chirp_log
 from hopper import ROBOT as HOPPER
 from hopper import write_hopper
 from pronk.errors import LogError, PronkError
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
-from pronk.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.simulators.load import joint_rigs
+from pronk.jump.trial.protocol import Case
+from pronk.jump.trial.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
-from pronk.runtime.script import STILL, Script
-from pronk.simulators.load import joint_rigs
-from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
 QUIET = known.Scenario(name="quiet", words="no noise", noise_rad=0.0)
@@ -253,7 +253,7 @@ def test_a_small_training_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
     import mjlab.tasks  # noqa: F401 - registers mjlab's own
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, register_mjlab_task
 
-    from pronk.train.rl.runner import PronkRunner
+    from pronk.jump.train.rl.runner import PronkRunner
 
     name, task = "Pronk-Bench-Small", "Pronk-Jump-MiniCheetah"
     learning, env_cfg = load_rl_cfg(task), load_env_cfg(task)

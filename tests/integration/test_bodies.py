@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation import bodies, results, variation, walk
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Results
-from pronk.evaluation.trial import Plan, Setup
-from pronk.evaluation.variation import NOMINAL, Parameter, add_variation
-from pronk.excitation.signals import Chirp
-from pronk.match.pipeline import match_logs
-from pronk.match.settings import MatchSettings
-from pronk.response.response import Estimator
-from pronk.runtime.script import STILL, Script
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_sim_params
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.response.response import Estimator
+from pronk.jump.trial import bodies, results, variation, walk
+from pronk.jump.trial.protocol import Case
+from pronk.jump.trial.results import Results
+from pronk.jump.trial.trial import Plan, Setup
+from pronk.jump.trial.variation import NOMINAL, Parameter, add_variation
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Script
 
 SIM_PARAMS = load_sim_params()
 QUICK = MatchSettings(method="paper", estimator=Estimator(segment_s=4.0), zero_armature=False)

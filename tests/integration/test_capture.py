@@ -13,11 +13,11 @@ import pytest
 
 from pronk.errors import ArtefactError, HardwareError
 from pronk.files import save_arrays
-from pronk.links.machine import Command
-from pronk.virtual.capture import SCHEMA, Capture, load, save
-from pronk.virtual.ground import Ground, Start
-from pronk.virtual.plant import Plant, legs_of
-from pronk.virtual.robot import VirtualRobot
+from pronk.jump.virtual.capture import SCHEMA, Capture, load, save
+from pronk.jump.virtual.ground import Ground, Start
+from pronk.jump.virtual.plant import Plant, legs_of
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.robots.machine import Command
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains
 
 KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]

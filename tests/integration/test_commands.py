@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 import training_env
-from pronk.train.mdp.commands import MotionCommand, motion_command
-from pronk.train.mdp.speed_ranges import STEPS
+from pronk.jump.train.mdp.commands import MotionCommand, motion_command
+from pronk.jump.train.mdp.speed_ranges import STEPS
 from training_env import N
 
 pytestmark = pytest.mark.train

@@ -8,15 +8,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
 from pronk.errors import PronkError
+from pronk.identify.simulators.command_trace import CommandTrace
+from pronk.identify.simulators.linear import plant
+from pronk.identify.simulators.mujoco import Chain, JointTestRig
 from pronk.robots import load_robot
+from pronk.robots.drive_law import DriveLaw
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.command_trace import CommandTrace
-from pronk.simulators.linear import plant
-from pronk.simulators.mujoco import Chain, JointTestRig
 
 LAWS = [
     DriveLaw(),
@@ -36,7 +36,7 @@ def on_law(name: str, law: DriveLaw) -> RobotSpec:
 
 
 def integrated(robot: RobotSpec, joint: str, command: Array, start: Array) -> Array:
-    """The equations of `pronk.actuator.law` with the mass matrix of a chain, step by step."""
+    """The equations of `pronk.robots.drive_law` with the mass matrix of a chain, step by step."""
     law, model = robot.law, bench_spec(robot, joint).compile()
     data, h = mujoco.MjData(model), law.substep(robot.timestep_s)
     joints = [robot.joint(model.joint(i).name) for i in range(model.nv)]

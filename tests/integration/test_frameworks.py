@@ -10,14 +10,14 @@ import pytest
 from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import ArtefactError, PronkError
-from pronk.logs.joint_log import JointLog
-from pronk.match.gains import load, save
-from pronk.match.pipeline import match_frameworks
-from pronk.match.predict import predict
-from pronk.match.settings import MatchSettings
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.gains import load, save
+from pronk.identify.match.pipeline import match_frameworks
+from pronk.identify.match.predict import predict
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.simulators.profiles import profile, profile_of, profiles
+from pronk.jump.train.gains import training_gains
 from pronk.robots import load_robot
-from pronk.simulators.profiles import profile, profile_of, profiles
-from pronk.train.gains import training_gains
 
 ROBOT = load_robot("mini_cheetah")
 GAINS = 21.8, 0.541

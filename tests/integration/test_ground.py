@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
-from pronk.links.machine import Command, State
+from pronk.jump.virtual.ground import Box, Ground, Start
+from pronk.jump.virtual.physics import Physics, Transport
+from pronk.jump.virtual.plant import Plant, legs_of
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sensors import about_z, moving_force, of_vector, product, turned_back
+from pronk.jump.virtual.sim_params import AttitudeParams, SimParams, TrunkParams, load_sim_params
 from pronk.robots import load_robot
-from pronk.virtual.ground import Box, Ground, Start
-from pronk.virtual.physics import Physics, Transport
-from pronk.virtual.plant import Plant, legs_of
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sensors import about_z, moving_force, of_vector, product, turned_back
-from pronk.virtual.sim_params import AttitudeParams, SimParams, TrunkParams, load_sim_params
+from pronk.robots.machine import Command, State
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet, with_joints
 
 ARM = load_robot("so101")

@@ -17,11 +17,11 @@ from mcap.reader import make_reader
 
 from log_files import example, write_mcap
 from pronk.errors import LogError
-from pronk.logs import mcap_log
-from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_log import LogHeader, McapLogWriter
-from pronk.logs.mcap_reader import read_mcap
-from pronk.logs.readers import read_log
+from pronk.identify.logs import mcap_log
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
+from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.identify.logs.readers import read_log
 
 LOG = example()
 TIMELESS = ("robot", "joints", "segments", "units", "virtual", "metadata", "complete")
@@ -133,8 +133,8 @@ def test_a_damaged_file_never_gives_wrong_numbers(whole: Path, data: st.DataObje
 KILLED = """
 import time
 from pathlib import Path
-from pronk.logs.joint_log import Segment
-from pronk.logs.mcap_log import LogHeader, McapLogWriter
+from pronk.identify.logs.joint_log import Segment
+from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 writer = McapLogWriter(Path({path!r}), LogHeader(robot="mini_cheetah", joints=("knee",)))
 writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))
 for k in range(1, 1000):

@@ -18,10 +18,10 @@ from torch import Tensor
 import training_env
 from parts import where
 from pronk.arrays import Array
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.policy.observation import ACTOR_INDICES, MEASURED
 from pronk.robots.legged import legged
-from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
 from training_env import MANY, ROBOT, N
 
 pytestmark = pytest.mark.train

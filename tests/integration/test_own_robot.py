@@ -8,7 +8,7 @@ import pytest
 
 import pronk.robots
 from command_line import accepted, refused
-from pronk.match.gains import load
+from pronk.identify.match.gains import load
 from pronk.robots import load_robot
 
 PENDULUM = """

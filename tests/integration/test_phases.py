@@ -12,9 +12,9 @@ import torch
 
 import training_env
 from pronk.errors import PronkError
-from pronk.train.mdp.commands import motion_command
-from pronk.train.phases import PHASES, TASKS, curriculum, phase_at
-from pronk.train.tasks.reward_weights import reward_weights
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.phases import PHASES, TASKS, curriculum, phase_at
+from pronk.jump.train.tasks.reward_weights import reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train

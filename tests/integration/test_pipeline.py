@@ -13,15 +13,15 @@ import pytest
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from chirp_logs import chirp_log
 from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
-from pronk.excitation.signals import Multisine
-from pronk.logs.joint_log import JointLog
-from pronk.match import gains as gains_file
-from pronk.match import result as result_file
-from pronk.match.gains import JointGains
-from pronk.match.pipeline import match_logs
-from pronk.match.result import MatchResult
-from pronk.match.settings import MatchSettings
-from pronk.response.response import Estimator
+from pronk.identify.excitation.signals import Multisine
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match import gains as gains_file
+from pronk.identify.match import result as result_file
+from pronk.identify.match.gains import JointGains
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.result import MatchResult
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.response.response import Estimator
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

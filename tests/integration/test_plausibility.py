@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from benchmarks.wrong_inputs import CORRUPTIONS, SETTINGS, Case, bare, judged
-from pronk.evaluation.virtual_sweep import sweep_virtual
-from pronk.excitation.plan import make_plan
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_logs
-from pronk.match.pipeline import match_logs
-from pronk.match.plausibility import CAUSES, findings, require_plausible
+from pronk.deploy.bench.virtual_sweep import sweep_virtual
+from pronk.identify.excitation.plan import make_plan
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_logs
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.plausibility import CAUSES, findings, require_plausible
+from pronk.jump.virtual.sim_params import SimParams
 from pronk.robots import load_robot
-from pronk.virtual.sim_params import SimParams
 from tests.virtual_robot import ROBOT, SIM_PARAMS
 
 JOINT = "FL_hip_roll"

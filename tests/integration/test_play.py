@@ -20,17 +20,17 @@ import pytest
 
 from command_line import invoke
 from hopper import ROBOT, write_hopper
+from pronk.deploy.links.link import wait_for
+from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import PronkError
-from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.live.page import WebPage, free_port, readout
-from pronk.evaluation.live.play import JUMP_S, Gauge, Joystick, play
-from pronk.links.link import wait_for
+from pronk.jump.play.page import WebPage, free_port, readout
+from pronk.jump.play.play import JUMP_S, Gauge, Joystick, play
+from pronk.jump.trial.jumps import JumpRules
+from pronk.jump.virtual.capture import Capture
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.runtime import load_policy
 from pronk.robots.legged import legged
-from pronk.runtime.ipc import Mode, OperatorRequest
-from pronk.runtime.teleop import OperatorCommand
-from pronk.virtual.capture import Capture
-from pronk.virtual.sim_params import load_sim_params
 from seen_jump import STANDING, Z_OFF, G, changed, seen_jump
 
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}

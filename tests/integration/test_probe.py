@@ -12,10 +12,10 @@ import pytest
 
 from benchmarks.probe import ENGINES, ROBOTS, Drawn, Truth, drawn, score
 from command_line import accepted, refused
-from pronk.actuator.law import DriveLaw
 from pronk.errors import PronkError
+from pronk.identify.simulators.probe import probe
 from pronk.robots import load_robot
-from pronk.simulators.probe import probe
+from pronk.robots.drive_law import DriveLaw
 
 PENDULUM, SWING = ROBOTS[0]
 

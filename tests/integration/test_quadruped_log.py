@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pronk.logs.readers import read_log
-from pronk.match.pipeline import match_logs
-from pronk.match.predict import predict, rmse
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.predict import predict, rmse
+from pronk.jump.virtual.robot import VirtualRobot, hold_of
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
-from pronk.virtual.robot import VirtualRobot, hold_of
-from pronk.virtual.sim_params import load_sim_params
 
 torch = pytest.importorskip("torch")
 

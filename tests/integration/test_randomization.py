@@ -16,9 +16,9 @@ import torch
 
 import training_env
 from pronk.errors import PronkError
+from pronk.jump.train.mdp.actions import DelayedJointPositionActionCfg, joint_position_action
+from pronk.jump.train.mdp.events import randomize_base_mass, randomize_decimation, reset_state
 from pronk.robots.legged import legged
-from pronk.train.mdp.actions import DelayedJointPositionActionCfg, joint_position_action
-from pronk.train.mdp.events import randomize_base_mass, randomize_decimation, reset_state
 from training_env import MANY, MATCHED, ROBOT, N, drawn
 
 pytestmark = pytest.mark.train

@@ -18,9 +18,15 @@ import pronk
 from command_line import accepted, invoke
 from log_files import example, write_csv, write_mcap, write_npz
 from pronk.errors import LogError, RobotError
-from pronk.logs.checks import check_motion, check_rate, check_unit, examine, saturation_note
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log, read_logs, readers
+from pronk.identify.logs.checks import (
+    check_motion,
+    check_rate,
+    check_unit,
+    examine,
+    saturation_note,
+)
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log, read_logs, readers
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.testing import check_reader
@@ -173,7 +179,7 @@ def test_pace_recording_without_pytorch_gives_pytorchs_numbers(tmp_path: Path) -
     assert log.joints == load_robot("mini_cheetah").joint_names
     names = [f"j{i}" for i in range(12)]
     code = (
-        "import sys; from pronk.logs.readers import read_log;"
+        "import sys; from pronk.identify.logs.readers import read_log;"
         f"log = read_log({str(path)!r}, joint_order={names});"
         "print(log.joints[11], 'torch' in sys.modules)"
     )
@@ -430,8 +436,8 @@ import hashlib
 import numpy as np
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import reader
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import reader
 
 
 @reader("turns", ".turns")

@@ -17,11 +17,11 @@ from command_line import accepted, invoke
 from log_files import write_mcap
 from pronk.cli.match import WARNING_STATUS
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
-from pronk.match.gains import load
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.gains import load
+from pronk.identify.simulators.engines.links import links_of
+from pronk.identify.simulators.load import joint_rigs, load_simulator
 from pronk.robots import load_robot
-from pronk.simulators.engines.links import links_of
-from pronk.simulators.load import joint_rigs, load_simulator
 from pronk.testing import check_simulator
 
 ROBOT = load_robot("mini_cheetah")
@@ -30,8 +30,8 @@ ADAPTERS = '''
 import os, time
 import numpy as np
 from pronk.errors import PronkError
-from pronk.simulators.engines.links import links_of
-from pronk.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.engines.links import links_of
+from pronk.identify.simulators.simulator import SimulatorInfo
 
 class Resting:
     """Positions at rest of one chain."""
@@ -156,7 +156,7 @@ def test_it_ends_with_a_killed_parent(python: Path, adapters: Path, tmp_path: Pa
     pid_file = tmp_path / "pid"
     code = (
         "import numpy as np; from pathlib import Path; from pronk.robots import load_robot\n"
-        "from pronk.simulators.load import load_simulator\n"
+        "from pronk.identify.simulators.load import load_simulator\n"
         f"s = load_simulator({str(adapters) + ':Endless'!r}, load_robot('mini_cheetah'),\n"
         f"    python=Path({str(python)!r}))\n"
         "s.rollout(np.zeros((1, 2, 3)), {})\n"

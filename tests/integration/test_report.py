@@ -14,9 +14,9 @@ import pytest
 
 from command_line import accepted
 from pronk.errors import ArtefactError
-from pronk.evaluation import results, tables
-from pronk.evaluation.jumps import JumpFigures
-from pronk.match import gains as gains_file
+from pronk.identify.match import gains as gains_file
+from pronk.jump.trial import results, tables
+from pronk.jump.trial.jumps import JumpFigures
 from pronk.report import build, match_page
 from report_cases import CASES, match, walks, write_match, write_tree, write_trial
 

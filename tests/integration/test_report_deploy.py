@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from command_line import accepted
+from pronk.deploy.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
+from pronk.deploy.runtime.safety import FilterAction, Reason
 from pronk.errors import LogError
 from pronk.report import build, deploy_page, deploy_run
 from pronk.report.deploy_page import part
 from pronk.report.deploy_run import delay, drive_delay, quantiles
-from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
-from pronk.runtime.log import DeployLogWriter, read_deploy_log
-from pronk.runtime.safety import FilterAction, Reason
 from virtual_robot import KP, POSE, ROBOT, rolled, still
 
 HEADER = {

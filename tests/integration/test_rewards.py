@@ -15,11 +15,11 @@ from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
 
 import training_env
-from pronk.train.mdp import commands
-from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.motion import Motion
-from pronk.train.mdp.reward_manager import StackedRewardManager
-from pronk.train.tasks.reward_weights import reward_weights
+from pronk.jump.train.mdp import commands
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.motion import Motion
+from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.tasks.reward_weights import reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train

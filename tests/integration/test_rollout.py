@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from hopper import DEFAULT, ROBOT, STRAIGHT, write_hopper
 from pronk.errors import ArtefactError, HardwareError
-from pronk.links.machine import Command
+from pronk.jump.virtual.ground import Start
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.rollout import check_standing, projected_gravity, ticks
 from pronk.policy.runtime import Policy, load_policy
-from pronk.runtime.rollout import check_standing, projected_gravity, ticks
-from pronk.runtime.script import STILL, Script
-from pronk.virtual.ground import Start
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Script
+from pronk.robots.machine import Command
 
 pytest.importorskip("onnxruntime")
 

@@ -12,7 +12,9 @@ import pytest
 
 from broken_message import mutated
 from command_line import invoke
-from pronk.links.lcm.codec import (
+from pronk.deploy.bench.faults import parse_faults
+from pronk.deploy.bench.server import TICK_S, RobotServer, ServerTransport, Watchdog
+from pronk.deploy.links.lcm.codec import (
     CHEETAH,
     CONTROL_PARAMETER,
     VIRTUAL_ROBOT,
@@ -21,11 +23,9 @@ from pronk.links.lcm.codec import (
     decode_command,
     encode_command,
 )
-from pronk.links.machine import Command, RefusedError, State
-from pronk.virtual.capture import load
-from pronk.virtual.faults import parse_faults
-from pronk.virtual.robot import VirtualRobot, hold_of
-from pronk.virtual.server import TICK_S, RobotServer, ServerTransport, Watchdog
+from pronk.jump.virtual.capture import load
+from pronk.jump.virtual.robot import VirtualRobot, hold_of
+from pronk.robots.machine import Command, RefusedError, State
 from virtual_robot import ROBOT, connected
 
 HOLD = hold_of(ROBOT)
@@ -211,7 +211,7 @@ def broken(layout: Layout, good: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
 def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: Layout) -> None:
     pytest.importorskip("lcm")
-    from pronk.virtual.lcm_server import LcmServerTransport
+    from pronk.deploy.bench.lcm_server import LcmServerTransport
 
     steps, count = 200, 50_000
     machine = leg()

@@ -11,12 +11,12 @@ import yaml
 from scipy.signal import tf2zpk
 
 from command_line import accepted, refused
-from pronk.evaluation.virtual_sweep import sweep_virtual
-from pronk.excitation.plan import make_plan
-from pronk.excitation.signals import Chirp
-from pronk.match.shape import Prefilter, Shaped
+from pronk.deploy.bench.virtual_sweep import sweep_virtual
+from pronk.identify.excitation.plan import make_plan
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.shape import Prefilter, Shaped
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
-from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
 

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pronk.deploy.runtime.safety import SafetyFilter
+from pronk.deploy.runtime.sweep import SweepTask, record
 from pronk.errors import HardwareError, PlanError
-from pronk.excitation.plan import SweepPlan, make_plan
-from pronk.excitation.signals import Chirp
-from pronk.links.machine import Command, State
-from pronk.logs.mcap_reader import read_mcap
+from pronk.identify.excitation.plan import SweepPlan, make_plan
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
-from pronk.runtime.safety import SafetyFilter
-from pronk.runtime.sweep import SweepTask, record
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_sim_params
+from pronk.robots.machine import Command, State
 
 ROBOT = load_robot("mini_cheetah")
 SIM_PARAMS = load_sim_params(None)

@@ -23,12 +23,12 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from scipy.signal import chirp
 
+from pronk.identify.simulators.command_trace import CommandTrace
+from pronk.jump.train.mdp.actions import NAME as ACTION
+from pronk.jump.train.mdp.actuators import actuators
+from pronk.jump.train.phases import TASKS
+from pronk.jump.train.rl.runner import PronkRunner
 from pronk.robots.model import bench_spec
-from pronk.simulators.command_trace import CommandTrace
-from pronk.train.mdp.actions import NAME as ACTION
-from pronk.train.mdp.actuators import actuators
-from pronk.train.phases import TASKS
-from pronk.train.rl.runner import PronkRunner
 from training_env import MATCHED, ROBOT, config, fresh, nominal
 
 pytestmark = pytest.mark.train
@@ -38,9 +38,9 @@ NAMES = {"Pronk-Jump-MiniCheetah": "jump", "Pronk-Walk-MiniCheetah": "walk"}
 def test_mjlab_knows_the_tasks_whatever_is_imported_first() -> None:
     """mjlab loads the entry point while it is itself imported: here by a module of pronk."""
     found = {point.name: point.value for point in entry_points(group="mjlab.tasks")}
-    assert found["pronk"] == "pronk.train.tasks"
+    assert found["pronk"] == "pronk.jump.train.tasks"
     code = (
-        "import pronk.train.mdp.commands, pronk.train.tasks\n"
+        "import pronk.jump.train.mdp.commands, pronk.jump.train.tasks\n"
         "from mjlab.tasks.registry import list_tasks\n"
         "print(*list_tasks())"
     )

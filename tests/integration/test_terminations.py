@@ -15,8 +15,8 @@ from torch import Tensor
 
 import training_env
 from parts import where
-from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.observations import CRITIC
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.observations import CRITIC
 from training_env import N
 
 pytestmark = pytest.mark.train

@@ -10,11 +10,11 @@ import pytest
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import JointLog
-from pronk.match.gains import load, save
-from pronk.match.pipeline import match_logs
-from pronk.match.result import HELD_OUT, NOT_BETTER, MatchResult, held_out_flags
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.gains import load, save
+from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.result import HELD_OUT, NOT_BETTER, MatchResult, held_out_flags
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -12,13 +12,13 @@ import pytest
 from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, rig, run
 from command_line import accepted, refused
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.readers import read_log
-from pronk.match import gains, match_logs
-from pronk.match.torque import fit_drives, fit_torque
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match import gains, match_logs
+from pronk.identify.match.torque import fit_drives, fit_torque
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.virtual.sim_params import load_sim_params
 
 recorded = pytest.mark.skipif(not DATA.is_dir(), reason="the AK80-6 recordings are not here")
 

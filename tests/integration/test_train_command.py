@@ -15,13 +15,13 @@ pytest.importorskip("mjlab")
 import pronk.robots
 from command_line import refused
 from pronk.errors import PronkError
-from pronk.train import devices
-from pronk.train.gains import training_gains
-from pronk.train.phases import TASKS
-from pronk.train.provenance import RunFolder
-from pronk.train.run import stop_signals, train
-from pronk.train.settings import TrainSettings
-from pronk.train.tasks import load_task
+from pronk.jump.train import devices
+from pronk.jump.train.gains import training_gains
+from pronk.jump.train.phases import TASKS
+from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.run import stop_signals, train
+from pronk.jump.train.settings import TrainSettings
+from pronk.jump.train.tasks import load_task
 
 pytestmark = pytest.mark.train
 NAIVE = ("--gains", "naive")
@@ -136,7 +136,7 @@ def test_missing_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- Tasks of other robots -----------------------------------------------------------------------
 
 ENV_CFGS = """
-from pronk.train.tasks.jump_env_cfg import jump_env_cfg
+from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg
 
 def env_cfg(robot, gains, **options):
     cfg = jump_env_cfg(robot, gains, **options)

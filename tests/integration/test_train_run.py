@@ -22,11 +22,11 @@ from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 from pronk.cli import main as cli
+from pronk.jump.train.phases import PHASES, TASKS
+from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.rl import checkpoint
+from pronk.jump.train.rl.runner import PronkRunner
 from pronk.policy.runtime import load_policy
-from pronk.train.phases import PHASES, TASKS
-from pronk.train.provenance import RunFolder
-from pronk.train.rl import checkpoint
-from pronk.train.rl.runner import PronkRunner
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 of_one_run = pytest.mark.xdist_group("run")

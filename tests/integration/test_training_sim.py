@@ -19,19 +19,19 @@ from mjlab.envs import ManagerBasedRlEnv
 from tensordict import TensorDict
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation.jumps import JumpRules, measure
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.training_sim import adapter
-from pronk.evaluation.training_sim.evaluation import NEVER, Plan
-from pronk.evaluation.training_sim.run import TERM, evaluate_policy
+from pronk.jump.train.gains import training_gains
+from pronk.jump.train.phases import TASKS
+from pronk.jump.train.provenance import SCHEMA, RunFolder
+from pronk.jump.train.rl import checkpoint
+from pronk.jump.train.rl.export import contract_for, export_policy
+from pronk.jump.train.tasks import load_task
+from pronk.jump.trial.jumps import JumpRules, measure
+from pronk.jump.trial.protocol import Case
+from pronk.jump.trial.training_sim import adapter
+from pronk.jump.trial.training_sim.evaluation import NEVER, Plan
+from pronk.jump.trial.training_sim.run import TERM, evaluate_policy
+from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
-from pronk.runtime.script import STILL, Script
-from pronk.train.gains import training_gains
-from pronk.train.phases import TASKS
-from pronk.train.provenance import SCHEMA, RunFolder
-from pronk.train.rl import checkpoint
-from pronk.train.rl.export import contract_for, export_policy
-from pronk.train.tasks import load_task
 
 DT = 0.005
 DROP = 0.3

@@ -12,12 +12,12 @@ import pytest
 from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import PronkError
-from pronk.match.gains import load, save
-from pronk.match.translate import stated_gains, translate
-from pronk.response.estimate import estimate
+from pronk.identify.match.gains import load, save
+from pronk.identify.match.translate import stated_gains, translate
+from pronk.identify.response.estimate import estimate
+from pronk.identify.simulators.profiles import profile
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.profiles import profile
 
 EXACT = "mjlab,timestep_s=0.0001"
 # Matched to the drive at 0.1 ms from 1 to 15 Hz, confirmed in MuJoCo, Drake, SAPIEN and PyBullet:

@@ -15,15 +15,15 @@ import yaml
 from command_line import invoke
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation import results
-from pronk.evaluation.jumps import measure
-from pronk.evaluation.protocol import PAPER_COMMANDS, Case, parse_case
-from pronk.evaluation.trial import Plan, Setup, draw, load_subjects, prepare, run_trial
 from pronk.files import sha256
+from pronk.jump.trial import results
+from pronk.jump.trial.jumps import measure
+from pronk.jump.trial.protocol import PAPER_COMMANDS, Case, parse_case
+from pronk.jump.trial.trial import Plan, Setup, draw, load_subjects, prepare, run_trial
+from pronk.jump.virtual import capture
+from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params
+from pronk.policy.script import STILL, Script
 from pronk.processes import in_processes
-from pronk.runtime.script import STILL, Script
-from pronk.virtual import capture
-from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 pytest.importorskip("onnxruntime")
 

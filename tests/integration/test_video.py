@@ -19,14 +19,14 @@ from PIL import Image
 from hopper import DEFAULT, ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.evaluation.pictures import render, video
-from pronk.evaluation.pictures.film import FPS, Film, JumpEvents, plan
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.trial import Plan as TrialPlan
-from pronk.evaluation.trial import Setup, run_trial
-from pronk.runtime.script import STILL, Script
-from pronk.virtual.capture import Capture
-from pronk.virtual.sim_params import load_sim_params
+from pronk.jump.trial.films import render, video
+from pronk.jump.trial.films.film import FPS, Film, JumpEvents, plan
+from pronk.jump.trial.protocol import Case
+from pronk.jump.trial.trial import Plan as TrialPlan
+from pronk.jump.trial.trial import Setup, run_trial
+from pronk.jump.virtual.capture import Capture
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Script
 from seen_jump import STANDING, G, motion
 
 RATE, LIFTOFF, RISE_SPEED = 200.0, 1.0, 2.0

@@ -11,9 +11,9 @@ from scipy import signal
 
 from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
-from pronk.links.machine import Command, State
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SimParams
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import SimParams
+from pronk.robots.machine import Command, State
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet, with_joints
 
 NAMES = ROBOT.joint_names

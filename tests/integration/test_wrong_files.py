@@ -10,12 +10,12 @@ import pytest
 
 from benchmarks.wrong_inputs import Case, judged
 from log_files import write_npz
+from pronk.deploy.bench.virtual_sweep import sweep_virtual
 from pronk.errors import LogError
-from pronk.evaluation.virtual_sweep import sweep_virtual
-from pronk.excitation.plan import make_plan
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
-from pronk.match import match_logs
+from pronk.identify.excitation.plan import make_plan
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match import match_logs
 from virtual_robot import ROBOT, SIM_PARAMS
 
 JOINT = "FL_hip_roll"

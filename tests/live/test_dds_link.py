@@ -17,10 +17,11 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from pronk.errors import HardwareError, RobotError
-from pronk.links.dds import codec as idl
-from pronk.links.dds.codec import decode_command, encode_command, joint_map
-from pronk.links.dds.link import (
+from pronk.deploy.bench.dds_server import DdsServerTransport
+from pronk.deploy.bench.server import RobotServer
+from pronk.deploy.links.dds import codec as idl
+from pronk.deploy.links.dds.codec import decode_command, encode_command, joint_map
+from pronk.deploy.links.dds.link import (
     COMMANDS,
     SWITCHER,
     Client,
@@ -30,11 +31,10 @@ from pronk.links.dds.link import (
     Participant,
     take,
 )
-from pronk.links.link import Freshness, wait_for
-from pronk.links.machine import Command
-from pronk.virtual.dds_server import DdsServerTransport
-from pronk.virtual.robot import hold_of
-from pronk.virtual.server import RobotServer
+from pronk.deploy.links.link import Freshness, wait_for
+from pronk.errors import HardwareError, RobotError
+from pronk.jump.virtual.robot import hold_of
+from pronk.robots.machine import Command
 from virtual_robot import ROBOT, connected, meanwhile
 
 pytestmark = pytest.mark.live

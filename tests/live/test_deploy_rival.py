@@ -18,12 +18,12 @@ import pytest
 
 from deploy_runs import DAMPED_S, FRESH, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
+from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.log import read_deploy_log
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.run import Deployment
 from pronk.errors import HardwareError
-from pronk.links.address import Address
-from pronk.runtime.ipc import Mode, OperatorRequest
-from pronk.runtime.log import read_deploy_log
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.run import Deployment
 from wire import ROBOT, Wire, over_dds, over_lcm
 
 pytest.importorskip("onnxruntime")

@@ -19,7 +19,7 @@ pytest.importorskip("onnx")
 
 from benchmarks.sensor_faults import FAULTS, PROCESSES, REFUSED, measure
 from deploy_runs import PATIENT
-from pronk.virtual.faults import SWAPPED
+from pronk.deploy.bench.faults import SWAPPED
 
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 IMU = ("imu", "attitude", "gyro", "accelerometer")

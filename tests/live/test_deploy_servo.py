@@ -16,12 +16,12 @@ import pytest
 
 from deploy_faults import FaultyLink
 from deploy_runs import PATIENT
+from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.ipc import ACTIONS, OPERATOR, TICK, Mode, OperatorRequest, Shared, fill
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.servo import Servo
+from pronk.deploy.runtime.state_machine import Timing
 from pronk.errors import HardwareError
-from pronk.links.address import Address
-from pronk.runtime.ipc import ACTIONS, OPERATOR, TICK, Mode, OperatorRequest, Shared, fill
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.servo import Servo
-from pronk.runtime.state_machine import Timing
 from virtual_robot import POSE
 
 QUICK = Timing(damp_s=0.05, fold_s=0.1, check_s=0.0, rise_s=0.1, ramp_s=0.1, sit_s=0.1)

@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 
 from deploy_runs import free_port
-from pronk.errors import HardwareError
-from pronk.links.lcm.codec import (
+from pronk.deploy.bench.lcm_server import LcmServerTransport
+from pronk.deploy.links.lcm.codec import (
     CHEETAH,
     CONTROL_PARAMETER,
     decode_command,
     encode_command,
     mode_request,
 )
-from pronk.links.lcm.link import LcmMachine, url_of
-from pronk.links.link import Freshness, wait_for
-from pronk.links.machine import Command, State
-from pronk.virtual.lcm_server import LcmServerTransport
-from pronk.virtual.robot import hold_of
+from pronk.deploy.links.lcm.link import LcmMachine, url_of
+from pronk.deploy.links.link import Freshness, wait_for
+from pronk.errors import HardwareError
+from pronk.jump.virtual.robot import hold_of
+from pronk.robots.machine import Command, State
 from virtual_robot import ROBOT, connected, meanwhile
 
 pytestmark = pytest.mark.live

@@ -23,14 +23,14 @@ from command_line import invoke
 from deploy_runs import DAMPED_S, FRESH, free_port, simulated
 from pronk.cli.console import Person
 from pronk.cli.sweep import record_wire
+from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.plan import Link
 from pronk.errors import HardwareError, LogError
-from pronk.excitation.plan import SweepPlan, make_plan
-from pronk.excitation.signals import Chirp
-from pronk.links.address import Address
-from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_reader import read_mcap
+from pronk.identify.excitation.plan import SweepPlan, make_plan
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.robots import load_robot
-from pronk.runtime.plan import Link
 from wire import ROBOT, over_lcm
 
 pytest.importorskip("lcm")

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from pronk.links.realtime import ENDING, TERMINAL, Interrupts, terminal_blocked
+from pronk.deploy.links.realtime import ENDING, TERMINAL, Interrupts, terminal_blocked
 
 
 @pytest.mark.parametrize("number", ENDING)
@@ -56,7 +56,7 @@ def test_another_thread_hears_nothing_and_changes_nothing() -> None:
 
 
 BORN = "import sys; print('up', flush=True); sys.stdin.readline(); print('alive', flush=True)"
-LEFT = "from pronk.links.realtime import leave; leave();" + BORN
+LEFT = "from pronk.deploy.links.realtime import leave; leave();" + BORN
 
 
 @pytest.mark.parametrize(("code", "blocked_at_start"), [(BORN, True), (LEFT, False)])

@@ -15,22 +15,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pronk.actuator.law import DriveLaw
 from pronk.arrays import Array
 from pronk.errors import PronkError
+from pronk.identify.simulators.engines.drake import Drake
+from pronk.identify.simulators.engines.engine import EngineSimulator
+from pronk.identify.simulators.engines.genesis import Genesis
+from pronk.identify.simulators.engines.mujoco import Mjx, Mujoco
+from pronk.identify.simulators.engines.newton import Newton
+from pronk.identify.simulators.engines.ovphysx import OvPhysx
+from pronk.identify.simulators.engines.pybullet import PyBullet
+from pronk.identify.simulators.engines.sapien import Sapien
+from pronk.identify.simulators.load import load_simulator
+from pronk.identify.simulators.mujoco import Chain
+from pronk.identify.simulators.simulator import Closing
 from pronk.robots import load_robot
+from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.engines.drake import Drake
-from pronk.simulators.engines.engine import EngineSimulator
-from pronk.simulators.engines.genesis import Genesis
-from pronk.simulators.engines.mujoco import Mjx, Mujoco
-from pronk.simulators.engines.newton import Newton
-from pronk.simulators.engines.ovphysx import OvPhysx
-from pronk.simulators.engines.pybullet import PyBullet
-from pronk.simulators.engines.sapien import Sapien
-from pronk.simulators.load import load_simulator
-from pronk.simulators.mujoco import Chain
-from pronk.simulators.simulator import Closing
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
 BAND = (1.0, 15.0)

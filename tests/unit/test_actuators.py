@@ -17,13 +17,13 @@ pytest.importorskip("mjlab")
 import torch
 
 import training_env
-from pronk.actuator.model import torque_limits
 from pronk.errors import PronkError, RobotError
-from pronk.match.gains import GroupGains
-from pronk.train.mdp.actions import DelayedJointPositionActionCfg
-from pronk.train.mdp.actuators import PositionDrive, actuators
-from pronk.train.mdp.events import check_ellipsoid, randomize_decimation, sample_gains
-from pronk.train.tasks.jump_env_cfg import without_randomization
+from pronk.identify.match.gains import GroupGains
+from pronk.jump.train.mdp.actions import DelayedJointPositionActionCfg
+from pronk.jump.train.mdp.actuators import PositionDrive, actuators
+from pronk.jump.train.mdp.events import check_ellipsoid, randomize_decimation, sample_gains
+from pronk.jump.train.tasks.jump_env_cfg import without_randomization
+from pronk.robots.motor import torque_limits
 from training_env import MATCHED, ROBOT
 
 pytestmark = pytest.mark.train

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.signal import chirp
 
-from pronk.actuator.model import torque_limits
 from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passive
+from pronk.robots.motor import torque_limits
 from pronk.robots.robot import RobotSpec
 
 CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")

@@ -23,12 +23,12 @@ from hypothesis.extra.numpy import arrays
 pytest.importorskip("cyclonedds")
 
 from broken_message import mutated, some_state
+from pronk.deploy.links.dds import codec as dds
+from pronk.deploy.links.lcm import codec as lcm
+from pronk.deploy.links.lcm.codec import CHEETAH, MESSAGES, WTW, Layout, Message
 from pronk.errors import HardwareError
-from pronk.links.dds import codec as dds
-from pronk.links.lcm import codec as lcm
-from pronk.links.lcm.codec import CHEETAH, MESSAGES, WTW, Layout, Message
-from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
+from pronk.robots.machine import Command, RefusedError, State
 
 ROBOT = load_robot("mini_cheetah")
 JOINTS = dds.joint_map(ROBOT)

@@ -12,16 +12,16 @@ import pytest
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
-from pronk.evaluation import crossing, results
-from pronk.evaluation.crossing import Attempt, CrossingFigures, CrossingPlan, Ladder, Obstacle
-from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Results, Row
-from pronk.evaluation.trial import Setup
-from pronk.runtime.script import STILL, Script
-from pronk.virtual.capture import Capture
-from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params import load_sim_params
+from pronk.jump.trial import crossing, results
+from pronk.jump.trial.crossing import Attempt, CrossingFigures, CrossingPlan, Ladder, Obstacle
+from pronk.jump.trial.jumps import JumpRules
+from pronk.jump.trial.protocol import Case
+from pronk.jump.trial.results import Results, Row
+from pronk.jump.trial.trial import Setup
+from pronk.jump.virtual.capture import Capture
+from pronk.jump.virtual.ground import Ground
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.script import STILL, Script
 from report_cases import of_kind, subject
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 

@@ -18,19 +18,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk.errors import HardwareError, LogError, RobotError
-from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace
-from pronk.logs.mcap import DamagedError, McapWriter, records
-from pronk.robots import load_robot
-from pronk.runtime import ipc
-from pronk.runtime.ipc import STEP, TICK, Event, Mode, OperatorRequest, event, fill
-from pronk.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
-from pronk.runtime.preflight import delay_objection, refusals
-from pronk.runtime.run import RunSummary
-from pronk.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
-from pronk.runtime.script import Script
-from pronk.runtime.state_machine import (
+from pronk.deploy.bench.faults import SWAPPED, spoiled
+from pronk.deploy.links.realtime import Histogram, Pace
+from pronk.deploy.runtime import ipc
+from pronk.deploy.runtime.ipc import STEP, TICK, Event, Mode, OperatorRequest, event, fill
+from pronk.deploy.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.preflight import delay_objection, refusals
+from pronk.deploy.runtime.run import RunSummary
+from pronk.deploy.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
+from pronk.deploy.runtime.state_machine import (
     FIRST_ACTION_S,
     StateMachine,
     Timing,
@@ -38,7 +34,7 @@ from pronk.runtime.state_machine import (
     minimum_jerk,
     stand_up,
 )
-from pronk.runtime.teleop import (
+from pronk.deploy.runtime.teleop import (
     Gamepad,
     Keyboard,
     Operator,
@@ -46,7 +42,11 @@ from pronk.runtime.teleop import (
     ScriptedOperator,
     TimeLimit,
 )
-from pronk.virtual.faults import SWAPPED, spoiled
+from pronk.errors import HardwareError, LogError, RobotError
+from pronk.identify.logs.mcap import DamagedError, McapWriter, records
+from pronk.policy.script import Script
+from pronk.robots import load_robot
+from pronk.robots.machine import State
 from virtual_robot import POSE, ROBOT, connected, rolled, still
 
 LIMITS = Limits.of(ROBOT)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk.actuator import model as drive
 from pronk.robots import load_robot
+from pronk.robots import motor as drive
 from pronk.robots.load import DriveEntry
 
 LINE = (62.428, 40.0, 17.0)

@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 from pronk.errors import PronkError, RobotError
-from pronk.response.grid import held_mean
+from pronk.identify.response.grid import held_mean
+from pronk.identify.simulators.engines.engine import delayed
+from pronk.identify.simulators.engines.links import (
+    along_x,
+    links_of,
+    principal,
+    quaternion,
+    rotation,
+)
+from pronk.identify.simulators.engines.sapien import Sapien
+from pronk.identify.simulators.mujoco import Chain
 from pronk.robots import load_robot
-from pronk.simulators.engines.engine import delayed
-from pronk.simulators.engines.links import along_x, links_of, principal, quaternion, rotation
-from pronk.simulators.engines.sapien import Sapien
-from pronk.simulators.mujoco import Chain
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation.criteria import cost_of_jumping, evaluation_checks
-from pronk.evaluation.results import Spread
-from pronk.evaluation.training_sim import evaluation as sim
-from pronk.evaluation.training_sim.results import load_speed_errors, save
+from pronk.jump.trial.criteria import cost_of_jumping, evaluation_checks
+from pronk.jump.trial.results import Spread
+from pronk.jump.trial.training_sim import evaluation as sim
+from pronk.jump.trial.training_sim.results import load_speed_errors, save
 from pronk.robots import load_robot
 
 DT, ROBOT = 0.005, load_robot("mini_cheetah")
@@ -103,7 +103,7 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
     save(path, evaluation())
     assert load_speed_errors(path) == {case.name: 0.1 for case in sim.WALKS}
     assert len(json.loads(path.read_text())["checks"]) == 50
-    for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/3"}', "not"):
+    for text in ('{"schema": "pronk/trial/9"}', '{"schema": "pronk/trial/3"}', "not"):
         path.write_text(text)
         with pytest.raises(ArtefactError, match=r"evaluation\.json"):
             load_speed_errors(path)

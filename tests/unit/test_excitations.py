@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from log_files import write_mcap
-from pronk.logs.excitations import with_segments
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
-from pronk.match.measured_joint import measured_joints
-from pronk.match.settings import MatchSettings
-from pronk.match.time_fit import recorded
-from pronk.response.estimate import estimate, excitations, excited_joints
+from pronk.identify.logs.excitations import with_segments
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.identify.match.measured_joint import measured_joints
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.time_fit import recorded
+from pronk.identify.response.estimate import estimate, excitations, excited_joints
+from pronk.identify.simulators.chain import moves_together
 from pronk.robots import load_robot
-from pronk.simulators.chain import moves_together
 from synthetic_joint import KNEE, chirp_command, multisine_command, simulate_second_order
 
 ROBOT = load_robot("mini_cheetah")

@@ -14,18 +14,18 @@ import pytest
 from pronk.arrays import Array
 from pronk.cli.export import Target
 from pronk.errors import PronkError
-from pronk.logs.joint_log import JointLog
-from pronk.match.export import TARGETS, Actuator, actuators, export_text, stability_share
-from pronk.match.gains import JointGains, MatchedGains
-from pronk.match.parameters import GAINS
-from pronk.match.predict import drives_of
-from pronk.match.randomization import group_gains
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.export import TARGETS, Actuator, actuators, export_text, stability_share
+from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.match.parameters import GAINS
+from pronk.identify.match.predict import drives_of
+from pronk.identify.match.randomization import group_gains
+from pronk.identify.simulators.chain import ChainSimulation
+from pronk.identify.simulators.mujoco import Chain
+from pronk.identify.simulators.profiles import profile, profiles
 from pronk.robots import load_robot
 from pronk.robots.model import free_spec
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation
-from pronk.simulators.mujoco import Chain
-from pronk.simulators.profiles import profile, profiles
 
 ROBOT = load_robot("mini_cheetah")
 _ISAACLAB = {"joint_names_expr", "stiffness", "damping", "armature"} | {

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from pronk.deploy.bench.faults import ChannelFaults, FaultChannel, Faults, parse_faults
 from pronk.errors import PronkError
-from pronk.virtual.faults import ChannelFaults, FaultChannel, Faults, parse_faults
 
 COUNT = 4000
 

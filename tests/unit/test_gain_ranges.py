@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import RobotError
-from pronk.match.gains import JointGains
-from pronk.match.randomization import enclosing, group_gains
+from pronk.identify.match.gains import JointGains
+from pronk.identify.match.randomization import enclosing, group_gains
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
-from pronk.excitation.signals import Chirp
-from pronk.match.grid import (
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.grid import (
     DIVERGED_DB,
     GridSearch,
     alike,
@@ -22,16 +22,16 @@ from pronk.match.grid import (
     search,
     search_all,
 )
-from pronk.match.measured_joint import DB, MeasuredJoint, measured_joints, merged
-from pronk.match.parameters import GAINS
-from pronk.match.response_fit import refine
-from pronk.match.settings import MatchSettings
-from pronk.match.simulated import SimRequest, responses
+from pronk.identify.match.measured_joint import DB, MeasuredJoint, measured_joints, merged
+from pronk.identify.match.parameters import GAINS
+from pronk.identify.match.response_fit import refine
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.simulated import SimRequest, responses
+from pronk.identify.response.response import Estimator
+from pronk.identify.simulators.linear import plant
+from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
-from pronk.response.response import Estimator
 from pronk.robots import load_robot
-from pronk.simulators.linear import plant
-from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = load_robot("mini_cheetah")
 

@@ -16,23 +16,23 @@ import yaml
 from benchmarks.fuzz import fuzz
 from command_line import accepted
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
-from pronk.evaluation import results
-from pronk.evaluation.training_sim.results import SCHEMA, load_speed_errors
-from pronk.evaluation.variation import VARIATION
 from pronk.files import LIMIT, read_yaml, write_text
-from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap import McapWriter
-from pronk.logs.mcap_log import HEADER, SAMPLE, SEGMENT, TOPICS
-from pronk.logs.mcap_log import SCHEMA as SWEEP
-from pronk.logs.readers import find_logs, read_log
-from pronk.match import gains
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.mcap import McapWriter
+from pronk.identify.logs.mcap_log import HEADER, SAMPLE, SEGMENT, TOPICS
+from pronk.identify.logs.mcap_log import SCHEMA as SWEEP
+from pronk.identify.logs.readers import find_logs, read_log
+from pronk.identify.match import gains
+from pronk.identify.response.response import FrequencyResponse
+from pronk.jump.trial import results
+from pronk.jump.trial.training_sim.results import SCHEMA, load_speed_errors
+from pronk.jump.trial.variation import VARIATION
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.names import check_names, file_name
 from pronk.policy.contract import from_json
-from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model, yaml_of_model
 from pronk.robots.load import read_robot
-from pronk.virtual.sim_params import load_sim_params
 from report_cases import joint_fit, varied
 
 GAINS = """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, PronkError
-from pronk.match.identifiability import (
+from pronk.identify.match.identifiability import (
     Experiment,
     bench_experiment,
     identifiability,

@@ -19,7 +19,7 @@ from pronk.robots.legged import legged
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.train.mdp.jump import JumpSettings, JumpState
+from pronk.jump.train.mdp.jump import JumpSettings, JumpState
 
 pytestmark = pytest.mark.train
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 import seen_jump as case
-from pronk.evaluation.jumps import (
+from pronk.jump.trial.jumps import (
     FIGURES,
     JumpFigures,
     JumpRules,
@@ -24,9 +24,9 @@ from pronk.evaluation.jumps import (
     measure,
     uncommanded_height,
 )
+from pronk.jump.virtual.capture import Capture
+from pronk.policy.script import Script
 from pronk.robots import load_robot
-from pronk.runtime.script import Script
-from pronk.virtual.capture import Capture
 from seen_jump import SCRIPT, STANDING, G, changed, motion, seen_jump
 
 ROBOT = load_robot("mini_cheetah")

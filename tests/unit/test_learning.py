@@ -27,10 +27,10 @@ from ppo_case import (
     weights,
 )
 from pronk.errors import ArtefactError, PronkError
+from pronk.jump.train.rl import checkpoint
+from pronk.jump.train.rl.networks import JUMP_WEIGHT, Estimator
+from pronk.jump.train.rl.ppo import EstimatorPPO
 from pronk.policy.observation import ACTOR_INDICES, ESTIMATOR_INDICES
-from pronk.train.rl import checkpoint
-from pronk.train.rl.networks import JUMP_WEIGHT, Estimator
-from pronk.train.rl.ppo import EstimatorPPO
 
 pytestmark = pytest.mark.train
 PAPER = (1024, 512, 256)

@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 
 from broken_message import some_state
-from pronk.errors import HardwareError, PronkError, RobotError
-from pronk.links import address as addresses
-from pronk.links import link as links
-from pronk.links.address import Address
-from pronk.links.link import (
+from pronk.deploy.links import address as addresses
+from pronk.deploy.links import link as links
+from pronk.deploy.links.address import Address
+from pronk.deploy.links.link import (
     CommandWriter,
     Encode,
     Freshness,
@@ -31,11 +30,12 @@ from pronk.links.link import (
     await_rest,
     wait_for,
 )
-from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
+from pronk.errors import HardwareError, PronkError, RobotError
+from pronk.jump.virtual.robot import VirtualRobot
 from pronk.robots import load_robot
+from pronk.robots.machine import Command, RefusedError, State, TorqueKind, check_command
 from pronk.robots.robot import RobotSpec
 from pronk.testing import check_link
-from pronk.virtual.robot import VirtualRobot
 
 ROBOT = load_robot("mini_cheetah")
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])

@@ -20,9 +20,9 @@ pytest.importorskip("mjlab")
 
 from tensordict import TensorDict
 
-from pronk.train.mdp.observations import CRITIC
-from pronk.train.rl import symmetry
-from pronk.train.rl.symmetry import GROUPS, mirrored, with_mirror_image
+from pronk.jump.train.mdp.observations import CRITIC
+from pronk.jump.train.rl import symmetry
+from pronk.jump.train.rl.symmetry import GROUPS, mirrored, with_mirror_image
 
 pytestmark = pytest.mark.train
 

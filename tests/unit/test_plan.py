@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pronk.errors import PlanError, RobotError
-from pronk.excitation.plan import SweepPlan, make_plan
-from pronk.excitation.signals import Chirp, Signal
-from pronk.excitation.worst_case import Forecast, Uncertainty, forecast
+from pronk.identify.excitation.plan import SweepPlan, make_plan
+from pronk.identify.excitation.signals import Chirp, Signal
+from pronk.identify.excitation.worst_case import Forecast, Uncertainty, forecast
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

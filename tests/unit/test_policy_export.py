@@ -14,9 +14,9 @@ pytest.importorskip("mjlab")
 pytest.importorskip("onnxruntime")
 from ppo_case import observe, one_thread, same, trained, weights  # noqa: F401
 from pronk.errors import ArtefactError
+from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from pronk.policy.contract import Contract, check
 from pronk.policy.runtime import load_policy
-from pronk.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from training_env import MATCHED, ROBOT, config
 
 pytestmark = pytest.mark.train

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import pronk
-from pronk.links.machine import State
-from pronk.links.realtime import Pace
+from pronk.deploy.links.realtime import Pace
+from pronk.deploy.runtime.ipc import OPERATOR, Mode, Shared, fill, put_state, state_dtype
+from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
+from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
-from pronk.runtime.ipc import OPERATOR, Mode, Shared, fill, put_state, state_dtype
-from pronk.runtime.plan import Link, Plan
-from pronk.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
-from pronk.runtime.rollout import measurement
-from pronk.runtime.script import STILL
+from pronk.policy.script import STILL
+from pronk.robots.machine import State
 
 pytest.importorskip("onnxruntime")
 

@@ -9,11 +9,11 @@ import pytest
 
 from chirp_logs import chirp_log
 from pronk.errors import LogError
-from pronk.logs.joint_log import JointLog
-from pronk.match.gains import JointGains, MatchedGains
-from pronk.match.predict import predict, r2, rmse
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.match.predict import predict, r2, rmse
+from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.robots import load_robot
-from pronk.simulators.simulator import SimulatorInfo
 
 ROBOT = load_robot("mini_cheetah")
 MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}

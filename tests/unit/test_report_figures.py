@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from pronk.evaluation.crossing import climbs
+from pronk.jump.trial.crossing import climbs
 from pronk.report import extra_pages, figures, style, trial_figures, trial_page
 from pronk.report.paper import published_jumps
 from report_cases import (

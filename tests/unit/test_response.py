@@ -12,11 +12,19 @@ import pytest
 from scipy.signal import lfilter
 
 from pronk.errors import ArtefactError, LogError, PronkError
-from pronk.logs.joint_log import JointLog
-from pronk.logs.readers import read_log
-from pronk.response import Estimator, FrequencyResponse, H1Operator, estimate, load, operators, save
-from pronk.response.grid import Grid, grid_over, held_mean
-from pronk.response.h1 import Layout, layout, sums
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.readers import read_log
+from pronk.identify.response import (
+    Estimator,
+    FrequencyResponse,
+    H1Operator,
+    estimate,
+    load,
+    operators,
+    save,
+)
+from pronk.identify.response.grid import Grid, grid_over, held_mean
+from pronk.identify.response.h1 import Layout, layout, sums
 from synthetic_joint import (
     AMPLITUDE,
     HIP,

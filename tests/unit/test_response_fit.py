@@ -11,18 +11,18 @@ import pytest
 
 from benchmarks.engine import engine_gap
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
-from pronk.excitation.signals import Chirp
-from pronk.match.measured_joint import MeasuredJoint, measured_joints
-from pronk.match.parameters import GAINS
-from pronk.match.pipeline import amplitude_flags, amplitude_gains, command_delay
-from pronk.match.response_fit import refine
-from pronk.match.result import amplitude_spread
-from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import Estimate, gain_interval
-from pronk.response.estimate import operators
-from pronk.response.response import Estimator
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.measured_joint import MeasuredJoint, measured_joints
+from pronk.identify.match.parameters import GAINS
+from pronk.identify.match.pipeline import amplitude_flags, amplitude_gains, command_delay
+from pronk.identify.match.response_fit import refine
+from pronk.identify.match.result import amplitude_spread
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.uncertainty import Estimate, gain_interval
+from pronk.identify.response.estimate import operators
+from pronk.identify.response.response import Estimator
+from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
-from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = load_robot("mini_cheetah")
 SHORT = MatchSettings(estimator=Estimator(segment_s=4.0))

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from pronk.errors import ArtefactError
-from pronk.evaluation import results, tables
-from pronk.evaluation.criteria import trial_checks
-from pronk.evaluation.jumps import FIGURES, JumpFigures, JumpRules
-from pronk.evaluation.protocol import PAPER_COMMANDS, PAPER_RATIOS, TABLE_III, Case
-from pronk.evaluation.results import Results, ratio_of_scatter
+from pronk.jump.trial import results, tables
+from pronk.jump.trial.criteria import trial_checks
+from pronk.jump.trial.jumps import FIGURES, JumpFigures, JumpRules
+from pronk.jump.trial.protocol import PAPER_COMMANDS, PAPER_RATIOS, TABLE_III, Case
+from pronk.jump.trial.results import Results, ratio_of_scatter
 from report_cases import ROBOT, of_kind, row, subject
 
 HEIGHTS = (0.40, 0.44, 0.48)

@@ -11,7 +11,7 @@ import pytest
 
 import pronk.robots
 from pronk.errors import RobotError
-from pronk.logs.sage_reader import SAGE_JOINTS
+from pronk.identify.logs.sage_reader import SAGE_JOINTS
 from pronk.robots import ROBOT_NAMES, load_robot
 from pronk.robots.legged import legged
 from pronk.robots.model import free_spec

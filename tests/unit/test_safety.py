@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk.errors import RobotError
-from pronk.links.machine import Command, State
-from pronk.runtime.safety import (
+from pronk.deploy.runtime.safety import (
     LEAST_DAMPING_S,
     Decision,
     FilterAction,
@@ -25,6 +23,8 @@ from pronk.runtime.safety import (
     apply_rules,
     tilt,
 )
+from pronk.errors import RobotError
+from pronk.robots.machine import Command, State
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
 LIMITS = Limits.of(ROBOT)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pronk.errors import PronkError
-from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case, parse_cases
-from pronk.runtime.script import STILL, Script
+from pronk.jump.trial.protocol import PAPER_COMMANDS, RATES, Case, parse_cases
+from pronk.policy.script import STILL, Script
 
 COMMAND = (2.0, 0.0, 0.5)
 

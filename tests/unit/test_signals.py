@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
 from pronk.errors import PlanError
-from pronk.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
-from pronk.logs.checks import correlation_note
+from pronk.identify.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
+from pronk.identify.logs.checks import correlation_note
 
 ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from pronk.errors import RobotError
+from pronk.jump.virtual.plant import Plant
+from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params, with_changes
 from pronk.robots import load_robot
-from pronk.virtual.plant import Plant
-from pronk.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params, with_changes
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
 ROBOT = load_robot("mini_cheetah")

@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 
 from benchmarks.synthetic_log import Excitation, simulate, synthetic_log
 from pronk.errors import LogError, PronkError
-from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.match import MatchSettings, match_logs, predict
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.match import MatchSettings, match_logs, predict
+from pronk.identify.simulators.command_trace import CommandTrace, command_trace
+from pronk.identify.simulators.load import joint_rigs, load_simulator
+from pronk.identify.simulators.mujoco import JointTestRig, MujocoSimulator
+from pronk.identify.simulators.simulator import RolloutRigs
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.load import joint_rigs, load_simulator
-from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
-from pronk.simulators.simulator import RolloutRigs
 from pronk.testing import check_simulator
 
 ROBOT = load_robot("mini_cheetah")

@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.train.mdp.speed_ranges import SpeedRanges
+from pronk.jump.train.mdp.speed_ranges import SpeedRanges
 
 pytestmark = pytest.mark.train
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pronk.links.machine import Command, State
-from pronk.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
-from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from pronk.deploy.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
+from pronk.robots.machine import Command, State
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
 DT = 0.002

@@ -11,10 +11,10 @@ import mujoco
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.match.gains import GroupGains, JointGains, MatchedGains, save
+from pronk.identify.match.gains import GroupGains, JointGains, MatchedGains, save
+from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.robots import load_robot
-from pronk.simulators.simulator import SimulatorInfo
-from pronk.train.gains import TrainingGains, training_gains
 
 ROBOT = load_robot("mini_cheetah")
 MINOR = ".".join(mujoco.__version__.split(".")[:2])

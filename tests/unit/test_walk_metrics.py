@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hopper import ROBOT
-from pronk.evaluation.walk import SETTLE_S, WalkFigures, measure_walk, walk_script
-from pronk.virtual.capture import Capture
+from pronk.jump.trial.walk import SETTLE_S, WalkFigures, measure_walk, walk_script
+from pronk.jump.virtual.capture import Capture
 from seen_jump import STANDING, changed, motion
 
 DT = 0.002

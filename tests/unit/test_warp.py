@@ -12,14 +12,14 @@ import pytest
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.arrays import Array
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
-from pronk.match.grid import search
-from pronk.match.measured_joint import measured_joints
-from pronk.match.settings import MatchSettings
-from pronk.response.response import Estimator
+from pronk.identify.excitation.signals import Chirp
+from pronk.identify.match.grid import search
+from pronk.identify.match.measured_joint import measured_joints
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.response.response import Estimator
+from pronk.identify.simulators.command_trace import CommandTrace
+from pronk.identify.simulators.mujoco import JointTestRig, MujocoSimulator, rig_on
 from pronk.robots import load_robot
-from pronk.simulators.command_trace import CommandTrace
-from pronk.simulators.mujoco import JointTestRig, MujocoSimulator, rig_on
 
 ROBOT = load_robot("mini_cheetah")
 STIFFNESS = np.array([13.0, 27.0, 20.0, 13.0, 27.0])
@@ -111,7 +111,7 @@ def test_a_missing_gpu_is_refused() -> None:
 
 
 def test_a_missing_extra_and_an_unknown_device_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "pronk.simulators.warp", raising=False)
+    monkeypatch.delitem(sys.modules, "pronk.identify.simulators.warp", raising=False)
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(PronkError, match=r"pronk\[train\]"):
         rig_on("cuda")

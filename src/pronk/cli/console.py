@@ -26,7 +26,7 @@ from pronk.errors import HardwareError
 from pronk.files import write_text
 
 if TYPE_CHECKING:
-    from pronk.evaluation.tables import Sheet
+    from pronk.jump.trial.tables import Sheet
 
 _LOOK_S = 0.2
 
@@ -121,8 +121,8 @@ def show_sheet(sheet: Sheet | None, title: str = "") -> None:
 
 
 def show_table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str) -> None:
-    """Print a table; arguments are those of `pronk.evaluation.tables.table`."""
-    from pronk.evaluation.tables import table
+    """Print a table; arguments are those of `pronk.jump.trial.tables.table`."""
+    from pronk.jump.trial.tables import table
 
     show_sheet(table(columns, rows, *notes, title=title))
 

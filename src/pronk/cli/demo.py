@@ -19,9 +19,9 @@ from pronk.names import file_name
 from pronk.processes import pool
 
 if TYPE_CHECKING:
-    from pronk.evaluation.results import Results
-    from pronk.match.predict import JointPrediction
-    from pronk.match.result import MatchResult
+    from pronk.identify.match.predict import JointPrediction
+    from pronk.identify.match.result import MatchResult
+    from pronk.jump.trial.results import Results
     from pronk.robots.robot import RobotSpec
 
 ROBOT = "mini_cheetah"
@@ -45,7 +45,7 @@ def demo(
         repeats: Repeats of the matched amplitude.
         seed: Of the virtual robot's noise.
     """
-    from pronk.evaluation import tables
+    from pronk.jump.trial import tables
     from pronk.report import figures, style
     from pronk.report.build import write_report
     from pronk.robots import load_robot
@@ -99,7 +99,7 @@ def demo(
 
 def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     """Return the policies of a folder, or of pronk's source if None; the matched one first."""
-    from pronk.evaluation.trial import load_subjects
+    from pronk.jump.trial.trial import load_subjects
 
     place = folder or Path(pronk.__file__).parents[2] / "policies"
     found = [*place.glob("policy.onnx"), *place.glob("*/policy.onnx")]
@@ -126,8 +126,8 @@ def jump_and_film(
 
     An existing trial is replaced. Without policies the results are None and no film.
     """
-    from pronk.evaluation.pictures.video import record_all
-    from pronk.evaluation.trial import VIDEOS, Plan, run_trial, setup_of
+    from pronk.jump.trial.films.video import record_all
+    from pronk.jump.trial.trial import VIDEOS, Plan, run_trial, setup_of
 
     if not policies:
         return None, ()
@@ -147,16 +147,16 @@ def sweep_and_match(
 
     The smaller amplitude only shows whether the gains hold there too; it has one repeat.
     """
-    from pronk.evaluation.virtual_sweep import sweep_virtual
-    from pronk.excitation.plan import make_plan
-    from pronk.excitation.signals import Chirp, LogChirp, Signal
-    from pronk.logs.readers import read_logs
-    from pronk.match import gains as gains_file
-    from pronk.match import result as result_file
-    from pronk.match.pipeline import match_logs
-    from pronk.match.predict import Prediction, predict, save_prediction
-    from pronk.response import save as save_responses
-    from pronk.virtual.sim_params import load_sim_params
+    from pronk.deploy.bench.virtual_sweep import sweep_virtual
+    from pronk.identify.excitation.plan import make_plan
+    from pronk.identify.excitation.signals import Chirp, LogChirp, Signal
+    from pronk.identify.logs.readers import read_logs
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match import result as result_file
+    from pronk.identify.match.pipeline import match_logs
+    from pronk.identify.match.predict import Prediction, predict, save_prediction
+    from pronk.identify.response import save as save_responses
+    from pronk.jump.virtual.sim_params import load_sim_params
 
     params, cpus = load_sim_params(), os.cpu_count() or 1
 

@@ -10,16 +10,16 @@ import tyro
 
 from pronk.cli import console
 from pronk.cli.options import Base, LinkOptions
+from pronk.deploy.runtime.safety import Limits
+from pronk.deploy.runtime.state_machine import Timing
 from pronk.errors import HardwareError, PronkError
-from pronk.runtime.safety import Limits
-from pronk.runtime.state_machine import Timing
 
 if TYPE_CHECKING:
+    from pronk.deploy.runtime.ipc import Event
+    from pronk.deploy.runtime.run import RunSummary
+    from pronk.deploy.runtime.teleop import Operator
     from pronk.policy.contract import Contract
-    from pronk.runtime.ipc import Event
-    from pronk.runtime.run import RunSummary
-    from pronk.runtime.script import Script
-    from pronk.runtime.teleop import Operator
+    from pronk.policy.script import Script
 
 
 def deploy(
@@ -54,11 +54,18 @@ def deploy(
         tilt: Largest tilt of the trunk, in rad.
         ignore_latency: Start the policy even if the measured latency exceeds its training range.
     """
-    from pronk.links.address import SIM
+    from pronk.deploy.links.address import SIM
+    from pronk.deploy.runtime.plan import Link, Plan
+    from pronk.deploy.runtime.run import run
+    from pronk.deploy.runtime.teleop import (
+        HELP,
+        PAD_HELP,
+        Gamepad,
+        Keyboard,
+        ScriptedOperator,
+        TimeLimit,
+    )
     from pronk.policy.runtime import load_policy
-    from pronk.runtime.plan import Link, Plan
-    from pronk.runtime.run import run
-    from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
 
     contract = load_policy(policy).contract
     address = machine.address(base)
@@ -106,8 +113,8 @@ def deploy(
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
     """The commands of an unattended run, those that the policy was trained for."""
-    from pronk.evaluation.protocol import parse_cases
-    from pronk.runtime.script import Script
+    from pronk.jump.trial.protocol import parse_cases
+    from pronk.policy.script import Script
 
     cases = parse_cases([text])
     ranges = contract.command_ranges
@@ -130,7 +137,7 @@ def _notify(event: Event) -> None:
 
 def _report(summary: RunSummary) -> None:
     """Print the figures of the run."""
-    from pronk.runtime.ipc import REAL, VIRTUAL
+    from pronk.deploy.runtime.ipc import REAL, VIRTUAL
 
     servo, policy = summary.servo, summary.policy
     times = {

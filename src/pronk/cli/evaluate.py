@@ -40,18 +40,18 @@ def evaluate(
         seed: Of all draws.
         device: auto: a GPU if there is one. On the CPU take a few robots.
     """
-    from pronk.evaluation.training_sim.evaluation import JUMPS, WALKS, Plan
-    from pronk.train.devices import find_devices, require_extra
+    from pronk.jump.train.devices import find_devices, require_extra
+    from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Plan
 
     require_extra()
     if out.suffix != ".json":
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
     where = "cuda:0" if find_devices(device) else "cpu"
 
-    from pronk.evaluation.training_sim import adapter
-    from pronk.evaluation.training_sim.results import load_speed_errors, save, sheets
-    from pronk.train.gains import training_gains
-    from pronk.train.tasks import load_task
+    from pronk.jump.train.gains import training_gains
+    from pronk.jump.train.tasks import load_task
+    from pronk.jump.trial.training_sim import adapter
+    from pronk.jump.trial.training_sim.results import load_speed_errors, save, sheets
 
     errors = {} if before is None else load_speed_errors(before)
     subject = adapter.load_subject(policy, where)

@@ -45,8 +45,8 @@ def export(
         per: One actuator per joint group, with the group's gains, or per joint, with its own.
     """
     from pronk.files import write_text
-    from pronk.match import gains as gains_file
-    from pronk.match.export import export_text
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match.export import export_text
     from pronk.robots import load_robot
 
     known = load_robot(robot) if robot else None

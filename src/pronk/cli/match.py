@@ -16,8 +16,8 @@ from pronk.errors import PronkError
 from pronk.names import file_name
 
 if TYPE_CHECKING:
-    from pronk.match.predict import JointPrediction
-    from pronk.match.result import MatchResult
+    from pronk.identify.match.predict import JointPrediction
+    from pronk.identify.match.result import MatchResult
 
 Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
@@ -64,11 +64,11 @@ def match(
             pronk[train]).
         reading: How logs are read.
     """
-    from pronk.match import gains as gains_file
-    from pronk.match import result as result_file
-    from pronk.match.pipeline import match_frameworks
-    from pronk.match.result import NOT_BETTER
-    from pronk.match.settings import MatchSettings
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match import result as result_file
+    from pronk.identify.match.pipeline import match_frameworks
+    from pronk.identify.match.result import NOT_BETTER
+    from pronk.identify.match.settings import MatchSettings
     from pronk.report.match_page import write_page
     from pronk.robots import load_robot
 
@@ -173,7 +173,7 @@ def framework_rows(results: Mapping[str, MatchResult]) -> list[dict[str, Any]]:
 
 def profiles() -> console.Outcome:
     """List the frameworks that gains can be matched for."""
-    from pronk.simulators import profiles as known
+    from pronk.identify.simulators import profiles as known
 
     found = known.profiles().values()
     fields = ("decimation", "delay", "friction", "source")
@@ -231,9 +231,9 @@ def predict(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         reading: How logs are read.
     """
-    from pronk.match import gains as gains_file
-    from pronk.match.predict import predict as predict_log
-    from pronk.match.predict import save_prediction
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match.predict import predict as predict_log
+    from pronk.identify.match.predict import save_prediction
     from pronk.report import figures, style
     from pronk.robots import load_robot
 

@@ -13,8 +13,8 @@ import tyro
 from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
-    from pronk.links.address import Address
-    from pronk.logs.joint_log import JointLog
+    from pronk.deploy.links.address import Address
+    from pronk.identify.logs.joint_log import JointLog
     from pronk.robots.robot import RobotSpec
 
 Layout = Literal["cheetah", "wtw"]
@@ -51,7 +51,7 @@ class LinkOptions:
 
     def address(self, base: Base | None = None) -> Address:
         """The machine's address, with what belongs to its link; None as base for the link's own."""
-        from pronk.links.address import SIM, Address
+        from pronk.deploy.links.address import SIM, Address
 
         options: dict[str, Any] = {"layout": self.layout, "port": self.port, "domain": self.domain}
         where = self.interface
@@ -99,7 +99,7 @@ class Reading:
 
     def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
         """Read every log that some paths stand for, on all cores."""
-        from pronk.logs.readers import read_logs
+        from pronk.identify.logs.readers import read_logs
 
         options = vars(self) | {
             "format": self.log_format,

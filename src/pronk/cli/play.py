@@ -32,14 +32,14 @@ def play(
         gamepad: Use a gamepad that is plugged into this machine; if there is one, if left out.
         seed: Of the virtual robot's noise.
     """
-    from pronk.evaluation.live.page import WebPage, modules
-    from pronk.evaluation.live.play import Joystick
-    from pronk.evaluation.live.play import play as run
+    from pronk.deploy.runtime.teleop import Gamepad
+    from pronk.jump.play.page import WebPage, modules
+    from pronk.jump.play.play import Joystick
+    from pronk.jump.play.play import play as run
+    from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.policy.contract import check
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
-    from pronk.runtime.teleop import Gamepad
-    from pronk.virtual.sim_params import load_sim_params
 
     modules()
     loaded = load_policy(policy)

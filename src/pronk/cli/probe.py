@@ -25,9 +25,9 @@ def probe(
         joint: The joint; the first one that moves no other if left out.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
     """
+    from pronk.identify.simulators.load import load_simulator
+    from pronk.identify.simulators.probe import probe as look
     from pronk.robots import load_robot
-    from pronk.simulators.load import load_simulator
-    from pronk.simulators.probe import probe as look
 
     known = load_robot(robot)
     made = load_simulator(simulator, known, threads=1, python=simulator_python)

@@ -14,7 +14,7 @@ from pronk.errors import LogError
 from pronk.names import file_name
 
 if TYPE_CHECKING:
-    from pronk.response.response import FrequencyResponse
+    from pronk.identify.response.response import FrequencyResponse
 
 COHERENT = 0.95
 """Least coherence of a frequency that counts as measured."""
@@ -36,9 +36,9 @@ def response(
         plots: Draw Bode plots.
         reading: How logs are read.
     """
+    from pronk.identify.response import Estimator, estimate, save
+    from pronk.identify.response.estimate import excited_joints
     from pronk.report import figures, style
-    from pronk.response import Estimator, estimate, save
-    from pronk.response.estimate import excited_joints
     from pronk.robots import load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)

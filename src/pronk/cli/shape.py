@@ -39,15 +39,15 @@ def shape(
         sim_params: Parameters of the virtual robot, instead of the shipped ones.
         reading: How logs are read.
     """
-    from pronk.evaluation.virtual_sweep import sweep_virtual
-    from pronk.logs.readers import read_logs
-    from pronk.match import gains as gains_file
-    from pronk.match import shape as shaping
-    from pronk.match.measured_joint import gains_by_joint, gains_on_drive
-    from pronk.match.translate import stated_gains
+    from pronk.deploy.bench.virtual_sweep import sweep_virtual
+    from pronk.identify.logs.readers import read_logs
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match import shape as shaping
+    from pronk.identify.match.measured_joint import gains_by_joint, gains_on_drive
+    from pronk.identify.match.translate import stated_gains
+    from pronk.identify.simulators.profiles import profile, profile_of
+    from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
-    from pronk.simulators.profiles import profile, profile_of
-    from pronk.virtual.sim_params import load_sim_params
 
     known, stated = load_robot(robot), options.drive_gains(sim_gains, "--sim-gains")
     if (gains is None) == (stated is None):

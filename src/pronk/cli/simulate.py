@@ -15,15 +15,15 @@ from pronk.cli.options import Base, Layout
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
-    from pronk.virtual.server import ServerTransport
+    from pronk.deploy.bench.server import ServerTransport
 
 _PRIORITY = 30  # of SCHED_FIFO; below that of the commanding process
 _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which the measured timing is not representative."""
 
 _SERVERS = {
-    "lcm": "pronk.virtual.lcm_server:LcmServerTransport",
-    "dds": "pronk.virtual.dds_server:DdsServerTransport",
+    "lcm": "pronk.deploy.bench.lcm_server:LcmServerTransport",
+    "dds": "pronk.deploy.bench.dds_server:DdsServerTransport",
 }
 
 
@@ -68,14 +68,14 @@ def simulate(
         capture: Write what a motion-capture rig would measure to this .npz (--base ground).
         realtime: Request real-time scheduling.
     """
-    from pronk.links.address import Address
-    from pronk.links.realtime import Interrupts, Wanted, enter
+    from pronk.deploy.bench.faults import parse_faults
+    from pronk.deploy.bench.server import RobotServer, Watchdog
+    from pronk.deploy.links.address import Address
+    from pronk.deploy.links.realtime import Interrupts, Wanted, enter
+    from pronk.jump.virtual.capture import save
+    from pronk.jump.virtual.robot import VirtualRobot, hold_of
+    from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
-    from pronk.virtual.capture import save
-    from pronk.virtual.faults import parse_faults
-    from pronk.virtual.robot import VirtualRobot, hold_of
-    from pronk.virtual.server import RobotServer, Watchdog
-    from pronk.virtual.sim_params import load_sim_params
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")

@@ -14,12 +14,12 @@ from pronk.cli.options import LinkOptions
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
-    from pronk.excitation.plan import SweepPlan
-    from pronk.runtime.ipc import Event
-    from pronk.runtime.plan import Link
+    from pronk.deploy.runtime.ipc import Event
+    from pronk.deploy.runtime.plan import Link
+    from pronk.identify.excitation.plan import SweepPlan
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""Excitation signals: classes of `pronk.excitation.signals`, `log-chirp` for `LogChirp`."""
+"""Excitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for `LogChirp`."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
 COLUMNS = {
@@ -63,13 +63,13 @@ def sweep(
         plan_only: Show what it would do to the robot and leave.
         overwrite: Replace logs that exist.
     """
-    from pronk.evaluation.virtual_sweep import sweep_virtual
-    from pronk.excitation import signals
-    from pronk.excitation.plan import make_plan
-    from pronk.links.address import SIM
+    from pronk.deploy.bench.virtual_sweep import sweep_virtual
+    from pronk.deploy.links.address import SIM
+    from pronk.deploy.runtime.plan import Link
+    from pronk.identify.excitation import signals
+    from pronk.identify.excitation.plan import make_plan
+    from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
-    from pronk.runtime.plan import Link
-    from pronk.virtual.sim_params import load_sim_params
 
     known, address = load_robot(robot), machine.address()
     virtual = address.kind == SIM
@@ -143,10 +143,10 @@ def record_wire(
             killed. What was recorded until then stays readable, with the reason.
         KeyboardInterrupt: The run was interrupted; the joints were damped.
     """
-    from pronk.runtime.plan import Plan
-    from pronk.runtime.run import run
-    from pronk.runtime.sweep import SweepTask
-    from pronk.runtime.teleop import BenchOperator
+    from pronk.deploy.runtime.plan import Plan
+    from pronk.deploy.runtime.run import run
+    from pronk.deploy.runtime.sweep import SweepTask
+    from pronk.deploy.runtime.teleop import BenchOperator
 
     metadata = {"link": str(link.address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)

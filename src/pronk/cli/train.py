@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pronk.cli import console
-from pronk.train.settings import TrainSettings
+from pronk.jump.train.settings import TrainSettings
 
 
 def train(settings: TrainSettings) -> console.Outcome:
@@ -16,11 +16,11 @@ def train(settings: TrainSettings) -> console.Outcome:
     Args:
         settings: What is trained.
     """
-    from pronk.train.devices import require_extra
+    from pronk.jump.train.devices import require_extra
 
     require_extra()
 
-    from pronk.train.run import train as run
+    from pronk.jump.train.run import train as run
 
     again = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
     try:

@@ -33,12 +33,12 @@ def translate(
             GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         out: The gains file to write.
     """
-    from pronk.match import gains as gains_file
-    from pronk.match import translate as translation
-    from pronk.match.export import profile_held, robot_of
-    from pronk.match.measured_joint import gains_by_joint
+    from pronk.identify.match import gains as gains_file
+    from pronk.identify.match import translate as translation
+    from pronk.identify.match.export import profile_held, robot_of
+    from pronk.identify.match.measured_joint import gains_by_joint
+    from pronk.identify.simulators.profiles import profile, profiles
     from pronk.robots import load_robot
-    from pronk.simulators.profiles import profile, profiles
 
     stated = options.drive_gains(drive_gains)
     if gains is None:

@@ -13,8 +13,8 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.evaluation.tables import Sheet
-    from pronk.evaluation.trial import Plan, Setup
+    from pronk.jump.trial.tables import Sheet
+    from pronk.jump.trial.trial import Plan, Setup
 
 RATES_JUMPS = 3
 """At 2.25 m/s, beside the paper's commands: enough to draw its figure of roll and pitch rates."""
@@ -66,12 +66,12 @@ def trial(
         overwrite: Replace the trial in that folder.
         definitions: Also print the equation of every figure.
     """
-    from pronk.evaluation import tables
-    from pronk.evaluation.criteria import trial_checks
-    from pronk.evaluation.pictures.video import record_all
-    from pronk.evaluation.protocol import parse_cases
-    from pronk.evaluation.results import SUMMARY, TABLE
-    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, run_trial, setup_of
+    from pronk.jump.trial import tables
+    from pronk.jump.trial.criteria import trial_checks
+    from pronk.jump.trial.films.video import record_all
+    from pronk.jump.trial.protocol import parse_cases
+    from pronk.jump.trial.results import SUMMARY, TABLE
+    from pronk.jump.trial.trial import CAPTURES, VIDEOS, Plan, run_trial, setup_of
     from pronk.report.build import write_report
 
     if own and not bodies:
@@ -145,10 +145,10 @@ def _extra_sheets(
     report: console.Reporter,
 ) -> Iterator[Sheet]:
     """Run what belongs to a trial besides its jumps, and yield the tables."""
-    from pronk.evaluation import bodies, variation
-    from pronk.evaluation.crossing import CrossingPlan, add_crossings
-    from pronk.evaluation.trial import Plan
-    from pronk.evaluation.walk import add_walks
+    from pronk.jump.trial import bodies, variation
+    from pronk.jump.trial.crossing import CrossingPlan, add_crossings
+    from pronk.jump.trial.trial import Plan
+    from pronk.jump.trial.walk import add_walks
     from pronk.report import extra_pages
 
     seed = plan.seed

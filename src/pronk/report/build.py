@@ -9,16 +9,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from pronk.deploy.runtime.log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
-from pronk.evaluation import bodies
-from pronk.evaluation.crossing import CROSSING
-from pronk.evaluation.results import SUMMARY
-from pronk.evaluation.variation import VARIATION
-from pronk.evaluation.walk import WALK
 from pronk.files import write_text
+from pronk.jump.trial import bodies
+from pronk.jump.trial.crossing import CROSSING
+from pronk.jump.trial.results import SUMMARY
+from pronk.jump.trial.variation import VARIATION
+from pronk.jump.trial.walk import WALK
 from pronk.report import deploy_page, extra_pages, match_page, trial_page
 from pronk.report.page import Part, page
-from pronk.runtime.log import is_deploy_log
 
 NAME = "report.html"
 LOGS = "*.mcap"

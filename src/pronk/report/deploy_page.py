@@ -13,8 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from pronk.arrays import Array
+from pronk.deploy.runtime.ipc import REAL, VIRTUAL, Mode
+from pronk.deploy.runtime.log import DeployLog, read_deploy_log
+from pronk.deploy.runtime.safety import FilterAction
 from pronk.errors import PronkError
-from pronk.evaluation.tables import Sheet, table
+from pronk.jump.trial.tables import Sheet, table
 from pronk.report import deploy_run as run
 from pronk.report import style
 from pronk.report.deploy_run import Delay, faults, jumps, seconds
@@ -22,9 +25,6 @@ from pronk.report.page import Part
 from pronk.report.style import drawing, joint_words, key, legend, picture
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.ipc import REAL, VIRTUAL, Mode
-from pronk.runtime.log import DeployLog, read_deploy_log
-from pronk.runtime.safety import FilterAction
 
 _MODE_COLOURS = {Mode.STAND: "#dcebf5", Mode.POLICY: "#9cc9e6", Mode.HALT: "#c3deef"}
 _MODE_COLOURS |= {Mode.SIT: "#dcebf5", Mode.FAULT: "#f3b48a"}

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from pronk.arrays import Array, Mask
+from pronk.deploy.runtime.ipc import Mode
+from pronk.deploy.runtime.log import DeployLog
+from pronk.deploy.runtime.safety import FilterAction, Reason
 from pronk.report.style import rms
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.ipc import Mode
-from pronk.runtime.log import DeployLog
-from pronk.runtime.safety import FilterAction, Reason
 
 POLICY_MODES = (Mode.POLICY, Mode.HALT)
 """Modes in which the policy gives the targets."""

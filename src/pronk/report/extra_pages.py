@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.evaluation import bodies as bodies_file
-from pronk.evaluation import results as results_file
-from pronk.evaluation import tables
-from pronk.evaluation import variation as varied
-from pronk.evaluation.bodies import Bodies, Body
-from pronk.evaluation.criteria import trial_checks
-from pronk.evaluation.crossing import CROSSING, Climb, climbs
-from pronk.evaluation.jumps import FIGURES
-from pronk.evaluation.results import Results, Spread, share_interval
-from pronk.evaluation.tables import Sheet, definitions, number, place, table, tally
-from pronk.evaluation.variation import VARIATION, parameters_of
-from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
+from pronk.jump.trial import bodies as bodies_file
+from pronk.jump.trial import results as results_file
+from pronk.jump.trial import tables
+from pronk.jump.trial import variation as varied
+from pronk.jump.trial.bodies import Bodies, Body
+from pronk.jump.trial.criteria import trial_checks
+from pronk.jump.trial.crossing import CROSSING, Climb, climbs
+from pronk.jump.trial.jumps import FIGURES
+from pronk.jump.trial.results import Results, Spread, share_interval
+from pronk.jump.trial.tables import Sheet, definitions, number, place, table, tally
+from pronk.jump.trial.variation import VARIATION, parameters_of
+from pronk.jump.trial.walk import SETTLE_S, WALK, WALK_FIGURES
 from pronk.report import trial_figures as draw
 from pronk.report import trial_page
 from pronk.report.page import Part

@@ -16,13 +16,13 @@ from matplotlib.ticker import LogLocator, NullLocator
 from scipy import stats
 
 from pronk.arrays import Array, ComplexArray, Mask
-from pronk.match.gains import MatchedGains
-from pronk.match.predict import JointPrediction
-from pronk.match.result import JointFit, MatchResult
+from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.predict import JointPrediction
+from pronk.identify.match.result import JointFit, MatchResult
+from pronk.identify.response.response import FrequencyResponse
 from pronk.report import style
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import drawing, key, legend
-from pronk.response.response import FrequencyResponse
 
 _Curves = Sequence[tuple[ComplexArray, dict[str, Any]]]
 

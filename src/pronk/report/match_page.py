@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from pronk.errors import ArtefactError, RobotError
-from pronk.evaluation.tables import Sheet, table
 from pronk.files import write_text
-from pronk.match import gains as gains_file
-from pronk.match import result as result_file
-from pronk.match.gains import MatchedGains
-from pronk.match.parameters import PARAMETERS
-from pronk.match.predict import Prediction, load_prediction
-from pronk.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
-from pronk.match.torque import UNITS
+from pronk.identify.match import gains as gains_file
+from pronk.identify.match import result as result_file
+from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.parameters import PARAMETERS
+from pronk.identify.match.predict import Prediction, load_prediction
+from pronk.identify.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
+from pronk.identify.match.torque import UNITS
+from pronk.jump.trial.tables import Sheet, table
 from pronk.report import figures
 from pronk.report.page import Part, page
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING

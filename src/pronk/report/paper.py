@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pronk.evaluation.protocol import TABLE_III
+from pronk.jump.trial.protocol import TABLE_III
 
 ROBOT = "mini_cheetah"
 """The paper's robot."""

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from pronk.arrays import Array
-from pronk.evaluation.results import Spread
+from pronk.jump.trial.results import Spread
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
 

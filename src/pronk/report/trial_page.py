@@ -11,17 +11,17 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import ArtefactError
-from pronk.evaluation import tables
-from pronk.evaluation.criteria import trial_checks
-from pronk.evaluation.protocol import RATES, in_paper_order
-from pronk.evaluation.results import SUMMARY, Results, load, share_interval
+from pronk.jump.trial import tables
+from pronk.jump.trial.criteria import trial_checks
+from pronk.jump.trial.protocol import RATES, in_paper_order
+from pronk.jump.trial.results import SUMMARY, Results, load, share_interval
+from pronk.jump.virtual import capture as capture_file
 from pronk.report import style
 from pronk.report import trial_figures as draw
 from pronk.report.page import Part
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture, rms
 from pronk.report.trial_figures import Values
-from pronk.virtual import capture as capture_file
 
 BEFORE_S, AFTER_S = 0.5, 2.0
 """Window of the height traces about the jump input [s]."""

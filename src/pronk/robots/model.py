@@ -27,8 +27,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.errors import RobotError
+from pronk.robots.drive_law import EXPLICIT, DriveLaw
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 _POSITION_INPUT = 1  # dcmotor input_mode: control is a position command

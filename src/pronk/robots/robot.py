@@ -6,9 +6,9 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.errors import RobotError
 from pronk.names import check_names
+from pronk.robots.drive_law import EXPLICIT, DriveLaw
 
 if TYPE_CHECKING:
     import mujoco

@@ -1,1 +1,0 @@
-"""Physics of the DC motor and gearbox that drive a joint."""

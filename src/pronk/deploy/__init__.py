@@ -1,0 +1,1 @@
+"""Sweeps and policies on a robot, through the safety filter."""

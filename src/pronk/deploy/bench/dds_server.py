@@ -1,0 +1,108 @@
+"""The robot's end of a DDS link, as of a Go2 and stricter."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from pronk.deploy.bench.server import ServerTransport
+from pronk.deploy.links.dds import codec, link
+from pronk.deploy.links.dds.codec import decode_command, encode_command, encode_state, joint_map
+from pronk.deploy.links.dds.link import BAD_PARAMETER, DONE, UNKNOWN_API, take, write
+from pronk.robots.machine import Command, State
+from pronk.robots.robot import RobotSpec
+
+MODES = ("", "normal", "ai", "advanced", "mcf")  # that can hold the joints; the first is none
+_SERVICE_POLLS = 20  # polls of commands to one of requests: 10 ms at the virtual robot's rate
+
+
+class DdsServerTransport(ServerTransport):
+    """The robot's end in Unitree's messages, on loopback only."""
+
+    def __init__(self, robot: RobotSpec, *, domain: int | None = None, mode: str = "") -> None:
+        """Join a domain, with the controller that holds the joints at first."""
+        network = link.DdsNetwork(domain=domain)
+        super().__init__(robot, mode, MODES)
+        self._joints = joint_map(robot)
+        # Another writer is another participant.
+        own, other = link.Participant(network), link.Participant(network)
+        self._commands = own.reader(link.COMMANDS, codec.LowCmd)
+        self._states = own.writer(link.STATES, codec.LowState)
+        self._other = other.writer(link.COMMANDS, codec.LowCmd)
+        # A handler takes a function's number and its parameter, and returns code and data.
+        self._services = [
+            (
+                own.reader(f"rt/api/{name}/request", codec.Request),
+                own.writer(f"rt/api/{name}/response", codec.Response),
+                handler,
+            )
+            for name, handler in ((link.SWITCHER, self._switch), (link.BENCH, self._bench))
+        ]
+        self._polls = 0
+
+    def poll(self) -> list[Command]:
+        """Commands that arrived since the last poll, oldest first."""
+        self._polls += 1
+        if self._polls % _SERVICE_POLLS == 1:
+            self._respond()
+        arrived = []
+        for message in take(self._commands, self.counts):
+            with self.refusing():
+                arrived.append(decode_command(self._joints, self.corrupt_in(message.data)))
+                self.counts["commands"] += 1
+        return arrived
+
+    def publish(self, state: State) -> None:
+        """Put a state on the wire."""
+        write(self._states, self.corrupt_out(encode_state(self._joints, state)), self.counts)
+        self.counts["states"] += 1
+
+    def contend(self, command: Command) -> None:
+        """Command the joints as another program would."""
+        write(self._other, encode_command(self._joints, command), self.counts)
+
+    def close(self) -> None:
+        """Leave the wire."""
+        del self._commands, self._states, self._services, self._other
+
+    def _respond(self) -> None:
+        for requests, responses, handler in self._services:
+            for request in take(requests, self.counts):
+                identity = request.header.identity
+                try:
+                    parameter = json.loads(request.parameter or "null")
+                except (ValueError, RecursionError):
+                    code, data = BAD_PARAMETER, None
+                else:
+                    code, data = handler(identity.api_id, parameter)
+                if code != DONE:
+                    self.counts["refused: request"] += 1
+                status = codec.ResponseStatus(code=code)
+                header = codec.ResponseHeader(identity=identity, status=status)
+                text = "" if data is None else json.dumps(data)
+                responses.write(codec.Response(header=header, data=text, binary=[]))
+
+    def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
+        """The service that reports and changes which controller holds the joints."""
+        if api_id == link.CHECK_MODE:
+            return DONE, {"form": "0", "name": self.mode}
+        if api_id not in (link.RELEASE_MODE, link.SELECT_MODE):
+            return UNKNOWN_API, None
+        name = ""
+        if api_id == link.SELECT_MODE:
+            name = parameter.get("name", "") if isinstance(parameter, dict) else ""
+            if name not in MODES[1:]:
+                return BAD_PARAMETER, None
+        self.mode = name
+        self.counts["mode switches"] += 1
+        return DONE, None
+
+    def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
+        """The service that holds joints mechanically."""
+        if api_id != link.CLAMP:
+            return UNKNOWN_API, None
+        joints = parameter.get("joints") if isinstance(parameter, dict) else None
+        if not isinstance(joints, list) or not all(name in self._names for name in joints):
+            return BAD_PARAMETER, None
+        self.clamps = tuple(name for name in self._names if name in joints)
+        return DONE, {"joints": list(self.clamps)}

@@ -1,0 +1,85 @@
+"""The robot's end of an LCM link, as of a Mini Cheetah or of the bridge on a Go1.
+
+A message that is not a possible command is refused and counted, where Cheetah-Software would pass
+it to the motors.
+"""
+
+from __future__ import annotations
+
+from pronk.deploy.bench.server import ServerTransport
+from pronk.deploy.links.lcm import codec
+from pronk.deploy.links.lcm.codec import CONTROL_PARAMETER, VIRTUAL_ROBOT
+from pronk.deploy.links.lcm.link import open_lcm, url_of
+from pronk.robots.machine import Command, State
+from pronk.robots.robot import RobotSpec
+
+_BEACON_STATES = 50  # states between two beacons: 10 Hz
+_QUEUE = 1000  # messages read in one poll; a sender of more cannot stop the robot's time
+
+
+class LcmServerTransport(ServerTransport):
+    """The robot's end in the messages of a layout."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        *,
+        layout: str = "cheetah",
+        port: int | None = None,
+        mode: str = "",
+        url: str | None = None,
+    ) -> None:
+        """Open the robot's end on a port of this computer, or at an LCM address of its own.
+
+        `mode` names the controller that holds the joints at first.
+        """
+        super().__init__(robot, mode, codec.MODES.values())
+        self._layout = known = codec.layout_of(layout)
+        # Another writer is another sender.
+        self._lcm, self._other = (open_lcm(url or url_of(port=port)) for _ in range(2))
+        self._arrived: list[Command] = []
+        self._bench_request, self._requested = 0, False
+        for channel in (known.command.channel, CONTROL_PARAMETER.channel, VIRTUAL_ROBOT.channel):
+            self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
+
+    def poll(self) -> list[Command]:
+        """Commands that arrived since the last poll, oldest first."""
+        for _ in range(_QUEUE):
+            if self._lcm.handle_timeout(0) == 0:
+                break
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def receive(self, channel: str, data: bytes) -> None:
+        """Take one message, whatever it is. Never raises."""
+        with self.refusing():
+            if channel == self._layout.command.channel:
+                self._arrived.append(codec.decode_command(self._layout, self.corrupt_in(data)))
+                self.counts["commands"] += 1
+            elif channel == CONTROL_PARAMETER.channel:
+                self.mode = codec.read_mode_request(data)
+                self.counts["mode switches"] += 1
+                self._lcm.publish(codec.RESPONSE_CHANNEL, data)
+            elif channel == VIRTUAL_ROBOT.channel:
+                self._bench_request, self.clamps = codec.read_clamp_message(self._names, data)
+                self._requested = True
+
+    def publish(self, state: State) -> None:
+        """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
+        messages = (self._layout.attitude, self._layout.joints)
+        for message, data in zip(messages, codec.encode_state(self._layout, state), strict=True):
+            self._lcm.publish(message.channel, self.corrupt_out(data))
+        if self._requested or self.counts["states"] % _BEACON_STATES == 0:
+            self._requested = False
+            beacon = codec.clamp_message(self._names, self.clamps, self._bench_request)
+            self._lcm.publish(codec.BEACON_CHANNEL, beacon)
+        self.counts["states"] += 1
+
+    def contend(self, command: Command) -> None:
+        """Command the joints as another program would."""
+        data = codec.encode_command(self._layout, command)
+        self._other.publish(self._layout.command.channel, data)
+
+    def close(self) -> None:
+        """Leave the wire."""
+        del self._lcm, self._other

@@ -1,0 +1,225 @@
+"""The policy's process: at 50 Hz from the newest state to an action for the servo.
+
+It steps from the moment the robot is damped, whether its actions are used or not: so the network is
+warm, and the latency is known, before the policy starts. Every change of mode resets the policy's
+history, except from `POLICY` to `HALT`.
+
+Just before each step a second instance of the policy runs for warm-up: between two steps, 20 ms
+apart, the network's weights (2.8 MB) leave the caches, and a step takes five times as long as it
+does back to back. `python -m benchmarks tick` measures it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
+from pronk.deploy.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, fill, get_state, serve
+from pronk.deploy.runtime.plan import POLICY_PRIORITY, Plan
+from pronk.errors import PronkError
+from pronk.policy.contract import Contract, check
+from pronk.policy.observation import History
+from pronk.policy.rollout import measurement
+from pronk.policy.runtime import Policy, load_policy
+from pronk.policy.script import STILL, Commanded
+from pronk.processes import die_with_parent
+from pronk.robots.machine import State
+
+WARM_UP = 20
+"""Warm-up steps before the first step."""
+LEAD_S = 2e-3
+"""Begin of the warm-up before a deadline: a tenth of a policy's step [s]."""
+_FIRST_S = 1e-3
+"""Time allowed for the first warm-up step [s]."""
+_SHARE = 0.5
+"""Time allowed for the next, as a share of what the last one took."""
+_SPIN_S = 0.2e-3
+"""Shorter waits are spun; a sleep ends up to so much late [s]."""
+_PHASE_S = 0.4e-3
+"""After the servo's tick, when its state is there: nothing waits for the next tick [s]."""
+_LIVE = (Mode.POLICY, Mode.HALT)
+
+
+def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
+    """Wait for a deadline, and repeat something in the last 2 ms before it.
+
+    Nothing is begun in less than half of the time that it took before, because each repeat is
+    quicker than the one before. `deadline` is a time of CLOCK_MONOTONIC [s]; returns the number of
+    repeats.
+    """
+    sleep_until(deadline - LEAD_S)
+    count, needed, now = 0, _FIRST_S, time.monotonic()
+    while now + needed < deadline:
+        act()
+        count += 1
+        done = time.monotonic()
+        needed, now = _SHARE * (done - now), done
+    sleep_until(deadline - _SPIN_S)
+    while time.monotonic() < deadline:
+        pass
+    return count
+
+
+def serve_policy(plan: Plan, name: str, end: Connection) -> None:
+    """Body of the policy's process."""
+    leave()
+    die_with_parent()
+    assert plan.policy is not None
+    shared = Shared(name, len(plan.robot.joints))
+    process = PolicyProcess(plan, shared, load_policy(plan.policy))
+    for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
+        shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
+    serve(process, shared, end)
+
+
+def standing(contract: Contract) -> State:
+    """The state of a robot that stands in its default pose."""
+    count = len(contract.joint_names)
+    return State(
+        time=0.0,
+        sequence=0,
+        position=np.array(contract.default_position),
+        velocity=np.zeros(count),
+        torque=np.zeros(count),
+        gyro=np.zeros(3),
+        accelerometer=np.array([0.0, 0.0, 9.81]),
+        bus_voltage=0.0,
+    )
+
+
+class PolicyProcess:
+    """The loop and its figures."""
+
+    def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
+        """Warm the network up.
+
+        Raises:
+            ArtefactError: The policy is not for this robot, or its output is not finite.
+        """
+        self.plan = plan
+        self.shared = shared
+        check(policy.contract, plan.robot)
+        self.policy = policy
+        self.rate_hz = policy.contract.policy_rate_hz
+        self.lateness = Histogram()
+        self.decision = Histogram()
+        """Observation built and network run."""
+        self.network = Histogram()
+        """The network alone."""
+        self._stand_in = policy.sibling()
+        self._standing = measurement(standing(policy.contract))
+        self._history = History(policy.contract.default_position)
+        self._jumps = policy.contract.jump
+        self._least, self._most = zip(*policy.contract.command_ranges.values(), strict=True)
+        self._pace: Pace | None = None
+        self._entry = -1
+        self._mode = Mode.IDLE
+        self._stopping = False
+        self._parent = os.getppid()
+        self._last_error = ""
+        self._action = np.zeros((), dtype=ACTIONS)
+        self._step = np.zeros((), dtype=STEP)
+        self._count = 0
+        for _ in range(WARM_UP):
+            self.warm_up()
+
+    def stop(self) -> None:
+        """End at the next step."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Step until the servo has ended."""
+        while not self._stopping and os.getppid() == self._parent:
+            record = self.shared.state.read()
+            if record is None:
+                time.sleep(1.0 / self.rate_hz)
+                continue
+            mode = Mode(int(record["mode"]))
+            if mode is Mode.ENDED:
+                return
+            if self._pace is None:
+                # On the servo's grid, so that states always have the same age.
+                self._pace = Pace(self.rate_hz, float(record["start"]) + _PHASE_S)
+                self._pace.advance(time.monotonic())
+            warm_up_until(self._pace.deadline, self.warm_up)
+            self.step(self._pace)
+
+    def warm_up(self) -> None:
+        """Run the first step of a robot that stands, with the second instance of the policy."""
+        self._stand_in.reset()
+        self._stand_in.step(self._standing, STILL)
+
+    def figures(self) -> dict[str, Any]:
+        """Of the run so far."""
+        pace = self._pace
+        return {
+            "steps": self.decision.count,
+            "missed_steps": 0 if pace is None else pace.missed,
+            "lateness": self.lateness.figures(),
+            "decision": self.decision.figures(),
+            "network": self.network.figures(),
+        }
+
+    def step(self, pace: Pace) -> None:
+        """Compute an action from the newest state."""
+        begun, deadline = time.monotonic(), pace.deadline
+        self.lateness.add(begun - deadline)
+        record = self.shared.state.read()
+        if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
+            mode, entry = Mode(int(record["mode"])), int(record["entry"])
+            if entry != self._entry and not (mode is Mode.HALT and self._mode is Mode.POLICY):
+                self.policy.reset()
+                self._history.reset()
+                self._entry = entry
+            self._mode = mode
+            try:
+                self._act(record, deadline, begun)
+            except PronkError as error:
+                # Without an action the last one expires in the servo's filter.
+                if str(error) != self._last_error:
+                    self._last_error = str(error)
+                    notice = event(time.monotonic(), "policy", self._last_error)
+                    self.shared.policy_events.put(notice)
+        pace.advance(time.monotonic())
+
+    def _act(self, record: np.void, deadline: float, begun: float) -> None:
+        state = get_state(record)
+        velocity, jump = self._commanded()
+        now = time.monotonic()
+        target = self.policy.step(measurement(state), velocity, jump)
+        inferred = time.monotonic()
+        self.decision.add(inferred - now)
+        self.network.add(self.policy.network_s)
+        outputs = self.policy.inference
+        assert outputs is not None
+        action, of = self._action, {"state_sequence": state.sequence, "state_time": state.time}
+        fill(action, **of, sequence=self._count, entry=self._entry, position=target)
+        fill(action, made=begun, valid_for=self.plan.action_valid_s)
+        self.shared.actions.write(action)
+        done = time.monotonic()
+        self._count += 1
+        # The observation for the log, built again after the action is out.
+        observation = self._history.observe(measurement(state), velocity)
+        self._history.acted(outputs.action[0])
+        step = self._step
+        fill(step, **of, sequence=action["sequence"], observation=observation)
+        fill(step, deadline=deadline, begun=begun, observed=now, inferred=inferred, done=done)
+        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, target=target)
+        for name in ("action", "contact", "linear_velocity"):
+            step[name] = getattr(outputs, name)[0]
+        self.shared.steps.put(step)
+        self._last_error = ""
+
+    def _commanded(self) -> Commanded:
+        """The operator's command within the ranges of training; zero unless the policy is live."""
+        record = self.shared.operator.read()
+        if record is None or self._mode is not Mode.POLICY:
+            return STILL, False
+        forward, left, yaw = np.clip(record["command"], self._least, self._most).tolist()
+        return (forward, left, yaw), bool(record["jump"]) and self._jumps

@@ -1,0 +1,400 @@
+"""A run of a policy or a sweep: its processes, and the operator's end of them."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, Self
+
+import numpy as np
+import orjson
+
+from pronk import __version__
+from pronk.deploy.links.address import SIM
+from pronk.deploy.links.realtime import Interrupts, sleep_until, terminal_blocked
+from pronk.deploy.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
+from pronk.deploy.runtime.log import READY, write_log
+from pronk.deploy.runtime.plan import SERVO_PRIORITY, Plan
+from pronk.deploy.runtime.policy_process import serve_policy
+from pronk.deploy.runtime.servo import serve_robot
+from pronk.deploy.runtime.standby import serve_standby
+from pronk.deploy.runtime.teleop import Operator, OperatorCommand
+from pronk.errors import HardwareError, LogError, PronkError
+from pronk.policy.contract import check
+from pronk.policy.runtime import Policy, load_policy
+
+_RATE_HZ = 50.0
+"""Of the operator's program."""
+_BEAT_S = 0.01
+"""Between two heartbeats of the operator's program [s]."""
+_STALL_S = 0.7
+"""Longest that the operator's program may be late, on a busy computer or at a slow terminal, before
+its heartbeat ends; `Plan.operator_timeout_s` follows [s]."""
+_START_S = 30.0
+"""In which the servo must have opened the link."""
+_END_S = 10.0
+"""In which each process must have ended."""
+
+_QUIT = OperatorCommand(request=OperatorRequest.QUIT)
+
+
+@dataclass(kw_only=True)
+class RunSummary:
+    """Figures and events of a run."""
+
+    servo: dict[str, Any] = field(default_factory=dict)
+    """Of the servo; empty if it was killed."""
+    policy: dict[str, Any] = field(default_factory=dict)
+    """Of the policy's process; empty if it was killed."""
+    events_seen: list[Event] = field(default_factory=list)
+    log_error: str = ""
+    """Why the log could not be written to its end."""
+    standby: bool = False
+    """Whether the standby process damped the joints, because the servo was silent."""
+    interrupted: bool = False
+    """Whether a signal ended it: the interrupt key, or the end of the terminal."""
+    trained_delay_s: tuple[float, float] = (0.0, 0.0)
+    """Command delays that the policy was trained for [s]."""
+
+    @property
+    def faults(self) -> list[str]:
+        """Faults that damped the robot."""
+        return [event.text for event in self.events_seen if event.kind == "fault"]
+
+    @property
+    def refusals(self) -> list[str]:
+        """Results of the pre-flight checks and of opening the link."""
+        return [event.text for event in self.events_seen if event.kind == "refused"]
+
+    def delay_words(self) -> str:
+        """The measured delay and the range that the policy was trained for, in one line."""
+        low, high = (1e3 * edge for edge in self.trained_delay_s)
+        measured = self.servo.get("state_to_command", {})
+        if not measured.get("n"):
+            return f"no delay was measured; the policy was trained for {low:g} to {high:g} ms."
+        p50, p95 = measured["p50_ms"], measured["p95_ms"]
+        where = "within" if p95 <= high else "BEYOND"
+        return (
+            f"state to command {p50:.1f} ms (median), {p95:.1f} ms (95 %), n = {measured['n']}: "
+            f"{where} the {low:g} to {high:g} ms trained for; the drives' own delay comes on top."
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """For JSON and the end of the log."""
+        return {
+            "servo": self.servo,
+            "policy": self.policy,
+            "trained_delay_s": list(self.trained_delay_s),
+            "faults": self.faults,
+            "refusals": self.refusals,
+            "standby": self.standby,
+            "log_error": self.log_error,
+            "interrupted": self.interrupted,
+        }
+
+
+class Deployment:
+    """Runs the processes of a plan. A context manager; leaving it damps, then ends them all."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Check what can be checked before any process starts.
+
+        Raises:
+            ArtefactError: The policy cannot be read, or is not for this robot.
+            PronkError: ONNX Runtime is not installed.
+        """
+        plan.safety()
+        self.plan = plan
+        self.summary = RunSummary()
+        self._header: dict[str, Any] = {}
+        if plan.policy is not None:
+            policy = load_policy(plan.policy)
+            check(policy.contract, plan.robot)
+            self.summary.trained_delay_s = policy.contract.delay_range_s
+            self._header = _header(plan, policy)
+        if plan.sweep is not None:
+            plan.sweep.check()
+        self.servo: BaseProcess
+        self.policy: BaseProcess | None = None
+        self.logger: BaseProcess | None = None
+        self.standby: BaseProcess | None = None
+        """Of a robot behind a network."""
+        self._ends: dict[BaseProcess, Connection] = {}
+        """This end of the pipe to each process."""
+        self._record = np.zeros((), dtype=OPERATOR)
+        self._written, self._beating = threading.Event(), False
+        self._heart = threading.Thread(target=self._beat, name="pronk heartbeat", daemon=True)
+        self._open = False
+        self._interrupts = Interrupts()
+
+    def __enter__(self) -> Self:
+        """Start everything; HardwareError if the link could not be opened."""
+        plan = self.plan
+        with terminal_blocked():
+            self.shared = Shared(joints=len(plan.robot.joints))
+        self.write(OperatorCommand())
+        self._beating = True
+        with terminal_blocked():
+            self._heart.start()
+        self.servo = self._process("servo", serve_robot, self.summary.trained_delay_s)
+        if plan.policy is not None:
+            self.policy = self._process("policy", serve_policy)
+        if plan.log is not None or plan.sweep is not None:
+            self.logger = self._process("log", write_log, self._header)
+        if plan.link.address.kind != SIM:
+            self.standby = self._process("standby", serve_standby)
+        self._interrupts.__enter__()
+        self._open = True
+        try:
+            with terminal_blocked():
+                for started in (self.policy, self.logger, self.standby):
+                    if started is not None:
+                        started.start()
+            if self.logger is not None:
+                silent = f"{plan.log}: the process that writes the log did not start."
+                reply = self._first(self.logger, LogError(silent))
+                if reply != READY:
+                    raise LogError(reply.decode())
+            if self.standby is not None:
+                silent = "the process that damps in place of the servo did not start."
+                self._first(self.standby, HardwareError(silent))
+            # Last, so that its first tick is logged.
+            with terminal_blocked():
+                self.servo.start()
+            self._await_servo()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _process(self, what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
+        """A process that is not started yet; the pipe's other end is its last argument."""
+        context = get_context("spawn")
+        end, other = context.Pipe()
+        given = (self.plan, self.shared.name, *given, other)
+        process = context.Process(target=body, args=given, name=f"pronk {what}")
+        self._ends[process] = end
+        return process
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the servo; `ENDED` too if its process is gone or the standby took over."""
+        gone = not self.servo.is_alive() or self.shared.standby.written > 0
+        return Mode.ENDED if gone else self.shared.mode or Mode.IDLE
+
+    def events_seen(self) -> list[Event]:
+        """Events of the servo since the last call; the summary keeps them too."""
+        found = [Event.of(record) for record in self.shared.events_seen.take()]
+        self.summary.events_seen += found
+        return found
+
+    def write(self, command: OperatorCommand) -> None:
+        """Send the operator's command to servo and policy; call it at about 50 Hz.
+
+        Raises:
+            KeyboardInterrupt: A signal requests the end; raised only here, and not while closing.
+        """
+        if self._open:
+            self._interrupts.check()
+        record = self._record.copy()
+        if command.request is not OperatorRequest.NONE:
+            record["request"] = command.request
+            record["requests"] += 1
+        fill(record, time=time.monotonic(), held=command.held, jump=command.jump)
+        record["command"] = command.command
+        # Replaced as a whole; the heartbeat alone writes to the mailbox.
+        self._record = record
+        self._written.set()
+
+    def _beat(self) -> None:
+        """Body of a thread: write the newest command with the time, as promptly as the servo."""
+        if self.plan.real_time:
+            with suppress(AttributeError, OSError):  # of this thread alone
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVO_PRIORITY))
+        while self._beating:
+            self._written.clear()
+            record, now = self._record.copy(), time.monotonic()
+            if now - float(record["time"]) <= _STALL_S:
+                record["time"] = now
+                self.shared.operator.write(record)
+            self._written.wait(_BEAT_S)
+
+    def run(
+        self,
+        operator: Operator,
+        notify: Callable[[Event], None] = lambda event: None,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> RunSummary:
+        """Send the operator's commands until the servo ends.
+
+        `progress` gets the share of a sweep that is done, 0 to 1.
+        """
+        wake = time.monotonic()
+        while True:
+            mode = self.mode
+            for event in self.events_seen():
+                operator.notified(event.kind, event.text)
+                notify(event)
+            if mode is Mode.ENDED:
+                return self.summary
+            record = self.shared.state.read()
+            progress(0.0 if record is None else float(record["progress"]))
+            try:
+                command = operator.command(time.monotonic(), mode)
+                logging = self.logger is not None and self.logger.is_alive()
+                self.write(command if logging or self.plan.sweep is None else _QUIT)
+            except KeyboardInterrupt:
+                self.summary.interrupted = True
+                self.write(_QUIT)
+                operator.leave()
+            wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
+            sleep_until(wake)
+
+    def close(self) -> None:
+        """Damp, end all processes, finish the log; closing twice has no effect."""
+        if not self._open:
+            return
+        self._open = False
+        try:
+            if self.servo.pid is not None:
+                self._stop_servo()
+            for process in (self.standby, self.policy):
+                if process is not None and process.pid is not None:
+                    process.terminate()
+                    process.join(_END_S)
+            self.summary.standby = self.shared.standby.written > 0
+            self.summary.servo = self._figures(self.servo)
+            self.summary.policy = self._figures(self.policy)
+            self.events_seen()
+            if self.logger is not None and self.logger.pid is not None:
+                self._stop_logger(self.logger)
+        finally:
+            for process in (self.servo, self.policy, self.logger, self.standby):
+                if process is not None and process.is_alive():
+                    process.kill()
+                    process.join()
+            self._beating = False
+            self._heart.join()
+            self.shared.close()
+            self._interrupts.__exit__(None, None, None)
+
+    def _stop_servo(self) -> None:
+        """Request the end; commands continue meanwhile, because their absence is a fault."""
+        if self.shared.standby.written:
+            self.servo.kill()  # it is stopped, or was for so long that the joints are damped
+            self.servo.join()
+            return
+        until = time.monotonic() + _END_S
+        self.write(_QUIT)
+        while self.servo.is_alive() and time.monotonic() < until:
+            self.servo.join(1.0 / _RATE_HZ)
+            self.write(OperatorCommand())
+        if self.servo.is_alive():
+            self.servo.terminate()
+            self.servo.join(_END_S)
+
+    def _figures(self, process: BaseProcess | None) -> dict[str, Any]:
+        """What a process sent when it ended; {} if it was killed."""
+        if process is None:
+            return {}
+        end = self._ends[process]
+        try:
+            return dict(orjson.loads(end.recv_bytes())) if end.poll(1.0) else {}
+        except (EOFError, OSError):
+            return {}
+
+    def _stop_logger(self, logger: BaseProcess) -> None:
+        summary, end = self.summary, self._ends[logger]
+        figures = summary.figures()
+        if not summary.servo:
+            figures["reason"] = "the servo's process was killed"
+        ended = time.time()
+        try:
+            if not end.poll():
+                end.send_bytes(orjson.dumps(figures))
+                logger.join(_END_S)
+            if end.poll():  # an error, or the end of the process
+                summary.log_error = end.recv_bytes().decode()
+            elif logger.exitcode is None:
+                summary.log_error = f"the log was not ended within {_END_S:.0f} s"
+        except (EOFError, OSError):
+            if logger.exitcode != 0:
+                summary.log_error = "the process that writes the log was killed"
+        dropped = sum(summary.servo.get("dropped", {}).values())
+        if dropped and not summary.log_error:
+            summary.log_error = f"the log lacks {dropped} records: its process was too slow"
+        elif summary.log_error and self.plan.log is not None and self.plan.log.exists():
+            lacking = ended - self.plan.log.stat().st_mtime
+            where = f"{self.plan.log} ends {max(lacking, 0.0):.1f} s before the run"
+            summary.log_error = f"{summary.log_error.rstrip('.')}; {where}"
+
+    def _first(self, process: BaseProcess, silent: PronkError) -> bytes:
+        """The first message of a process; raises `silent` if none comes."""
+        end, until = self._ends[process], time.monotonic() + _START_S
+        while not end.poll(0.05):
+            self.write(OperatorCommand())
+            if process.exitcode is not None or time.monotonic() > until:
+                raise silent
+        return end.recv_bytes()
+
+    def _await_servo(self) -> None:
+        until = time.monotonic() + _START_S
+        while self.shared.state.written == 0:
+            self.write(OperatorCommand())
+            self.servo.join(0.05)
+            self.events_seen()
+            if self.servo.exitcode is not None:
+                why = " ".join(self.summary.refusals) or "its process ended without an error."
+                raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
+            if time.monotonic() > until:
+                raise HardwareError(
+                    f"the link was not open after {_START_S:.0f} s; check the robot and the cable."
+                )
+
+
+def run(
+    plan: Plan,
+    operator: Operator,
+    notify: Callable[[Event], None],
+    progress: Callable[[float], None] = lambda share: None,
+) -> RunSummary:
+    """Run a plan from beginning to end; HardwareError if it could not start."""
+    with Deployment(plan) as deployment:
+        summary = deployment.run(operator, notify, progress)
+    if not summary.servo:
+        damped = (
+            "the standby process damped the joints"
+            if summary.standby
+            else "only the robot's own watchdog damps the joints now: secure them before anything "
+            "else"
+        )
+        raise HardwareError(f"the servo's process was killed; {damped}.")
+    return summary
+
+
+def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
+    """Of a policy's log."""
+    import onnxruntime
+
+    contract = policy.contract
+    shown = ("gains", "gains_sha256", "delay_range_s", "jump", "virtual")
+    return {
+        "robot": plan.robot.name,
+        "joints": list(plan.robot.joint_names),
+        "link": str(plan.link),
+        "policy": {"file": str(plan.policy), "sha256": policy.sha256}
+        | {name: getattr(contract, name) for name in shown},
+        "limits": vars(plan.safety()),
+        "timing": vars(plan.timing),
+        "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
+    }

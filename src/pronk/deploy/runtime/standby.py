@@ -1,0 +1,71 @@
+"""The standby process: damps the joints when the servo's process has stopped or was killed.
+
+It has a transport of its own and reads the time that the servo writes into shared memory at every
+tick. A servo that has been silent for `Plan.silence_s` while it drove the joints has stopped, and
+with it the thread of its link that damps when a command expires. A servo that goes on later finds
+the commands of another writer, and damps too.
+
+A wire that has one writer (a link of one's own without `open_damper`) and the virtual robot in this
+program have no standby.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from pronk.deploy.links.link import NetworkLink
+from pronk.deploy.links.realtime import Wanted, enter, leave, sleep_until
+from pronk.deploy.runtime.ipc import STANDBY, Mode, Shared
+from pronk.deploy.runtime.plan import STANDBY_PRIORITY, Plan
+
+_POLL_S = 0.004
+_REPEAT_S = 0.01
+"""Between two messages of damping [s]."""
+_LEAST_S = 3.0
+"""Shortest time of damping, in which any robot here comes to rest [s]."""
+DRIVEN = (Mode.STAND, Mode.POLICY, Mode.HALT, Mode.SIT, Mode.SWEEP)
+"""Modes whose last command is not damping."""
+
+
+def serve_standby(plan: Plan, name: str, end: Connection) -> None:
+    """Body of the standby process; `end` gets one byte: whether the link can have one."""
+    leave()
+    stopping = False
+
+    def stop(*_: object) -> None:
+        nonlocal stopping
+        stopping = True
+
+    signal.signal(signal.SIGTERM, stop)
+    machine = plan.link()
+    damp = machine.open_damper() if isinstance(machine, NetworkLink) else None
+    end.send_bytes(b"\1" if damp is not None else b"\0")
+    if damp is None:
+        return
+    enter(Wanted(priority=STANDBY_PRIORITY) if plan.real_time else Wanted(lock=False))
+    shared, parent = Shared(name, len(plan.robot.joints)), os.getppid()
+    begun, due = None, 0.0
+    record = np.zeros((), STANDBY)
+    while True:
+        now, seen = time.monotonic(), shared.state.read()
+        mode = None if seen is None else Mode(int(seen["mode"]))
+        orphan = os.getppid() != parent
+        if begun is None:
+            # A servo that drove the joints and has not ended may yet fall silent.
+            if mode is Mode.ENDED or ((stopping or orphan) and mode not in DRIVEN):
+                break
+            if seen is not None and mode in DRIVEN and now - float(seen["now"]) > plan.silence_s:
+                begun = record["time"] = now
+                shared.standby.write(record)
+        elif now - begun > _LEAST_S and (stopping or orphan or mode is Mode.ENDED):
+            break
+        if begun is not None and now >= due:
+            damp()
+            due = now + _REPEAT_S
+        sleep_until(now + _POLL_S)
+    shared.close()

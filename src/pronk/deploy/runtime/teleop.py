@@ -1,0 +1,344 @@
+"""Operators: keyboard, gamepad, scripts, and the clamping of joints beside a sweep."""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pronk.deploy.links.link import ClampOperator
+from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.errors import HardwareError, PronkError
+from pronk.policy.script import STILL, Script, Velocity
+
+Ranges = Mapping[str, tuple[float, float]]
+"""Smallest and largest commands trained for (`Contract.command_ranges`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OperatorCommand:
+    """The operator's input at a moment."""
+
+    command: Velocity = STILL
+    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+    jump: bool = False
+    held: bool = False
+    """Dead-man button; without it the robot is damped while the policy runs."""
+    request: OperatorRequest = OperatorRequest.NONE
+    """A new request."""
+
+
+class Operator:
+    """Gives the operator's input, 50 times a second."""
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The input now (CLOCK_MONOTONIC [s]), in a mode of the servo."""
+        raise NotImplementedError
+
+    def notified(self, kind: str, text: str) -> None:
+        """Receive an event of the servo."""
+
+    def leave(self) -> None:
+        """End, because the program was interrupted."""
+
+    def close(self) -> None:
+        """Release the device."""
+
+
+_PAUSE_S = 1.0
+"""With a zero command after each script [s]."""
+
+
+class ScriptedOperator(Operator):
+    """Stands up and runs scripts one after another; ends at the first fault.
+
+    `TimeLimit` of `seconds` sits down at their end.
+    """
+
+    def __init__(self, scripts: Sequence[Script]) -> None:
+        self.scripts = tuple(scripts)
+        self.seconds = sum(script.seconds + _PAUSE_S for script in scripts)
+        """While the policy runs [s]."""
+        self._began: float | None = None
+        self._requested_in = Mode.ENDED
+        self._over = False
+
+    def notified(self, kind: str, text: str) -> None:
+        """End at a fault or refusal."""
+        if kind in ("fault", "refused") or (kind == "notice" and self._began is None):
+            self._over = True
+
+    def leave(self) -> None:
+        """End."""
+        self._over = True
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The scripts' input."""
+        if self._over:
+            return OperatorCommand(request=OperatorRequest.QUIT)
+        if mode is Mode.DAMP:
+            return OperatorCommand(request=self._once(OperatorRequest.STAND, mode))
+        if mode is Mode.STAND:
+            return OperatorCommand(held=True, request=self._once(OperatorRequest.WALK, mode))
+        if mode is Mode.POLICY:
+            self._began = now if self._began is None else self._began
+            t = now - self._began
+            for script in self.scripts:
+                if 0.0 <= t < script.seconds:
+                    command, jump = script.commanded(t)
+                    return OperatorCommand(command=command, jump=jump, held=True)
+                t -= script.seconds + _PAUSE_S
+        return OperatorCommand(held=True)
+
+    def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
+        """A request, once in each mode."""
+        if self._requested_in is mode:
+            return OperatorRequest.NONE
+        self._requested_in = mode
+        return request
+
+
+class BenchOperator(Operator):
+    """Beside a sweep: clamps joints by hand when the servo requests it."""
+
+    def __init__(self, clamp_operator: ClampOperator) -> None:
+        """`clamp_operator` clamps joints; it is called in a thread of its own."""
+        self._clamp = clamp_operator
+        self._next = OperatorRequest.NONE
+        self.error: PronkError | None = None
+        """Why joints could not be clamped."""
+
+    def notified(self, kind: str, text: str) -> None:
+        """Have joints clamped."""
+        if kind == "clamp":
+            joints = tuple(name for name in text.split(", ") if name)
+            threading.Thread(target=self._fix, args=(joints,), daemon=True).start()
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The dead-man button is held; a request once joints are clamped, or cannot be."""
+        request, self._next = self._next, OperatorRequest.NONE
+        return OperatorCommand(held=True, request=request)
+
+    def _fix(self, joints: tuple[str, ...]) -> None:
+        try:
+            self._clamp(joints)
+        except PronkError as error:
+            self.error = error
+        except Exception as error:
+            self.error = HardwareError(f"{type(error).__name__}: {error}")
+        self._next = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
+
+
+class TimeLimit(Operator):
+    """Another operator for a time with the policy running; then it sits down and ends."""
+
+    def __init__(self, operator: Operator, seconds: float) -> None:
+        """Count from the start of the policy [s]."""
+        self._operator = operator
+        self._seconds = seconds
+        self._began: float | None = None
+        self._sat = False
+        self.notified = operator.notified  # type: ignore[method-assign]
+        self.leave = operator.leave  # type: ignore[method-assign]
+        self.close = operator.close  # type: ignore[method-assign]
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The other's input, until the time is over; then its requests to damp and to end."""
+        given = self._operator.command(now, mode)
+        if mode is Mode.POLICY and self._began is None:
+            self._began = now
+        over = self._began is not None and now - self._began >= self._seconds
+        if not over or given.request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
+            return given
+        if mode is Mode.DAMP:
+            return OperatorCommand(request=OperatorRequest.QUIT)
+        if mode is not Mode.POLICY or self._sat:
+            return OperatorCommand(held=given.held)
+        self._sat = True
+        return OperatorCommand(held=given.held, request=OperatorRequest.SIT)
+
+
+HELP = """\
+  hold SPACE   dead-man: releasing it damps the joints
+  1 stand up   2 start the policy   3 sit down   0 damp at once   r reset a fault   q quit
+  w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
+"""Keys of the keyboard."""
+
+_STEPS = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1)}
+_STEPS |= {"j": (2, 0.2), "l": (2, -0.2)}
+_REQUESTS = {
+    "1": OperatorRequest.STAND,
+    "2": OperatorRequest.WALK,
+    "3": OperatorRequest.SIT,
+    "0": OperatorRequest.DAMP,
+    "r": OperatorRequest.RESET,
+    "q": OperatorRequest.QUIT,
+}
+_JUMP_S = 0.5
+"""Length of the jump input of one press, as in training [s]."""
+_REPEAT_S = 0.8
+"""A key counts as held for this long; keyboards repeat a key after 0.66 s at most [s]."""
+
+
+class Device(Operator):
+    """A device that is read by its file descriptor."""
+
+    def __init__(self, fd: int, ranges: Ranges) -> None:
+        self._fd, self._ranges = fd, tuple(ranges.values())
+        self._jump = -1e9
+        """When the jump was pressed last [s]."""
+        self._connected = True
+
+    def _read(self) -> bytes:
+        """What has come since the last call; notes the end of the device."""
+        data = b""
+        while select.select([self._fd], [], [], 0.0)[0]:
+            try:
+                part = os.read(self._fd, 4096)
+            except OSError:
+                part = b""
+            if not part:
+                self._connected = False
+                break
+            data += part
+        return data
+
+
+class Keyboard(Device):
+    """Keys of a terminal.
+
+    A terminal does not report the release of a key, only its repetition, so the dead-man button is
+    released 0.8 s late; a gamepad's at once.
+    """
+
+    def __init__(self, ranges: Ranges, stream: int | None = None) -> None:
+        """Read standard input key by key, or another file; HardwareError if it is no terminal."""
+        super().__init__(sys.stdin.fileno() if stream is None else stream, ranges)
+        if not os.isatty(self._fd):
+            raise HardwareError(
+                "there is no keyboard (standard input is no terminal); run it in a terminal, use "
+                "--gamepad, or --script for a run without an operator."
+            )
+        self._before = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        self._command = [0.0, 0.0, 0.0]
+        self._held = -1e9
+
+    def close(self) -> None:
+        """Restore the terminal."""
+        with suppress(termios.error):
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+
+    def notified(self, kind: str, text: str) -> None:
+        """Reset the velocity command when the mode changes."""
+        if kind == "mode":
+            self._command = [0.0, 0.0, 0.0]
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The keys' input."""
+        request, keys = OperatorRequest.NONE, self._read().decode("ascii", "ignore")
+        if not self._connected:
+            return OperatorCommand(request=OperatorRequest.QUIT)
+        for key in keys:
+            if key == " ":
+                self._held = now
+            elif key in _STEPS:
+                axis, step = _STEPS[key]
+                low, high = self._ranges[axis]
+                self._command[axis] = min(max(self._command[axis] + step, low), high)
+            elif key == "x":
+                self._command = [0.0, 0.0, 0.0]
+            elif key in "\r\n":
+                self._jump = now
+            elif key in _REQUESTS:
+                request = _REQUESTS[key]
+        forward, left, yaw = self._command
+        return OperatorCommand(
+            command=(forward, left, yaw),
+            jump=now - self._jump < _JUMP_S,
+            held=now - self._held < _REPEAT_S,
+            request=request,
+        )
+
+
+_EVENT = struct.Struct("<IhBB")
+"""js_event of linux/joystick.h: time [ms], value, type, number."""
+_BUTTON, _AXIS, _INITIAL = 1, 2, 0x80
+_FULL = 32767.0
+_DEAD_ZONE = 0.1
+# Numbers of the kernel's xpad driver, to which other gamepads are mapped.
+_PAD_REQUESTS = {
+    0: OperatorRequest.STAND,
+    1: OperatorRequest.DAMP,
+    2: OperatorRequest.SIT,
+    3: OperatorRequest.WALK,
+    6: OperatorRequest.QUIT,
+    7: OperatorRequest.RESET,
+}
+_LEFT_BUMPER, _RIGHT_BUMPER = 4, 5
+_AXES = (1, 0, 3)
+"""Forward, left, turn."""
+
+PAD_HELP = """\
+  hold LB      dead-man: releasing it damps the joints
+  A stand up   Y start the policy   X sit down   B damp at once   START reset a fault   BACK quit
+  left stick forward and sideways   right stick turn   RB jump"""
+"""Buttons of the gamepad."""
+
+
+class Gamepad(Device):
+    """A gamepad through the kernel's joystick interface; unplugged counts as released."""
+
+    def __init__(self, path: Path, ranges: Ranges) -> None:
+        """Open a device such as /dev/input/js0; HardwareError if it cannot be opened."""
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise HardwareError(
+                f"gamepad {path}: {error.strerror}; plug it in, or name another "
+                "one (ls /dev/input/js*)."
+            ) from None
+        super().__init__(fd, ranges)
+        self._axes: dict[int, float] = {}
+        self._buttons: dict[int, bool] = {}
+        self._pressed = False
+
+    def close(self) -> None:
+        """Close the device."""
+        os.close(self._fd)
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The input of sticks and buttons."""
+        request = OperatorRequest.NONE
+        for _, value, kind, number in _EVENT.iter_unpack(self._read()):
+            if kind & ~_INITIAL == _AXIS:
+                self._axes[number] = value / _FULL
+            elif kind & ~_INITIAL == _BUTTON:
+                self._buttons[number] = bool(value)
+                if value and not kind & _INITIAL:
+                    request = _PAD_REQUESTS.get(number, request)
+        if not self._connected:
+            return OperatorCommand(request=request)
+        pushed = (-self._axes.get(number, 0.0) for number in _AXES)
+        forward, left, yaw = (
+            0.0 if abs(push) <= _DEAD_ZONE else push * (high if push > 0.0 else -low)
+            for push, (low, high) in zip(pushed, self._ranges, strict=True)
+        )
+        pressed = self._buttons.get(_RIGHT_BUMPER, False)
+        if pressed and not self._pressed:
+            self._jump = now
+        self._pressed = pressed
+        return OperatorCommand(
+            command=(forward, left, yaw),
+            jump=now - self._jump < _JUMP_S,
+            held=self._buttons.get(_LEFT_BUMPER, False),
+            request=request,
+        )

@@ -1,0 +1,177 @@
+"""The command to a joint, at every physics step of the training simulator.
+
+The simulator holds a policy's command for `decimation` physics steps. The jitter of the timestamps
+(tens of microseconds) must not move a command by a whole step, so the instants at which the command
+changes are fitted by the clock of the policy, and the command is read in the middle of each tick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pronk.arrays import Array
+from pronk.errors import LogError
+from pronk.identify.logs.columns import in_force
+from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.robots.robot import RobotSpec
+
+_OFF_CLOCK = 0.25
+"""Largest median distance of a change from the policy's clock, as a share of a tick, with which
+the command is still taken for one held at the policy's rate."""
+_SAME = 1e-6
+"""Commands closer than this are the same [rad]: far below an encoder count."""
+_POSE_SLACK = 0.05
+"""How far a clamped joint may be from where the bench model clamps it [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandTrace:
+    """One command to one joint, at every physics step of the training simulator."""
+
+    joint: str
+    start: float
+    """Instant of the first step, on the clock of the log [s]."""
+    timestep: float
+    """Physics step [s]."""
+    command: Array
+    """Command in force during each step [rad], shape (steps,)."""
+    pose: Array
+    """Position that every joint of the robot is held at, robot's order [rad], shape (joints,)."""
+    amplitude: float = float("nan")
+    """Peak of the command about the pose [rad]."""
+    policy_held: bool = True
+    """True if the command was found to be held at the policy's rate."""
+
+    @property
+    def time(self) -> Array:
+        """Start of each step, on the clock of the log [s], shape (steps,)."""
+        return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
+
+    def excitation(self, robot: RobotSpec, steps: int | None = None) -> tuple[Array, Array]:
+        """What the original joint is simulated with, mirrored from this one.
+
+        Returns the pose of the original joint's chain [rad], shape (chain,), and the command about
+        it at each of `steps` [rad] (all if None); a shorter command stays where it ends.
+        """
+        excited = robot.joint(self.joint)
+        first, sign = excited.original
+        # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
+        pairs = zip(excited.chain, robot.joint(first).chain, strict=True)
+        signs = [robot.joint(own).original[1] * robot.joint(one).original[1] for own, one in pairs]
+        names = robot.joint_names
+        pose = np.array(signs) * self.pose[[names.index(own) for own in excited.chain]]
+        command = sign * (self.command[:steps] - self.pose[names.index(self.joint)])
+        spare = 0 if steps is None else steps - len(command)
+        return pose, np.pad(command, (0, spare), mode="edge")
+
+    def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
+        """True if both lead to the same simulation of the same original joint.
+
+        One may rest longer at the end. With `sign` -1 the commands have opposite signs.
+        """
+        if robot.joint(self.joint).original[0] != robot.joint(other.joint).original[0]:
+            return False
+        (pose, mine), (other_pose, theirs) = self.excitation(robot), other.excitation(robot)
+        short, long = sorted((mine, sign * theirs), key=len)
+        short = np.pad(short, (0, len(long) - len(short)), mode="edge")
+        same = bool(np.abs(long - short).max() < _SAME)
+        return same and np.allclose(pose, other_pose, atol=1e-3)
+
+
+def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:
+    """Phase of the clock of period `tick` [s] on which a held command changes.
+
+    Returns an instant at which a tick begins [s], and the median distance of the changes from the
+    ticks as a share of `tick` (0.25 is what changes at random instants give). A command that never
+    changes begins at the first timestamp, at distance 0.
+    """
+    changes = time[1:][np.diff(command) != 0.0]
+    if len(changes) == 0:
+        return float(time[0]), 0.0
+    # Circular mean: the phase that all changes share, whatever ticks lie between them.
+    turns = np.exp(2j * np.pi * (changes - time[0]) / tick)
+    phase = float(np.angle(turns.mean())) / (2.0 * np.pi) * tick
+    distance = (changes - time[0] - phase) / tick
+    distance -= np.round(distance)
+    # Jitter must not split the first tick: let the clock begin at the change nearest the start.
+    return float(time[0] + phase), float(np.median(np.abs(distance)))
+
+
+def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec) -> CommandTrace:
+    """Command to one joint in one segment of a log at every physics step of the robot.
+
+    A LogError says that the joint was not excited in the segment, that its unit is unknown, or that
+    a joint that is clamped in the bench model stood elsewhere.
+    """
+    where = log.source or "log"
+    if joint not in segment.joints:
+        raise LogError(
+            f"{where}: {joint} is not excited from {segment.start:.3f} to {segment.stop:.3f} s; "
+            f"{', '.join(segment.joints)} are."
+        )
+    if log.unit(joint) != "rad":
+        raise LogError(
+            f"{where}: {joint} is in unit {log.unit(joint)!r}; the simulator needs radians, so "
+            "give --scale JOINT=RADIANS."
+        )
+    part = log.cut(segment)
+    command = part.command[:, part.column(joint)]
+    tick = robot.timestep_s * robot.decimation
+    clock, distance = policy_clock(part.time, command, tick)
+    on_clock = distance <= _OFF_CLOCK * 0.6
+    start, period = part.time[0], robot.timestep_s
+    if on_clock:
+        # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
+        start, period = clock + np.floor((start - clock) / tick + 0.5) * tick, tick
+    count = int(np.ceil((part.time[-1] - start) / period))
+    middle = start + (np.arange(count) + 0.5) * period
+    steps = command[np.maximum(in_force(part.time, middle), 0)]
+    if on_clock:
+        early = _early_ticks(steps)
+        start -= early * tick
+        steps = np.repeat(np.pad(steps, (early, 0), mode="edge"), robot.decimation)
+    return CommandTrace(
+        joint=joint,
+        start=float(start),
+        timestep=robot.timestep_s,
+        command=steps,
+        pose=_pose(part, joint, robot),
+        amplitude=segment.amplitude,
+        policy_held=bool(on_clock),
+    )
+
+
+def _early_ticks(values: Array) -> int:
+    """Ticks to begin before the log, so that repeats begin alike.
+
+    Whether the log caught the tick it began in is chance; a rest before the first change is
+    therefore lengthened to a multiple of five ticks. A log that begins in motion is left alone.
+    """
+    changes = np.nonzero(np.diff(values) != 0.0)[0]
+    rest = int(changes[0]) + 1 if len(changes) else len(values)
+    # Plans rest for multiples of five ticks (0.1 s) give or take one: keep clear of those.
+    return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
+
+
+def _pose(log: JointLog, joint: str, robot: RobotSpec) -> Array:
+    """Pose of every joint of the robot.
+
+    The log's; where it has none, the first command of each of its joints, and the default
+    position of joints that it does not have.
+    """
+    pose = np.array([j.default_position for j in robot.joints])
+    logged = log.command[0] if log.pose is None else log.pose
+    for i, name in enumerate(robot.joint_names):
+        if name in log.joints and log.unit(name) == "rad":
+            pose[i] = logged[log.column(name)]
+    for name in robot.joint(joint).clamped:
+        default = robot.joint(name).default_position
+        stood = pose[robot.joint_names.index(name)]
+        if abs(stood - default) > _POSE_SLACK:
+            raise LogError(
+                f"{log.source or 'log'}: {name} was clamped at {stood:.3f} rad while {joint} was "
+                f"excited; the bench model of {robot.name} clamps it at {default:.3f} rad."
+            )
+    return pose

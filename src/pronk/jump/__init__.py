@@ -1,0 +1,1 @@
+"""The jump task of a quadruped: training, the virtual robot, trials."""

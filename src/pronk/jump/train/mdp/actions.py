@@ -1,0 +1,128 @@
+"""The policy's action: joint position targets, which reach the drives after a delay.
+
+A target takes effect a number of physics steps after the policy issued it, one number for each
+robot and episode, the same for all its joints, as on one bus. The delay may be longer than a policy
+step: ages of targets are counted in physics steps.
+
+mjlab's actuators can delay too, with a buffer that is read and written in every physics step. A
+target changes once in a policy step, so it is enough to choose between the last targets in the
+first few physics steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
+from torch import Tensor
+
+from pronk.errors import PronkError
+from pronk.jump.train.mdp.actuators import Battery
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+NAME = "joint_position"
+"""The action term's name in every environment."""
+
+
+@dataclass(kw_only=True)
+class DelayedJointPositionActionCfg(JointPositionActionCfg):
+    """Joint position targets with a command delay."""
+
+    delay_steps: tuple[int, int] = (0, 0)
+    """Smallest and largest delay, drawn uniformly at the start of an episode [physics steps]."""
+
+    def __post_init__(self) -> None:
+        """Refuse a delay that is negative or falls."""
+        super().__post_init__()
+        low, high = self.delay_steps
+        if not 0 <= low <= high:
+            raise PronkError(
+                f"delay_steps is {low} to {high} physics steps; expected 0 or more, rising."
+            )
+
+    def build(self, env: ManagerBasedRlEnv) -> DelayedJointPositionAction:
+        """Build the term of an environment."""
+        return DelayedJointPositionAction(self, env)
+
+
+class DelayedJointPositionAction(JointPositionAction):
+    """Targets of N robots: default pose + scale * action, in force `lag` physics steps later."""
+
+    cfg: DelayedJointPositionActionCfg
+
+    def __init__(self, cfg: DelayedJointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        low, high = cfg.delay_steps
+        self.lag = torch.full((self.num_envs, 1), low, device=self.device)
+        """Delay in this episode [physics steps]. (N, 1)"""
+        self.battery = Battery(self._entity)
+        self.guidance: Tensor | None = None
+        """Added to the coming targets, if not None [rad]. (N, joints)"""
+        everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
+        # A slice costs a view where a list of indices costs a kernel.
+        self._joints: slice | Tensor = slice(None) if everything else self._target_ids
+        self._default: Tensor = self._entity.data.default_joint_pos[:, self._joints]
+        # With a policy step of at least one physics step no older target can be in force.
+        count = high + 1
+        self._targets = self._default.repeat(count, 1, 1)
+        """The last targets, as a ring that begins at `_newest` [rad]. (count, N, joints)"""
+        self._newest = 0
+        self._ages = [high] * count
+        """Physics steps since each target was issued, newest first."""
+
+    def process_actions(self, actions: Tensor) -> None:
+        """Issue the targets of a policy step, of the network's actions (N, joints)."""
+        super().process_actions(actions)
+        if self.guidance is not None:
+            self._processed_actions += self.guidance
+        count = len(self._ages)
+        self._newest = (self._newest + 1) % count
+        self._ages = [0, *self._ages[:-1]]
+        bias = self._entity.data.encoder_bias[:, self._joints]
+        torch.sub(self._processed_actions, bias, out=self._targets[self._newest])
+
+    def apply_actions(self) -> None:
+        """Give the drives the targets that are in force in the coming physics step."""
+        low, high = self.cfg.delay_steps
+        # A reset clears the drives' targets: the first physics step writes them in any case.
+        if self._ages[0] == 0 or any(low <= age <= high for age in self._ages):
+            self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
+        self._ages = [age + 1 for age in self._ages]
+        self.battery.advance()
+
+    def _in_force(self) -> Tensor:
+        """Of each robot the newest target that is at least as old as its delay."""
+        low, high = self.cfg.delay_steps
+        ring = [self._targets[self._newest - i] for i in range(len(self._ages))]
+        oldest = next(i for i, age in enumerate(self._ages) if age >= high)
+        target = ring[oldest]
+        for i in reversed(range(oldest)):
+            if self._ages[i] >= low:
+                target = torch.where(self.lag <= self._ages[i], ring[i], target)
+        return target
+
+    def reset(self, env_ids: Tensor | slice | None = None) -> None:
+        """Draw the delays of new episodes; the default pose is in force until a target arrives."""
+        super().reset(env_ids)
+        which = slice(None) if env_ids is None else env_ids
+        self.battery.reset(which)
+        if self.guidance is not None:
+            self.guidance[which] = 0.0
+        low, high = self.cfg.delay_steps
+        if high == 0:
+            return
+        self._targets[:, which] = self._default[which]
+        if low < high:
+            drawn = torch.randint(low, high + 1, self.lag.shape, device=self.device)
+            self.lag[which] = drawn[which]
+
+
+def joint_position_action(env: ManagerBasedRlEnv) -> DelayedJointPositionAction:
+    """The action term of an environment."""
+    term = env.action_manager.get_term(NAME)
+    assert isinstance(term, DelayedJointPositionAction)
+    return term

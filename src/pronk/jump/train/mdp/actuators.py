@@ -1,0 +1,155 @@
+"""The drives of the robot and the battery that feeds them, as mjlab actuators.
+
+At the start of each physics step a drive gives
+
+    torque = clip(stiffness (command - q) - damping qdot, low, high),
+    high = min(effort_limit, stall_torque (1 - qdot / no_load_speed)), low its mirror image,
+
+or the effort limit, where a joint turns so fast that the line is beyond it. This is the law of
+`pronk.robots.motor`, with which gains are matched; a test compares the two.
+
+The battery (not in the paper, whose bus voltage is constant, S5) sags with the power that the
+drives draw. With the torques tau of the last physics step and the speeds omega of this one,
+
+    P = sum(tau omega + tau^2 / back_emf),        electrical power [W]
+    V = (U + sqrt(U^2 - 4 R P)) / 2,              from V = U - R P / V
+
+with U the voltage at no load, R the resistance, and V at least U / 2, where the power is greatest.
+tau^2 / back_emf is the heat in the windings: with motor constant K (no-load speed U / K, stall
+torque K U / r), back_emf = stall_torque / no_load_speed = K^2 / r. The stall torque changes in
+proportion to V. V follows over a few steps, since power and voltage depend on each other.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from mjlab.actuator import DcMotorActuator, DcMotorActuatorCfg
+from torch import Tensor
+
+from pronk.errors import PronkError, RobotError
+from pronk.jump.train.gains import TrainingGains
+from pronk.robots.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from mjlab.actuator.actuator import ActuatorCmd
+    from mjlab.entity import Entity
+
+_VOLTAGE_STEP = 0.3
+"""Fraction of the way to its new value that the voltage covers in a physics step."""
+
+
+class PositionDriveCfg(DcMotorActuatorCfg):
+    """mjlab's DC motor behind a PD law with position commands alone."""
+
+    def build(
+        self, entity: Entity, target_ids: list[int], target_names: list[str]
+    ) -> PositionDrive:
+        """Build the actuator of an entity."""
+        return PositionDrive(self, entity, target_ids, target_names)
+
+
+class PositionDrive(DcMotorActuator[PositionDriveCfg]):
+    """The law of mjlab's DC motor in 9 operations instead of 21, for every physics step."""
+
+    param_names = ("stiffness", "damping", "force_limit", "saturation_effort", "back_emf")
+
+    def initialize(self, *args: Any) -> None:
+        """Set up the parameters."""
+        super().initialize(*args)
+        self.back_emf = self.saturation_effort / self.velocity_limit_motor
+        """Torque lost to speed [N m s/rad]. (N, joints)"""
+
+    @staticmethod
+    def control_law(params: dict[str, Tensor], cmd: ActuatorCmd) -> Tensor:
+        """Torque [N m], (N, joints), of parameters (N, joints) and a command (N, joints)."""
+        stall, limit, back_emf = (
+            params[name] for name in ("saturation_effort", "force_limit", "back_emf")
+        )
+        commanded = params["stiffness"] * (cmd.position_target - cmd.pos)
+        commanded = torch.addcmul(commanded, params["damping"], cmd.vel, value=-1.0)
+        # Without the back-EMF both ends of the line are at the stall torque, whatever the speed.
+        torque = torch.addcmul(commanded, back_emf, cmd.vel).clamp(-stall, stall)
+        return torch.addcmul(torque, back_emf, cmd.vel, value=-1.0).clamp(-limit, limit)
+
+
+def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
+    """One actuator for each joint group, in the robot's order of groups."""
+    if gains.robot != robot.name:
+        raise PronkError(f"gains of {gains.robot} were given for the drives of {robot.name}.")
+    cfgs = []
+    for group in robot.groups:
+        joints, own = robot.group(group), gains.groups[group]
+        drive, fitted = joints[0].drive, own.frictionloss
+        if any(joint.drive != drive for joint in joints):
+            raise RobotError(
+                f"the joints of {robot.name}'s group {group} have different drives; expected one "
+                "drive for all joints of a group."
+            )
+        cfgs.append(
+            PositionDriveCfg(
+                target_names_expr=tuple(joint.name for joint in joints),
+                stiffness=own.stiffness,
+                damping=own.damping,
+                armature=drive.armature,
+                frictionloss=drive.frictionloss if math.isnan(fitted) else fitted,
+                viscous_damping=drive.viscous_damping,
+                effort_limit=drive.effort_limit,
+                saturation_effort=drive.stall_torque,
+                velocity_limit=drive.no_load_speed,
+            )
+        )
+    return tuple(cfgs)
+
+
+class Battery:
+    """Batteries of N robots. Voltages are relative to the rated voltage of the drives."""
+
+    def __init__(self, entity: Entity) -> None:
+        """Start at the rated voltage and without resistance; the drives are `PositionDrive`s."""
+        self._entity = entity
+        drives = [drive for drive in entity.actuators if isinstance(drive, PositionDrive)]
+        self._drives = [(drive, drive.saturation_effort.clone()) for drive in drives]
+        # Heat in the windings per torque squared [rad/s per N m]. (N, joints)
+        self._heat = torch.zeros_like(entity.data.joint_vel)
+        for drive in drives:
+            self._heat[:, drive.target_ids] = 1.0 / drive.back_emf
+        self.no_load = torch.ones_like(self._heat[:, :1])
+        """U over the rated voltage. (N, 1)"""
+        self.drop = torch.zeros_like(self.no_load)
+        """4 R over the square of the rated voltage [1/W]. (N, 1)"""
+        self.voltage = torch.ones_like(self.no_load)
+        """V over the rated voltage. (N, 1)"""
+        self.ideal = True
+        """All batteries hold the rated voltage, so that nothing is computed."""
+
+    def set(self, voltage: Tensor, resistance: Tensor, rated: float) -> None:
+        """Give every robot its U [V] and R [ohm], (N, 1); `rated` is that of the drives [V]."""
+        self.no_load.copy_(voltage / rated)
+        self.drop.copy_(4.0 * resistance / rated**2)
+        self.voltage.copy_(self.no_load)
+        self.ideal = False
+        self._apply()
+
+    def advance(self) -> None:
+        """Before a physics step: the power drawn in the last one lowers the voltage."""
+        if self.ideal:
+            return
+        data = self._entity.data
+        torque = data.qfrc_actuator
+        power = (torch.addcmul(data.joint_vel, torque, self._heat) * torque).sum(1, keepdim=True)
+        root = torch.addcmul(self.no_load.square(), self.drop, power, value=-1.0)
+        sagged = 0.5 * (self.no_load + root.clamp_min_(0.0).sqrt_())
+        self.voltage.lerp_(sagged, _VOLTAGE_STEP)
+        self._apply()
+
+    def reset(self, robots: Tensor | slice) -> None:
+        """Return some batteries to no load; a power that is not finite leaves no voltage."""
+        if not self.ideal:
+            self.voltage[robots] = self.no_load[robots]
+
+    def _apply(self) -> None:
+        for drive, rated in self._drives:
+            torch.mul(rated, self.voltage, out=drive.saturation_effort)

@@ -1,0 +1,275 @@
+"""Commands: velocities, redrawn at intervals, and the jump input (paper C1 to C4).
+
+The command term also holds what depends on the commands: the state of the jumps, the motion of the
+last step, and the ranges of the velocities. Masks are used, so that no step waits for the device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+import tyro
+from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
+from torch import Tensor
+
+from pronk.jump.train.gains import TrainingGains
+from pronk.jump.train.mdp.actions import joint_position_action
+from pronk.jump.train.mdp.guidance import guidance
+from pronk.jump.train.mdp.jump import JumpSettings, JumpState
+from pronk.jump.train.mdp.motion import Motion, measure_motion, standing_leg
+from pronk.jump.train.mdp.speed_ranges import SpeedRanges
+from pronk.robots import load_robot
+from pronk.robots.legged import legged
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+NAME = "motion"
+"""The command term's name in every environment."""
+
+
+@dataclass(kw_only=True)
+class MotionCommandCfg(CommandTermCfg):
+    """Velocity ranges and jump intervals."""
+
+    robot: str
+    """The robot, as `load_robot` reads it."""
+    gains: tyro.conf.Suppress[TrainingGains]
+    """Nominal gains of the drives."""
+    resampling_time_range: tuple[float, float] = (2.0, 6.0)
+    """Time between draws of the velocity command [s]."""
+    limits: tuple[float, float, float] = (3.0, 1.0, 2.0)
+    """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3).
+
+    They grow up to these, see `pronk.jump.train.mdp.speed_ranges`."""
+    standing: float = 0.1
+    """Fraction of the draws that are zero."""
+    one_axis: float = 0.4
+    """Fraction of the draws along one axis alone, as in the trials."""
+    jump_fraction: float = 0.0
+    """Fraction of the robots whose jump input is used; a phase sets it."""
+    jump_on_s: tuple[float, float] = (0.4, 0.7)
+    """Time that the jump input is held [s]: less than preparation and flight together, so that
+    one command means one jump."""
+    jump_off_s: tuple[float, float] = (1.0, 2.5)
+    """Time between jump inputs [s]."""
+    jump_speed_added: float = 0.6
+    """In jump mode the rewarded horizontal speed is this much higher [m/s], for commands below
+    1 m/s in proportion: the paper's robot, too, flew further than command times flight time
+    (.60 m at 1 m/s). Ground covered faster is not rewarded."""
+    settings: JumpSettings = field(default_factory=JumpSettings)
+
+    def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
+        """Build the term of an environment."""
+        return MotionCommand(self, env)
+
+
+class MotionCommand(CommandTerm):
+    """Commands of N robots, and their motion in response."""
+
+    cfg: MotionCommandCfg
+    time_left: Tensor
+
+    def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        count, device = self.num_envs, self.device
+        self.body = legged(cfg.robot)
+        self.velocity = torch.zeros(count, 3, device=device)
+        """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. (N, 3)"""
+        self.jump = torch.zeros(count, dtype=torch.bool, device=device)
+        """Jump input. (N,)"""
+        entity = env.scene["robot"]
+        self.default_position: Tensor = entity.data.default_joint_pos
+        """[rad]. (N, 12)"""
+        self.position_limits: Tensor = entity.data.joint_pos_limits
+        """[rad]. (N, 12, 2)"""
+        joints = load_robot(cfg.robot).joints
+        pairs = [(joint.drive, cfg.gains.groups[joint.group]) for joint in joints]
+        numbers = [(own.stiffness, own.damping, drive.effort_limit) for drive, own in pairs]
+        self.stiffness, self.damping, self.effort_limit = torch.tensor(numbers).T.to(device)
+        """Nominal [N m/rad, N m s/rad], and of the drives [N m]. (12,)"""
+        self.scripted = False
+        """True: `velocity` and `jump` are set by the caller alone."""
+        self.guidance_scale = 0.0
+        """Fraction of the guidance that is added to the actions, 0 to 1; a phase sets it."""
+        gains = (self.stiffness, self.damping)
+        self._guidance = guidance(self.body, cfg.settings, *gains, env.step_dt)
+        self._standing_leg = standing_leg(self.body)
+        self.state = JumpState(count, device, cfg.settings)
+        self.ranges = SpeedRanges(device)
+        self._jump_left = torch.zeros(count, device=device)
+        self._limits = torch.tensor(cfg.limits, device=device)
+        moving = 1.0 - cfg.standing
+        kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
+        self._kinds = torch.tensor([*kinds, moving], device=device)
+        """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
+        self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
+        """Axes that each kind of draw moves along."""
+        spans = torch.tensor([cfg.resampling_time_range, cfg.jump_on_s, cfg.jump_off_s])
+        self._least, self._most = spans.to(device).T[:, :, None]
+        # The golden ratio spreads any fraction evenly over the robots.
+        self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
+        sites = [f"{leg}_foot" for leg in self.body.legs]
+        feet, _ = entity.find_sites(sites, preserve_order=True)
+        self.feet: Tensor = entity.indexing.site_ids[feet].long()
+        """The foot sites' ids in the model. (4,)"""
+        geoms, _ = entity.find_geoms([f"{s}_collision" for s in sites], preserve_order=True)
+        self.foot_geoms: Tensor = entity.indexing.geom_ids[geoms].long()
+        """Ids of the feet's geoms. (4,)"""
+        self._motion: Motion | None = None
+        self._motion_step = -1
+        self._scales: dict[float, Tensor] = {}
+
+    @property
+    def command(self) -> Tensor:
+        """Velocity command, (N, 3)."""
+        return self.velocity
+
+    @property
+    def target(self) -> Tensor:
+        """Horizontal velocity that is rewarded: the command, in jump mode faster. (N, 2).
+
+        The overspeed at the jump command is added, so that braking is not rewarded.
+        """
+        horizontal = self.velocity[:, :2]
+        speed = torch.linalg.vector_norm(horizontal, dim=-1)
+        added = self.cfg.jump_speed_added * speed.clamp_max(1.0) + self.state.overspeed
+        return horizontal * (1.0 + added * self.state.mode / speed.clamp_min(1e-6))[:, None]
+
+    @property
+    def jumper(self) -> Tensor:
+        """Robots that get jump inputs. Bool, (N,)."""
+        return self._rank < self.cfg.jump_fraction
+
+    @property
+    def jump_left(self) -> Tensor:
+        """Time until the jump input changes [s]; 0 where it never does. (N,)."""
+        return self._jump_left * self.jumper
+
+    @property
+    def standing(self) -> Tensor:
+        """Commanded to stand still: no velocity and no jump. Bool, (N,)."""
+        return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.state.mode
+
+    @property
+    def position_target(self) -> Tensor:
+        """Joint position targets of this step [rad]. (N, 12)."""
+        return joint_position_action(self._env)._processed_actions
+
+    @property
+    def motion(self) -> Motion:
+        """Motion in the step just simulated; measured once a step, on first use."""
+        step = self._env.common_step_counter
+        if self._motion is None or self._motion_step != step:
+            self._motion = measure_motion(self._env, self.body, self.feet, self._motion)
+            self._motion_step = step
+            self._scales.clear()
+            self._advance_state(self._motion)
+        return self._motion
+
+    def in_jump_mode(self, scale: float) -> Tensor:
+        """`scale` in jump mode, 1 outside. (N,)."""
+        if scale not in self._scales:
+            self._scales[scale] = torch.where(self.state.mode, scale, 1.0)
+        return self._scales[scale]
+
+    def _advance_state(self, motion: Motion) -> None:
+        horizontal, target = motion.velocity_heading, self.target
+        commanded = self.velocity[:, :2]
+        speed = torch.linalg.vector_norm(commanded, dim=-1)
+        # The part along the command, which `target` is parallel to; zero without one.
+        along = (horizontal * commanded).sum(dim=-1) / speed.clamp_min(1e-6)
+        left = torch.stack((-motion.heading[:, 1], motion.heading[:, 0]), dim=-1)
+        way = commanded[:, :1] * motion.heading + commanded[:, 1:] * left
+        self.state.advance(
+            jump=self.jump,
+            contact=motion.contact,
+            height=motion.height,
+            vertical=motion.velocity_world[:, 2],
+            velocity_error=torch.linalg.vector_norm(horizontal - target, dim=-1),
+            turn=torch.linalg.vector_norm(motion.angular_velocity[:, :2], dim=-1),
+            along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
+            excess=along - speed,
+            feet=motion.foot_position,
+            direction=way / torch.linalg.vector_norm(way, dim=-1, keepdim=True).clamp_min(1e-6),
+            extension=motion.leg_length - self._standing_leg,
+            dt=self._env.step_dt,
+        )
+        if not self.scripted:
+            self.ranges.advance(horizontal - commanded, ~self.state.mode)
+
+    def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
+        """Draw commands for robots that start a new episode, and clear their jumps."""
+        assert isinstance(env_ids, Tensor)
+        self.state.reset(env_ids)
+        if self._motion is not None:
+            self._motion.reset(env_ids)
+        if self.scripted:
+            return {}
+        velocity, time, _, off = self._draw(len(env_ids))
+        self.velocity[env_ids] = velocity
+        self.time_left[env_ids] = time
+        self.jump[env_ids] = False
+        self._jump_left[env_ids] = off
+        return {}
+
+    def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
+        """Advance the time by `dt`; draw anew where an interval is over."""
+        # Rewards have read the feet before `forward`, and mjlab keeps what was read until a robot
+        # resets; observations need the present contacts.
+        self._env.scene["feet"].update(0.0)
+        if env_ids is not None:
+            return
+        if not self.scripted:
+            self.time_left -= dt
+            due = self.time_left <= 0.0
+            velocity, time, on, off = self._draw(self.num_envs)
+            self.velocity = torch.where(due[:, None], velocity, self.velocity)
+            self.time_left = torch.where(due, time, self.time_left)
+            if self.cfg.jump_fraction <= 0.0:
+                self.jump.zero_()
+            else:
+                self._jump_left -= dt
+                turn = (self._jump_left <= 0.0) & self.jumper
+                self.jump = self.jump ^ turn
+                change = torch.where(self.jump, on, off)
+                self._jump_left = torch.where(turn, change, self._jump_left)
+        self._set_guidance()
+
+    def _set_guidance(self) -> None:
+        """Set what the action term adds to the targets of the coming step."""
+        action = joint_position_action(self._env)
+        if self.guidance_scale == 0.0:
+            action.guidance = None
+            return
+        state, last = self.state, len(self._guidance) - 1
+        # The jump state learns of a new command at the end of the step that begins with it.
+        begins = self.jump & ~state.commanded
+        steps = (state.since / self._env.step_dt).round().long().clamp_max(last)
+        on_the_ground = state.mode & (state.liftoffs == 0.0)
+        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
+        action.guidance = self.guidance_scale * self._guidance[steps]
+
+    def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
+        drawn = torch.rand(7, count, device=self.device)
+        axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
+        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.fraction * self._limits) * axes
+        time, on, off = torch.lerp(self._least, self._most, drawn[4:])
+        return velocity, time, on, off
+
+    def _update_metrics(self) -> None:
+        """No-op, as the next two, which mjlab requires: see `compute` and `reset`."""
+
+    def _resample_command(self, env_ids: Tensor) -> None: ...
+
+    def _update_command(self, env_ids: Tensor | None) -> None: ...
+
+
+def motion_command(env: ManagerBasedRlEnv) -> MotionCommand:
+    """The command term of an environment."""
+    term = env.command_manager.get_term(NAME)
+    assert isinstance(term, MotionCommand)
+    return term

@@ -1,0 +1,69 @@
+"""Guidance of a jump: joint target offsets of a countermovement, added to the policy's targets.
+
+A countermovement needs a different action of twelve drives at every moment of a quarter of a
+second, and a policy that has not begun to fall cannot learn to push. So at first each leg is guided
+through `JumpSettings.countermovement`, its foot below its hip, with the torque that it takes; the
+phases of training then reduce the offsets to zero.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pronk.jump.train.mdp.jump import JumpSettings
+from pronk.jump.train.mdp.motion import standing_leg
+from pronk.robots.legged import Legged
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+_DIFFERENCE = 1e-4
+"""Time step of the finite difference that gives joint velocities [s]."""
+
+
+def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Hip pitch and knee [rad] of a leg whose foot is below its hip, bent as in the default pose.
+
+    `length` is from the axis of the hip pitch to the foot [m], at most that of a straight leg.
+    """
+    thigh, shank = body.thigh_length, body.shank_length
+    cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
+    knee = torch.arccos(cosine.clamp(-1.0, 1.0))
+    pitch = -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos())
+    sign = 1.0 if body.default_position["knee"] >= 0.0 else -1.0
+    return sign * pitch, sign * knee
+
+
+def guidance(
+    body: Legged, settings: JumpSettings, stiffness: Tensor, damping: Tensor, dt: float
+) -> Tensor:
+    """Offsets of the joint targets in each policy step after a jump command [rad].
+
+    A drive gives stiffness (target - q) - damping qdot, so a target lies beyond the joint's
+    intended position by what torque and velocity need. Guided like that, a policy that only walks
+    left the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
+
+    `stiffness` [N m/rad] and `damping` [N m s/rad] are of the drives, leg by leg, (12,); a policy
+    step takes `dt` [s]. Returns (steps + 1, 12): the last but one is for the step that ends with
+    the lift-off, the last is zero.
+    """
+    # Each target is for the end of its step.
+    time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
+    default = torch.tensor([body.default_position[name] for name in body.leg_joints]).double()
+
+    def angles(at: Tensor) -> Tensor:
+        pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(at))
+        return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)
+
+    pose, rate = angles(time), angles(time + _DIFFERENCE) - angles(time - _DIFFERENCE)
+    upwards = torch.where(time < settings.fall_s, -settings.fall, settings.push)
+    force = (0.25 * body.total_mass * (upwards + GRAVITY)).clamp_min(0.0)
+    torque = torch.zeros_like(pose)
+    # The force passes through the hip; the knee is beside it by the thigh's horizontal part.
+    torque[:, 2] = force * body.thigh_length * pose[:, 1].sin()
+    offset, torque, rate = (
+        value.repeat(1, len(body.legs)) for value in (pose - default, torque, rate)
+    )
+    moving = damping.double().cpu() * rate / (2.0 * _DIFFERENCE)
+    added = offset + (torque + moving) / stiffness.double().cpu()
+    return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)

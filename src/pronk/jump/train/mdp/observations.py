@@ -1,0 +1,147 @@
+"""Observations: the measured vector, the jump input, and the state that only training has.
+
+The measured vector is laid out in `pronk.policy.observation`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from pronk.jump.train.mdp.actions import joint_position_action
+from pronk.jump.train.mdp.commands import motion_command
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+_TRUNK = {"angular_velocity": 3, "projected_gravity": 3, "command": 3, "time_left": 1}
+_MOTION = {"joint_position": 12, "joint_velocity": 12, "action": 12, "linear_velocity": 3}
+_GROUND = {"height": 1, "foot_contact": 4, "foot_force": 4, "foot_height": 4}
+_BATTERY = {"voltage": 1, "no_load": 1, "drop": 1}
+_BODY = {"friction": 1, "base_mass": 1, "delay": 1, "shank_length": 4}
+RANDOMIZED = {**_BATTERY, **_BODY, "stiffness": 12, "damping": 12}
+"""Parameters that are drawn for each robot, see `randomized_parameters`."""
+CRITIC = {**_TRUNK, **_MOTION, **_GROUND, **RANDOMIZED}
+"""Parts of the critic's vector, in order, and their sizes. With the randomized parameters of the
+robot and the time that its velocity command lasts, they explain differences between returns."""
+
+_LIFTOFF = ("mode", "since", "airborne", "best_score", "travel", "reward_scale", "overspeed")
+_FLIGHT = ("flight", "best_flight")
+CRITIC_JUMP = dict.fromkeys(("jump", *_LIFTOFF, *_FLIGHT, "jumper", "jump_left"), 1)
+"""Parts of the critic's jump vector; zeros as long as no robot gets a jump input. Jump commands
+come at random and earn more than seconds of walking: without knowing whether and when one comes,
+most of the difference between two returns would hide the effect of an action."""
+
+
+def angular_velocity(env: ManagerBasedRlEnv) -> Tensor:
+    """Of the trunk, in its frame [rad/s]. (N, 3)."""
+    return env.sim.data.qvel[:, 3:6]
+
+
+def projected_gravity(env: ManagerBasedRlEnv) -> Tensor:
+    """Direction of gravity in the trunk's frame. (N, 3)."""
+    return -_trunk_axes(env)[:, 2]
+
+
+def joint_position(env: ManagerBasedRlEnv) -> Tensor:
+    """Relative to the default pose [rad]. (N, 12)."""
+    return env.sim.data.qpos[:, 7:] - motion_command(env).default_position
+
+
+def joint_velocity(env: ManagerBasedRlEnv) -> Tensor:
+    """[rad/s]. (N, 12)."""
+    return env.sim.data.qvel[:, 6:]
+
+
+def action(env: ManagerBasedRlEnv) -> Tensor:
+    """The network's last actions. (N, 12)."""
+    return env.action_manager.action
+
+
+def command(env: ManagerBasedRlEnv) -> Tensor:
+    """Forward, left [m/s], yaw rate [rad/s]. (N, 3)."""
+    return motion_command(env).velocity
+
+
+def jump(env: ManagerBasedRlEnv) -> Tensor:
+    """The jump input, 0 or 1. (N, 1)."""
+    return motion_command(env).jump.float()[:, None]
+
+
+def estimator_target(env: ManagerBasedRlEnv) -> Tensor:
+    """Contacts (0 or 1), then velocity in the trunk's frame [m/s]. (N, 7)."""
+    contact = env.scene["feet"].data.found > 0
+    return torch.cat([contact.float(), _linear_velocity(env)], dim=-1)
+
+
+def critic(env: ManagerBasedRlEnv) -> Tensor:
+    """The parts of `CRITIC`. (N, 96)."""
+    ground = env.scene["feet"].data
+    terms = motion_command(env)
+    weight = 9.81 * terms.body.total_mass
+    return torch.cat(
+        [
+            angular_velocity(env),
+            projected_gravity(env),
+            command(env),
+            terms.time_left[:, None],
+            joint_position(env),
+            joint_velocity(env),
+            action(env),
+            _linear_velocity(env),
+            env.sim.data.qpos[:, 2:3],
+            (ground.found > 0).float(),
+            torch.linalg.vector_norm(ground.force, dim=-1) / weight,
+            env.sim.data.site_xpos[:, terms.feet, 2],
+            *randomized_parameters(env),
+        ],
+        dim=-1,
+    )
+
+
+def randomized_parameters(env: ManagerBasedRlEnv) -> list[Tensor]:
+    """The parts of `RANDOMIZED`, in order. (N, size) each.
+
+    Voltages over the rated one, `drop` in 1/kW, mass in kg, delay in physics steps, foot to knee
+    axis in m, stiffness and damping by joint group and leg.
+    """
+    model, action = env.sim.model, joint_position_action(env)
+    feet, battery = motion_command(env).foot_geoms, action.battery
+    drives = env.scene["robot"].actuators
+    parts = [
+        battery.voltage,
+        battery.no_load,
+        1e3 * battery.drop,
+        model.geom_friction[:, feet[:1], 0],
+        model.body_mass[:, env.scene["robot"].indexing.body_ids[:1]],
+        action.lag,
+        -model.geom_pos[:, feet, 2],
+        *(drive.stiffness for drive in drives),
+        *(drive.damping for drive in drives),
+    ]
+    # A field that is not drawn is stored once for all robots.
+    return [part.expand(env.num_envs, -1) for part in parts]
+
+
+def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
+    """The parts of `CRITIC_JUMP`. (N, 12)."""
+    command = motion_command(env)
+    inside = [getattr(command.state, name) for name in (*_LIFTOFF, *_FLIGHT)]
+    parts = [command.jump, *inside, command.jumper, command.jump_left]
+    if not (command.cfg.jump_fraction > 0.0 or command.scripted):
+        return env.sim.data.qpos.new_zeros(env.num_envs, len(parts))
+    return torch.stack([part.float() for part in parts], dim=-1)
+
+
+def _linear_velocity(env: ManagerBasedRlEnv) -> Tensor:
+    """Of the trunk, in its frame [m/s]. (N, 3)."""
+    # Not a matrix product: those are rounded to ten bits where TF32 is allowed.
+    return (env.sim.data.qvel[:, :3, None] * _trunk_axes(env)).sum(dim=1)
+
+
+def _trunk_axes(env: ManagerBasedRlEnv) -> Tensor:
+    """The trunk's x, y, z axes in the world's frame, as columns. (N, 3, 3)."""
+    axes: Tensor = env.sim.data.xmat[:, env.scene["robot"].indexing.root_body_id]
+    return axes

@@ -1,0 +1,183 @@
+"""The phases of training as a curriculum term on the step counter (paper P1, P2).
+
+Phase 1 walks, with the jump input held at zero. In phase 2 half of the robots are commanded to jump
+now and then. In 2a equal foot forces are rewarded strongly, which turns a trot into a jump with all
+feet at once; in 2b a tenth of that is left (Table II). The networks have the jump input from the
+beginning; its weights are zero until phase 2, since an input of zeros has no gradient: the blank
+neuron of the paper's widening (N3).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from pronk.errors import PronkError
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers import CurriculumTermCfg
+
+NAME = "phases"
+"""The curriculum term's name in every environment."""
+STEPS_PER_ITERATION = 24
+"""Policy steps of every robot between two updates of PPO."""
+
+Span = tuple[float, float]
+"""Values at the beginning and at the end of a phase."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """What changes from phase to phase; each value moves linearly unless said otherwise."""
+
+    jump: bool
+    """Whether half of the robots get the jump input."""
+    weights: Mapping[str, Span] = field(default_factory=dict)
+    """Weights of rewards by name; the others keep those of `reward_weights`."""
+    jump_scales: Mapping[str, Span] = field(default_factory=dict)
+    """Their factors in jump mode."""
+    liftoff_std: Span = (1.0, 1.0)
+    """Standard deviation of the lift-off kernel [m/s]; the paper's expression has 1."""
+    guidance: Span = (0.0, 0.0)
+    """Fraction of the countermovement's guidance; falls fast at first and slowly at last, when
+    there is little noise left to learn with."""
+    noise: Span = (math.inf, math.inf)
+    """Largest standard deviation of the actions; falls slowly at first and fast at last: with
+    little noise a policy changes little in an iteration (PPO bounds a step in units of it)."""
+    entropy: float = 0.005
+    """Coefficient of PPO's entropy bonus."""
+    estimator_rate: float = 1e-3
+    """Learning rate of the estimator."""
+
+    def largest_noise(self, done: float) -> float:
+        """Largest standard deviation of the actions when a fraction of the phase is over."""
+        first, last = self.noise
+        return math.inf if math.isinf(first) else first * (last / first) ** done**2
+
+
+_JUMP_A = {
+    "dense_jump": (-0.02, -0.02),
+    "sparse_jump": (16.0, 16.0),
+    "jump_height": (16.0, 16.0),
+    "flight_distance": (28.0, 28.0),
+    "clearance_gap": (12.0, 12.0),
+    "countermovement": (60.0, 60.0),
+    "hop": (-1.0, -1.0),
+}
+
+PHASES: Mapping[str, Phase] = {
+    "walk": Phase(jump=False),
+    # Jumping has to be found, and a countermovement with it: policies that had learned to push
+    # without one never came to it. Rewarded by the trunk's velocity alone, seven of eight trainings
+    # found a jump 40 to 400 iterations into 2b, and one none. The entropy bonus alone would raise
+    # the noise from .5 to 1.0 in 170 iterations.
+    "jump_a": Phase(jump=True, weights=_JUMP_A, noise=(0.65, 0.65), guidance=(1.0, 0.7)),
+    # Then alike every time: with a standard deviation of .59 after 560 iterations (.42 before the
+    # first jump) a policy walks worse and its jumps scatter. The penalties of low landings and of
+    # thighs and knees on the ground grow: in force before there is a jump, they might prevent it.
+    # Jumps earn less: with as much as at first walking came to be .18 m/s too fast and turning .2
+    # rad/s too slow.
+    "jump_b": Phase(
+        jump=True,
+        weights={
+            **_JUMP_A,
+            "dense_jump": (-0.002, -0.002),
+            "sparse_jump": (16.0, 12.0),
+            "jump_height": (16.0, 10.0),
+            "clearance_gap": (12.0, 11.0),
+            "countermovement": (60.0, 0.0),
+            "landing": (0.0, -40.0),
+        },
+        jump_scales={"collision": (1.0, 9.0), "knees": (1.0, 10.0)},
+        liftoff_std=(0.8, 0.25),
+        entropy=0.0,
+        noise=(0.65, 0.2),
+        guidance=(0.7, 0.0),
+        estimator_rate=3e-4,
+    ),
+}
+"""The phases by name, in order. The paper's weights are 2.5 and 0.25 for dense and 250 for sparse;
+in `PAPER_UNIT`s .125, .0125 and 12.5."""
+
+TASKS: Mapping[str, Mapping[str, int]] = {
+    "walk": {"walk": 300, "jump_a": 0, "jump_b": 0},
+    "jump": {"walk": 300, "jump_a": 220, "jump_b": 560},
+    "all": {"walk": 300, "jump_a": 220, "jump_b": 560},
+    # The paper's ablation: to walk and to jump at once, with as many iterations in all.
+    "together": {"walk": 0, "jump_a": 520, "jump_b": 560},
+}
+"""Iterations of each phase, by task; a task whose walk is 0 begins with jump_a."""
+
+
+def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]:
+    """The phase of an iteration, counted from 0, and the fraction of it that is over before.
+
+    Beyond the last iteration the last phase is over. PronkError without any phase.
+    """
+    present = {name: count for name, count in iterations.items() if count > 0}
+    if not present:
+        raise PronkError("all phases have 0 iterations; expected 1 or more for one of them.")
+    for name, count in present.items():
+        if iteration < count:
+            return name, iteration / count
+        iteration -= count
+    return name, 1.0
+
+
+class Curriculum:
+    """Curriculum term: sets the rewards and the command term to the phase of the iteration.
+
+    mjlab calls it whenever a robot resets, the runner at the beginning of every iteration.
+    """
+
+    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        self.iterations = {name: cfg.params[name] for name in PHASES}
+        self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
+        self._set = -1
+        self._initial = {
+            name: (term.weight, dict(term.params)) for name, term in env.cfg.rewards.items()
+        }
+
+    @property
+    def total(self) -> int:
+        """Iterations of all phases."""
+        return sum(self.iterations.values())
+
+    def __call__(self, env: ManagerBasedRlEnv, env_ids: Any, **_: int) -> dict[str, float]:
+        """Apply the phase, and return what is logged."""
+        iteration = env.common_step_counter // self.steps_per_iteration
+        name, done = phase_at(self.iterations, iteration)
+        if iteration != self._set:
+            self._set = iteration
+            self.apply(env, PHASES[name], done)
+        return {"phase": float(list(PHASES).index(name)), "done": done}
+
+    def apply(self, env: ManagerBasedRlEnv, phase: Phase, done: float) -> None:
+        """Set a phase of which a fraction is over, whatever the step counter."""
+        from pronk.jump.train.mdp.commands import motion_command
+
+        for name, (weight, params) in self._initial.items():
+            term = env.reward_manager.get_term_cfg(name)
+            term.weight = _between(phase.weights.get(name, (weight, weight)), done)
+            if name in phase.jump_scales:
+                params = {**params, "jump_scale": _between(phase.jump_scales[name], done)}
+            term.params.update(params)
+        command = motion_command(env)
+        command.state.liftoff_std = _between(phase.liftoff_std, done)
+        command.cfg.jump_fraction = 0.5 if phase.jump else 0.0
+        first, last = phase.guidance
+        command.guidance_scale = last + (first - last) * (1.0 - done) ** 2
+
+
+def curriculum(env: ManagerBasedRlEnv) -> Curriculum:
+    """The curriculum term of an environment."""
+    term = env.curriculum_manager.get_term_cfg(NAME).func
+    assert isinstance(term, Curriculum)
+    return term
+
+
+def _between(span: Span, done: float) -> float:
+    return span[0] + (span[1] - span[0]) * done

@@ -1,0 +1,94 @@
+"""The tasks: configurations of the environment and of PPO for each robot, registered with mjlab.
+
+mjlab finds this package by its entry point, so its `train`, `play` and `list-envs` have the tasks
+`Pronk-Jump-ROBOT` (the whole recipe) and `Pronk-Walk-ROBOT` (phase 1 alone), with nominal gains.
+`pronk train` builds the same configurations with the given gains.
+
+A robot outside this package has a task if `env_cfgs.py` (with `env_cfg`) and, optionally,
+`rl_cfg.py` (with `rl_cfg`) lie beside its `robot.yaml`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl import RslRlOnPolicyRunnerCfg
+from mjlab.tasks.registry import register_mjlab_task
+
+from pronk.errors import PronkError
+from pronk.jump.train.gains import NAIVE, training_gains
+from pronk.jump.train.phases import TASKS
+from pronk.jump.train.rl.runner import PronkRunner
+from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
+from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+
+ROBOTS = ("mini_cheetah",)
+"""Robots of this package with a task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """The configurations of one robot; arguments are those of `jump_env_cfg`, `jump_rl_cfg`."""
+
+    robot: RobotSpec
+    env_cfg: Callable[..., ManagerBasedRlEnvCfg]
+    rl_cfg: Callable[..., RslRlOnPolicyRunnerCfg]
+
+
+def load_task(robot: str) -> Task:
+    """The task of a robot, by name or path; a PronkError says which robots have one."""
+    spec = load_robot(robot)
+    if spec.source in ROBOTS:
+        return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
+    folder = Path(spec.source).parent
+    path, own = folder / "env_cfgs.py", folder / "rl_cfg.py"
+    if not path.is_file():
+        raise PronkError(
+            f"{robot} has no training task: expected {path} with a function env_cfg, or one of the "
+            f"robots {', '.join(ROBOTS)}."
+        )
+    rl_cfg = _function(own, "rl_cfg") if own.is_file() else jump_rl_cfg
+    return Task(robot=spec, env_cfg=_function(path, "env_cfg"), rl_cfg=rl_cfg)
+
+
+def _function(path: Path, name: str) -> Callable[..., Any]:
+    found = importlib.util.spec_from_file_location(path.stem, path)
+    assert found is not None
+    assert found.loader is not None
+    module: ModuleType = importlib.util.module_from_spec(found)
+    try:
+        found.loader.exec_module(module)
+    except Exception as error:
+        raise PronkError(
+            f"{path}: cannot be imported ({type(error).__name__}: {error})."
+        ) from error
+    if not callable(function := getattr(module, name, None)):
+        raise PronkError(f"{path}: has no function {name}.")
+    return function
+
+
+def _register() -> None:
+    for robot in ROBOTS:
+        task = load_task(robot)
+        gains = training_gains(NAIVE, task.robot)
+        name = "".join(word.capitalize() for word in robot.split("_"))
+        for kind in ("Jump", "Walk"):
+            iterations = TASKS[kind.lower()]
+            register_mjlab_task(
+                task_id=f"Pronk-{kind}-{name}",
+                env_cfg=task.env_cfg(task.robot, gains, iterations=iterations),
+                play_env_cfg=play_cfg(task.env_cfg(task.robot, gains, iterations=iterations)),
+                rl_cfg=task.rl_cfg(iterations=sum(iterations.values())),
+                runner_cls=PronkRunner,
+            )
+
+
+_register()

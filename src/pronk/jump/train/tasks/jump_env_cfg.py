@@ -1,0 +1,274 @@
+"""The environment of the jump task, for any quadruped: walk, run and jump on command.
+
+Legs `LEG` with joints `LEG_hip_roll`, `LEG_hip_pitch`, `LEG_knee`, foot sites `LEG_foot`, and
+collision geoms `trunk_collision`, `LEG_thigh_collision`, `LEG_shank_collision`,
+`LEG_foot_collision`. A robot's `env_cfgs.py` calls `jump_env_cfg` and changes what differs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import mujoco
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.envs.mdp import dr, push_by_setting_velocity
+from mjlab.managers import (
+    CurriculumTermCfg,
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    TerminationTermCfg,
+)
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.scene import SceneCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg
+from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.terrains import TerrainEntityCfg
+from mjlab.viewer import ViewerConfig
+
+from pronk.jump.train import phases
+from pronk.jump.train.gains import TrainingGains
+from pronk.jump.train.mdp import actions, commands, events, observations, terminations
+from pronk.jump.train.mdp.actuators import actuators
+from pronk.jump.train.tasks.reward_weights import reward_weights
+from pronk.policy.observation import ACTIONS, HISTORY
+from pronk.robots.legged import legged
+from pronk.robots.robot import RobotSpec
+
+FOOT_CONTACT = (0.0105, 1.0)
+"""Time constant [s] and damping ratio of a foot on the ground. With MuJoCo's .02 the feet of a
+landing robot sink in by 19 to 28 mm, so that its shanks touch the floor; MuJoCo takes no less than
+twice the physics step."""
+EPISODE_S = 20.0
+"""Longest episode at the nominal policy rate [s]."""
+DELAY_STEPS = 1
+"""Half-width of the command delay about the matched one [physics steps]. Not in the paper."""
+
+
+def jump_env_cfg(
+    robot: RobotSpec,
+    gains: TrainingGains,
+    *,
+    iterations: Mapping[str, int],
+    gain_shape: events.Shape = "box",
+    num_envs: int = 4096,
+    seed: int = 0,
+) -> ManagerBasedRlEnvCfg:
+    """The environment of all phases, with their PPO iterations by name."""
+    delay = round(gains.delay_s / robot.timestep_s)
+    return ManagerBasedRlEnvCfg(
+        seed=seed,
+        decimation=robot.decimation,
+        scene=_scene(robot, gains, num_envs),
+        sim=_simulation(robot),
+        observations=_observations(),
+        actions={
+            actions.NAME: actions.DelayedJointPositionActionCfg(
+                entity_name="robot",
+                actuator_names=robot.joint_names,
+                scale=0.35,
+                use_default_offset=True,
+                preserve_order=True,
+                delay_steps=(max(0, delay - DELAY_STEPS), delay + DELAY_STEPS),
+            )
+        },
+        commands={commands.NAME: commands.MotionCommandCfg(robot=robot.source, gains=gains)},
+        events=_events(robot, gains, gain_shape),
+        rewards=reward_weights(),
+        terminations={
+            "time_out": TerminationTermCfg(
+                func=terminations.time_out,
+                time_out=True,
+                params={"steps": round(EPISODE_S * robot.policy_rate_hz)},
+            ),
+            # 70 degrees; the trunk's lower face is 5 cm below its centre.
+            "fell": TerminationTermCfg(
+                func=terminations.fell, params={"tilt_cosine": 0.34, "height": 0.08}
+            ),
+            "non_finite": TerminationTermCfg(func=terminations.non_finite, params={"speed": 200.0}),
+        },
+        curriculum={
+            phases.NAME: CurriculumTermCfg(
+                func=phases.Curriculum,
+                params={**iterations, "steps_per_iteration": phases.STEPS_PER_ITERATION},
+            )
+        },
+        episode_length_s=EPISODE_S,
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="robot",
+            body_name=robot.base_body,
+            distance=2.0,
+            elevation=-10.0,
+        ),
+    )
+
+
+def without_randomization(cfg: ManagerBasedRlEnvCfg, *, noise: bool = False) -> None:
+    """Leave the nominal robot, undisturbed; with `noise` keep that of measurements, timing, delay.
+
+    Starts and commands are still drawn.
+    """
+    kept = ("reset", "decimation") if noise else ("reset",)
+    cfg.events = {name: term for name, term in cfg.events.items() if name in kept}
+    if not noise:
+        cfg.observations["measured"].enable_corruption = False
+        action = cfg.actions[actions.NAME]
+        middle = action.delay_steps[1] - DELAY_STEPS
+        action.delay_steps = (middle, middle)
+
+
+def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
+    """Make the environment for mjlab's `play` of a training environment: one nominal robot."""
+    without_randomization(cfg)
+    cfg.scene.num_envs = 1
+    cfg.episode_length_s = 1e6
+    cfg.terminations = {n: t for n, t in cfg.terminations.items() if not t.time_out}
+    cfg.curriculum = {}
+    cfg.commands[commands.NAME].jump_fraction = 1.0
+    return cfg
+
+
+def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
+    """The robot on a plane, with sensors `feet` (force and contact) and `limbs` (contact)."""
+    body = legged(robot.source)
+    feet = tuple(f"{leg}_foot_collision" for leg in body.legs)
+    limbs = [f"{leg}_{link}_collision" for leg in body.legs for link in ("thigh", "shank")]
+
+    def sensor(name: str, geoms: tuple[str, ...], **measured: Any) -> ContactSensorCfg:
+        return ContactSensorCfg(
+            name=name,
+            primary=ContactMatch(mode="geom", pattern=geoms, entity="robot"),
+            secondary=ContactMatch(mode="body", pattern="terrain"),
+            **measured,
+        )
+
+    entity = EntityCfg(
+        spec_fn=partial(_spec, robot, feet),
+        init_state=EntityCfg.InitialStateCfg(
+            pos=(0.0, 0.0, body.standing_height),
+            joint_pos={joint.name: joint.default_position for joint in robot.joints},
+            joint_vel={".*": 0.0},
+        ),
+        articulation=EntityArticulationInfoCfg(actuators=actuators(robot, gains)),
+        sort_actuators=True,
+    )
+    return SceneCfg(
+        terrain=TerrainEntityCfg(terrain_type="plane"),
+        entities={"robot": entity},
+        sensors=(
+            sensor("feet", feet, fields=("found", "force"), reduce="netforce"),
+            sensor("limbs", ("trunk_collision", *limbs), fields=("found",), reduce="none"),
+        ),
+        num_envs=num_envs,
+        extent=2.0,
+    )
+
+
+def _spec(robot: RobotSpec, feet: tuple[str, ...]) -> mujoco.MjSpec:
+    spec = robot.build_spec()
+    for name in feet:
+        spec.geom(name).solref = FOOT_CONTACT
+    return spec
+
+
+def _simulation(robot: RobotSpec) -> SimulationCfg:
+    """MuJoCo Warp at the timestep that gains are matched for."""
+    return SimulationCfg(
+        # At most 4 feet, 8 limb capsules with two points each and 4 trunk corners touch; each
+        # point of condim 3 has three constraint rows, each joint a friction and a limit row.
+        nconmax=24,
+        njmax=104,
+        mujoco=MujocoCfg(
+            timestep=robot.timestep_s,
+            integrator="implicitfast",
+            # Elliptic, because the softness of a pyramid grows with the square of its friction:
+            # with the 3.0 of D2 a standing robot sinks 2 cm into the floor.
+            cone="elliptic",
+            impratio=10.0,
+            iterations=10,
+            ls_iterations=20,
+        ),
+    )
+
+
+def _observations() -> dict[str, ObservationGroupCfg]:
+    """The groups; noise is uniform, with these half-widths (D7 to D10)."""
+
+    def term(func: Any, noise: float = 0.0, history: int = 0) -> ObservationTermCfg:
+        drawn = events.UniformNoise(n_min=-noise, n_max=noise) if noise else None
+        return ObservationTermCfg(func=func, noise=drawn, history_length=history)
+
+    groups = {
+        name: ObservationGroupCfg(terms={"all": term(getattr(observations, name))})
+        for name in ("jump", "critic", "critic_jump", "estimator_target")
+    }
+    groups["measured"] = ObservationGroupCfg(
+        terms={
+            "angular_velocity": term(observations.angular_velocity, 0.2),
+            "projected_gravity": term(observations.projected_gravity, 0.05),
+            "joint_position": term(observations.joint_position, 0.05, HISTORY),
+            "joint_velocity": term(observations.joint_velocity, 0.5, HISTORY),
+            "action": term(observations.action, 0.0, ACTIONS),
+            "command": term(observations.command),
+        },
+        enable_corruption=True,
+    )
+    return groups
+
+
+def _events(
+    robot: RobotSpec, gains: TrainingGains, gain_shape: events.Shape
+) -> dict[str, EventTermCfg]:
+    feet = SceneEntityCfg("robot", geom_names=".*_foot_collision", site_names=".*_foot")
+    shanks = SceneEntityCfg("robot", geom_names=".*_shank_collision")
+    base = SceneEntityCfg("robot", body_names=robot.base_body)
+    ranges = {joint.name: gains.groups[joint.group] for joint in robot.joints}
+    if gain_shape == "ellipsoid":
+        for group in gains.groups.values():
+            events.check_ellipsoid(group)
+    body = legged(robot.source)
+    # D5, .18 to .20 m, and D6, -.4 to 1.6 kg, of the Mini Cheetah, in proportion.
+    shank = (0.18 / 0.195 * body.shank_length, 0.20 / 0.195 * body.shank_length)
+    added = (-0.4 / 12.0 * body.total_mass, 1.6 / 12.0 * body.total_mass)
+    rated = robot.joints[0].drive.bus_voltage
+
+    def once(func: Any, **params: Any) -> EventTermCfg:
+        return EventTermCfg(func=func, mode="startup", params=params)
+
+    return {
+        "reset": EventTermCfg(
+            func=events.reset_state,
+            mode="reset",
+            params={"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1},
+        ),
+        # D2, one for all feet, which have priority over the floor.
+        "friction": once(dr.geom_friction, ranges=(0.05, 3.0), shared_random=True, asset_cfg=feet),
+        "gains": once(events.randomize_gains, ranges=ranges, shape=gain_shape),  # D3, D4
+        "shank_length": once(events.randomize_shank_length, span=shank, feet=feet, shanks=shanks),
+        "base_mass": once(events.randomize_base_mass, added=added, base=base),
+        # Lithium cells from 3.7 V (nominal, and all but empty) to 4.2 V (full); of six cells 5 to
+        # 12 milliohm each, and plugs and wires. Not in the paper. A jump draws a kilowatt and more.
+        "battery": once(
+            events.randomize_battery,
+            voltage=(22.2 / 24.0 * rated, 25.2 / 24.0 * rated),
+            resistance=(0.03, 0.1),
+            rated=rated,
+        ),
+        "decimation": EventTermCfg(  # D1, A1
+            func=events.randomize_decimation,
+            mode="step",
+            params={"nominal": robot.decimation, "added": (-2, 2)},
+        ),
+        # Mild; the paper has none.
+        "push": EventTermCfg(
+            func=push_by_setting_velocity,
+            mode="interval",
+            interval_range_s=(5.0, 10.0),
+            params={"velocity_range": {"x": (-0.3, 0.3), "y": (-0.3, 0.3), "yaw": (-0.3, 0.3)}},
+        ),
+    }

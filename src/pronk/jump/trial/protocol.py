@@ -1,0 +1,102 @@
+"""The commands of a trial, and what the paper published about its jumps with them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from pronk.errors import PronkError
+from pronk.policy.script import STILL, Velocity
+
+Pair = tuple[float, float]
+"""Mean and standard deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A velocity at which jumps are commanded."""
+
+    name: str
+    command: Velocity
+    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+
+
+_COMMANDS: Mapping[str, Velocity] = {
+    "forward 1": (1.0, 0.0, 0.0),
+    "forward 2": (2.0, 0.0, 0.0),
+    "forward 2.25": (2.25, 0.0, 0.0),
+    "forward 3": (3.0, 0.0, 0.0),
+    "back 2": (-2.0, 0.0, 0.0),
+    "back 3": (-3.0, 0.0, 0.0),
+    **dict.fromkeys(("side +1", "left 1"), (0.0, 1.0, 0.0)),
+    **dict.fromkeys(("side -1", "right 1"), (0.0, -1.0, 0.0)),
+    **dict.fromkeys(("turn +2", "yaw 2"), (0.0, 0.0, 2.0)),
+    **dict.fromkeys(("turn -2", "yaw -2"), (0.0, 0.0, -2.0)),
+    "stand": STILL,
+}
+
+
+def named(*names: str) -> tuple[Case, ...]:
+    """Return commands by name. Positive sideways and positive turns are to the left.
+
+    The paper does not define the side, and its robot is symmetric.
+    """
+    return tuple(Case(name=name, command=_COMMANDS[name]) for name in names)
+
+
+PAPER_COMMANDS = named("forward 1", "forward 2", "side -1", "side +1", "back 2")
+"""The jumps of Table III of the paper."""
+(RATES,) = named("forward 2.25")
+"""Of the paper's figure of roll and pitch rates (R7)."""
+
+
+def parse_cases(texts: Iterable[str]) -> tuple[Case, ...]:
+    """Return the cases of several commands, in their order; `paper` stands for the paper's five."""
+    return tuple(
+        case
+        for text in texts
+        for case in (PAPER_COMMANDS if text.strip() == "paper" else (parse_case(text),))
+    )
+
+
+def parse_case(text: str) -> Case:
+    """Return the case of a command as `1,0` or `1,0,0`; one of the paper's keeps its name."""
+    try:
+        values = [float(part) for part in text.split(",")]
+        if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
+            raise ValueError
+    except ValueError:
+        raise PronkError(
+            f"command {text!r}; expected two or three numbers between commas, forward and left "
+            'velocity [m/s] and yaw rate [rad/s], as in "1,0,0".'
+        ) from None
+    forward, left, yaw = (*values, 0.0)[:3]
+    command = (forward, left, yaw)
+    known = [case for case in (*PAPER_COMMANDS, RATES) if case.command == command]
+    return known[0] if known else Case(name=",".join(f"{v:g}" for v in command), command=command)
+
+
+_ROWS = {
+    "forward 1": ((0.332, 0.008), (0.318, 0.014), (0.690, 0.076), (0.597, 0.042)),
+    "forward 2": ((0.246, 0.022), (0.244, 0.013), (0.944, 0.030), (0.969, 0.026)),
+    "side -1": ((0.304, 0.061), (0.374, 0.016), (0.636, 0.092), (0.587, 0.054)),
+    "side +1": ((0.249, 0.041), (0.366, 0.052), (0.701, 0.183), (0.542, 0.051)),
+    "back 2": ((0.346, 0.031), (0.381, 0.015), (0.944, 0.030), (0.932, 0.025)),
+}
+_COLUMNS = [(figure, gains) for figure in ("height", "distance") for gains in ("naive", "matched")]
+TABLE_III: Mapping[tuple[str, str], Mapping[str, Pair]] = {
+    column: {case: row[i] for case, row in _ROWS.items()} for i, column in enumerate(_COLUMNS)
+}
+"""arXiv 2404.15096, Table III: mean and standard deviation of five jumps [m], by figure and gains,
+then by command; for comparison, never fitted to. Its naive distance with `back 2` is
+that with `forward 2`, digit by digit: most likely an error of the table (reading A4)."""
+
+PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
+"""Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text has
+2.30 for the distance (reading A4)."""
+
+
+def in_paper_order(names: Iterable[str]) -> list[str]:
+    """Sort names of policies as the columns of Table III: `naive` first, others as they came."""
+    return sorted(names, key=lambda name: name != "naive")

@@ -1,0 +1,352 @@
+"""The plant of the virtual robot: rotors behind compliant belts, driven by DC motors.
+
+Every joint of the robot's model has two degrees of freedom here: the link, and the rotor with the
+inertia reflected through the gear. A belt (spring and damper) couples them. Motor, encoder and
+friction are on the rotor. All of it is in joint coordinates. On the bench the base is fixed to its
+stand and there are no contacts; on the ground the trunk is free.
+
+Drive. MuJoCo's `dcmotor`, whose controller outputs volts. A drive that regulates current demands
+tau = stiffness (target - q) - damping qdot and assumes a motor constant K0; the motor has
+K = torque_scale K0, in torque as in back-EMF (one magnetic flux). The voltage that drives the
+current tau / K0 through R against the back-EMF is
+
+    V = R tau / K0 + K qdot,    torque = K (V - K qdot) / R = torque_scale tau,
+
+so the controller gains are R stiffness / K0 and R damping / K0 - K, and the clip of V at the bus
+gives the torque-speed line of the true motor. Friction is LuGre with a Stribeck peak:
+dz/dt = v - sigma0 |v| z / g(v), g = F_C + (F_S - F_C) exp(-(v/v_S)^2), torque sigma0 z +
+sigma1 dz/dt, outside the limits of the motor.
+
+Time stepping. MuJoCo's Euler step is symplectic: positions use the new speed, torques the old one.
+With the drive's derivative torque explicit, q_{n+1} - 2 q_n + q_{n-1} = -(h/I) kd (q_n - q_{n-1})
++ ..., in which the backward difference stands for qdot - (h/2) qddot: the joint responds as if its
+inertia were smaller by kd h / 2, an error of first order in the step h (0.13 dB at 0.25 ms). The
+rotor is therefore given that much more inertia, which leaves an error of second order; passive
+damping is implicit in MuJoCo, so its share has the other sign. The same effect, uncorrected and
+at 5 ms, is what makes gains matched in the training simulator differ from those on the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.arrays import Array
+from pronk.errors import RobotError
+from pronk.jump.virtual.ground import Ground
+from pronk.jump.virtual.sim_params import JointParams, SimParams, TrunkParams
+from pronk.robots.robot import Drive, RobotSpec
+
+Indices = NDArray[np.intp]
+
+# Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
+_STABLE = 1.0
+# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass as well [kg].
+_ROTOR_MASS = 1e-9
+# Time in which a joint that has run into its stop is pushed back, 8 physics steps [s].
+_STOP_S = 2e-3
+# Joints of a compliant stand, and their axes.
+_STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
+# Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
+_KP, _KD, _VMAX = 4, 6, 7
+_STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
+
+
+class RawStates(NamedTuple):
+    """Views of raw states of a plant at n instants."""
+
+    position: Array  # qpos, (n, nq)
+    velocity: Array  # qvel, (n, nv)
+    torque: Array  # of the motors [N m], (n, joints of the plant)
+    voltage: Array  # of the bus [V], (n,)
+
+
+class Plant:
+    """A compiled plant and indices of its parts. Arrays are in the order of `joints`."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        sim_params: SimParams,
+        legs: tuple[str, ...],
+        timestep_s: float,
+        ground: Ground | None = None,
+    ) -> None:
+        """Build it with these of `legs_of(robot)`, on the bench (no contacts) or on `ground`."""
+        if sim_params.robot != robot.name:
+            raise RobotError(
+                f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a "
+                "file written for that robot."
+            )
+        sim_params.check_joints(robot.joint_names)
+        joints = [joint for joint in robot.joints if leg_of(robot, joint.name) in legs]
+        names, drives = [joint.name for joint in joints], [joint.drive for joint in joints]
+        true = [sim_params.joints[name] for name in names]
+        spec = robot.build_spec()
+        spec.option.timestep = timestep_s
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        for key in list(spec.keys):
+            spec.delete(key)
+        if ground is None:
+            _fix_base(spec, robot, sim_params)
+        else:
+            _free_base(spec, robot, ground)
+        _drop_legs(spec, robot, set(names))
+        for name, drive, params in zip(names, drives, true, strict=True):
+            _add_rotor(spec, name, drive, params, sim_params.machine.drive_lag_s)
+        self.model: Any = spec.compile()  # mujoco.MjModel
+        model = self.model
+        if model.nq != model.nv + (ground is not None):
+            raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
+        rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
+        # Mass and inertia by the same factor: a body that was possible stays possible.
+        for link, params in zip(links, true, strict=True):
+            body = int(model.jnt_bodyid[link.id])
+            model.body_mass[body] *= params.link_inertia_scale
+            model.body_inertia[body] *= params.link_inertia_scale
+        self.feet = _ids([])  # geoms; none on the bench
+        if ground is not None:
+            _change_trunk(model, model.body(robot.base_body).id, sim_params.trunk)
+            self.feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        if ground is not None:
+            ground.set_contact(model, self.feet)
+        self.aside = mujoco.MjData(model)  # to compute in, beside the run's
+        self.joints = tuple(names)  # in the plant, in file order
+        self.columns = _ids([robot.joint_names.index(name) for name in names])  # among the robot's
+        self.rotor = _ids([joint.dofadr[0] for joint in rotors])  # in qvel
+        self.rotor_qpos = _ids([joint.qposadr[0] for joint in rotors])
+        self.link = _ids([joint.dofadr[0] for joint in links])  # in qvel
+        self.link_qpos = _ids([joint.qposadr[0] for joint in links])
+        self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])  # in ctrl
+        # Currents in act. LuGre's bristle comes first among a motor's states, its current last.
+        states = model.actuator_actadr + model.actuator_actnum
+        self._current = _ids(states[self.actuator] - 1)
+        rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
+        # Roll, pitch, yaw in qpos and qvel; none of a rigid stand, and on the ground.
+        self.stand = _ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES])
+        scale = np.array([params.torque_scale for params in true])
+        # Motor constants K0 that the drives assume and K [V s/rad], resistance [ohm].
+        self._believed, self.resistance = np.array([drive.motor for drive in drives]).T.copy()
+        self.constant = scale * self._believed
+        self._effort_limit = scale * np.array([drive.effort_limit for drive in drives])  # [N m]
+        self._least_torque = -self._effort_limit
+        gears = np.array([drive.gear_ratio for drive in drives])
+        # Reflected through the gear [kg m^2], and viscous friction [N m s/rad].
+        self._rotor_inertia = np.array([params.rotor_inertia for params in true]) * gears**2
+        self._viscous = np.array([params.viscous for params in true])
+        # Reading minus true angle [rad].
+        self.encoder_offset = np.array([params.encoder_offset for params in true])
+        # Voltages at which the inverters clip, a view; every actuator of the plant is a motor [V].
+        self.inverters = model.actuator_gainprm[:, _VMAX]
+        # Numbers in a raw state: positions, velocities, activations, bus voltage.
+        self.state_size = int(model.nq + model.nv + model.na + 1)
+        self._check_springs(true)
+
+    def _check_springs(self, joints: list[JointParams]) -> None:
+        """Refuse springs that the physics step cannot follow; name field and largest value."""
+        model, data = self.model, mujoco.MjData(self.model)
+        inertia = np.zeros((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        mobility = np.diag(np.linalg.inv(inertia))
+        rotors, links = mobility[self.rotor], mobility[self.link]
+        springs = {"belt_stiffness": rotors + links, "presliding_stiffness": rotors}
+        for k, (name, joint) in enumerate(zip(self.joints, joints, strict=True)):
+            for field, mobile in springs.items():
+                most = (_STABLE / model.opt.timestep) ** 2 / mobile[k]
+                if (value := getattr(joint, field)) > most:
+                    raise RobotError(
+                        f"joints.{name}.{field} is {value:g}; at a physics step of "
+                        f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
+                    )
+
+    def read(self, data: Any, voltage: float, row: Array) -> None:
+        """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
+        mujoco.mj_getState(self.model, data, row[:-1], _STATE)
+        row[-1] = voltage
+
+    def unpack(self, rows: Array) -> RawStates:
+        """Split raw states (n, state_size)."""
+        nq, nv = self.model.nq, self.model.nv
+        torque = self.motor_torque(rows[:, nq + nv : -1])
+        return RawStates(rows[:, :nq], rows[:, nq : nq + nv], torque, rows[:, -1])
+
+    def set_gains(self, stiffness: Array, damping: Array) -> None:
+        """Set the drives' gains [N m/rad, N m s/rad] from the next physics step."""
+        volts = self.resistance / self._believed
+        self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
+        self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant
+        # Second-order time stepping; see the module's docstring.
+        explicit = self.constant / self._believed * damping - self._viscous
+        half_step = 0.5 * self.model.opt.timestep
+        inertia = self._rotor_inertia + half_step * explicit
+        self.model.dof_armature[self.rotor] = inertia
+        # MuJoCo reads this in its place for a rotor whose parent cannot move.
+        self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
+
+    def motor_torque(self, act: Array) -> Array:
+        """Motor torque without friction [N m], (..., joints), from activations (..., na)."""
+        torque = self.constant * act.take(self._current, axis=-1)
+        np.maximum(torque, self._least_torque, out=torque)
+        limited: Array = np.minimum(torque, self._effort_limit, out=torque)
+        return limited
+
+    def set_clamps(
+        self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
+    ) -> None:
+        """Hold the links of `joints` where they are in `q`; release all others.
+
+        A spring and damper [N m/rad, N m s/rad] between link and body cost no solver iterations.
+        """
+        for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
+            held = name in joints
+            self.model.jnt_stiffness[self.model.dof_jntid[dof]] = stiffness if held else 0.0
+            self.model.dof_damping[dof] = damping if held else 0.0
+            self.model.qpos_spring[index] = q[index] if held else 0.0
+
+
+def legs_of(robot: RobotSpec) -> tuple[str, ...]:
+    """Names of the robot's limbs in file order; see `leg_of`."""
+    return tuple(dict.fromkeys(leg_of(robot, joint.name) for joint in robot.joints))
+
+
+def leg_of(robot: RobotSpec, name: str) -> str:
+    """The limb of a joint: the first part that its joints' names share, or its first joint."""
+    joint = robot.joint(name)
+    limb = [n for n in robot.joint_names if n in (name, *joint.chain, *joint.clamped)]
+    first = {each.split("_")[0] for each in limb}
+    return first.pop() if len(first) == 1 else limb[0]
+
+
+def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
+    """Give a joint its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
+    link = spec.joint(name)
+    if link is None:
+        raise RobotError(f"the robot's model has no joint {name!r}.")
+    rotor_body = link.parent.parent.add_body(
+        name=f"{name}/rotor",
+        pos=link.parent.pos,
+        quat=link.parent.quat,
+        mass=_ROTOR_MASS,
+        inertia=[_ROTOR_MASS] * 3,
+        ipos=link.pos,
+        explicitinertial=True,
+    )
+    rotor_body.add_joint(
+        name=f"{name}/rotor",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=link.axis,
+        pos=link.pos,
+        armature=true.rotor_inertia * drive.gear_ratio**2,
+        damping=[true.viscous, 0, 0],
+        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+    )
+    # Nothing of the training model's joint remains but its axis and its stops.
+    link.armature = link.frictionloss = 0.0
+    link.damping = link.stiffness = [0.0, 0.0, 0.0]
+    # A mechanical stop is hard: the model's gives way by 0.4 rad under the weight of the trunk.
+    link.solref_limit = [_STOP_S, 1.0]
+    belt = spec.add_tendon(
+        name=f"{name}/belt",
+        stiffness=[true.belt_stiffness, 0, 0],
+        damping=[true.belt_damping, 0, 0],
+        springlength=[0.0, 0.0],
+    )
+    belt.wrap_joint(f"{name}/rotor", 1.0)
+    belt.wrap_joint(name, -1.0)
+    believed, resistance = drive.motor
+    # MuJoCo integrates the current exactly over a step h with time constant t, and applies it in
+    # that very step: late by h / (exp(h / t) - 1) at low frequency. Solved for t.
+    lag = spec.option.timestep / math.log1p(spec.option.timestep / lag_s)
+    spec.add_actuator(
+        name=f"{name}/motor", target=f"{name}/rotor", trntype=mujoco.mjtTrn.mjTRN_JOINT
+    ).set_to_dcmotor(
+        # A second constant other than zero would silently become their geometric mean.
+        motorconst=[true.torque_scale * believed, 0.0],
+        resistance=resistance,
+        saturation=[true.torque_scale * drive.effort_limit, 0.0, 0.0],
+        # kp, ki, kd, slew limit, integral limit, voltage limit; gains are set by set_gains().
+        controller=[0.0, 0.0, 0.0, 0.0, 0.0, drive.bus_voltage],
+        lugre=[
+            true.presliding_stiffness,
+            true.presliding_damping,
+            true.coulomb,
+            true.breakaway,
+            true.stribeck_speed,
+        ],
+        # Inductance over resistance stands for all that delays torque inside the drive.
+        inductance=[0.0, lag],
+        input_mode=1,  # ctrl is a position
+    )
+
+
+def _drop_legs(spec: Any, robot: RobotSpec, kept: set[str]) -> None:
+    """Delete every subtree under the base that holds no kept joint."""
+    for child in list(spec.body(robot.base_body).bodies):
+        names = [joint.name for joint in (*child.find_all("joint"), *child.joints)]
+        if names and not any(name in kept for name in names):
+            spec.delete(child)
+
+
+def _free_base(spec: Any, robot: RobotSpec, ground: Ground) -> None:
+    """Put a model's free trunk over the ground; refuse an arm."""
+    base = spec.body(robot.base_body)
+    if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
+        raise RobotError(
+            f"{robot.name} has no legs to stand on; it can be simulated on the bench only."
+        )
+    # Visual geoms cost time in every step.
+    for geom in [geom for geom in spec.geoms if not geom.contype and not geom.conaffinity]:
+        spec.delete(geom)
+    ground.add_to(spec)
+
+
+def _fix_base(spec: Any, robot: RobotSpec, sim_params: SimParams) -> None:
+    """Fix a model's trunk to its stand, without contacts."""
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    base = spec.body(robot.base_body)
+    for joint in list(base.joints):
+        spec.delete(joint)
+    if math.isfinite(sim_params.machine.stand_stiffness):
+        for name, axis in _STAND_AXES.items():
+            base.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis,
+                stiffness=[sim_params.machine.stand_stiffness, 0, 0],
+                damping=[sim_params.machine.stand_damping, 0, 0],
+                limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+            )
+
+
+def _change_trunk(model: Any, body: int, trunk: TrunkParams) -> None:
+    """Apply the trunk's parameters; refuse an impossible body."""
+    mass = float(model.body_mass[body])
+    if not mass + trunk.mass_offset > 0.0:
+        raise RobotError(
+            f"trunk.mass_offset is {trunk.mass_offset:g} kg; the trunk has {mass:.3g} kg, of which "
+            "something must be left."
+        )
+    # MuJoCo's principal moments are sorted; those of the parameters are about x, y, z.
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
+    nearest = np.abs(axes.reshape(3, 3)).argmax(axis=0)
+    moments = model.body_inertia[body] * np.array(trunk.inertia_scale)[nearest]
+    if 2.0 * moments.max() > moments.sum():
+        raise RobotError(
+            f"trunk.inertia_scale is {list(trunk.inertia_scale)}; the principal moments would be "
+            f"{', '.join(f'{m:.4g}' for m in moments)} kg m^2, of which the largest exceeds the "
+            "sum of the others, as no body's does."
+        )
+    model.body_inertia[body] = moments * (1.0 + trunk.mass_offset / mass)
+    model.body_mass[body] = mass + trunk.mass_offset
+    model.body_ipos[body] += trunk.com_offset
+
+
+def _ids(values: Any) -> Indices:
+    return np.array(values, dtype=np.intp)

@@ -1,0 +1,81 @@
+"""Tables of results, for the terminal, the pages and `--json` alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+Cell = str | int | float | tuple[float, float] | None
+"""Text, a number, an interval as (lower, upper), or None where nothing was measured."""
+
+NOT_MEASURED = "-"
+"""Text of a cell without a finite number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """Heading of a column, and how its numbers are written."""
+
+    heading: str
+    unit: str = ""
+    """Unit, written in brackets behind the heading; empty for text and counts."""
+    digits: int = 3
+    """Digits behind the decimal point."""
+
+    @property
+    def title(self) -> str:
+        """Heading with the unit, for instance `stiffness [N m/rad]`."""
+        return f"{self.heading} [{self.unit}]" if self.unit else self.heading
+
+    def text(self, cell: Cell) -> str:
+        """Return the text of a cell; an interval without width is a value that was held."""
+        if cell is None:
+            return NOT_MEASURED
+        if isinstance(cell, str | int):
+            return str(cell)
+        if isinstance(cell, tuple):
+            lower, upper = cell
+            if lower == upper:
+                return "held"
+            return f"{number(lower, self.digits)} to {number(upper, self.digits)}"
+        return number(cell, self.digits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows of cells under headings."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    notes: tuple[str, ...] = ()
+    """Sentences below the table."""
+
+    def __post_init__(self) -> None:
+        """Refuse rows that do not have one cell for each column."""
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"table {self.title!r}: a row has {len(row)} cells; expected "
+                    f"{len(self.columns)}, one for each column."
+                )
+
+    def text_rows(self) -> list[list[str]]:
+        """Return the cells as text, row by row."""
+        text_rows = []
+        for row in self.rows:
+            text_row = []
+            for column, cell in zip(self.columns, row, strict=True):
+                text_row.append(column.text(cell))
+            text_rows.append(text_row)
+        return text_rows
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Format a number; a dash where it is not finite."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else NOT_MEASURED
+
+
+def percent(share: float) -> str:
+    """Format a share between 0 and 1 in percent."""
+    return number(100.0 * share, 1)
