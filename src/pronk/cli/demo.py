@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import pronk
 from pronk.cli import console
-from pronk.cli.match import prediction_rows, summary
+from pronk.cli.match import summary
+from pronk.cli.predict import prediction_rows
 from pronk.cli.sweep import AMPLITUDES
 from pronk.errors import PronkError
 from pronk.names import file_name
