@@ -6,7 +6,8 @@ ONNX Runtime within), in three ways:
 
 - back to back, a thousand times;
 - at ticks 20 ms apart, woken by an absolute deadline;
-- the same after the warm-up of `pronk deploy` (`warm_up_until` in `pronk.deploy.runtime.policy_process`).
+- the same after the warm-up of `pronk deploy` (`warm_up_until` in
+  `pronk.deploy.runtime.policy_process`).
 
 Ticks of both kinds alternate in one loop. Quantiles are the upper edges of the bins of
 `Histogram`, 4.7 % wide.

@@ -1,8 +1,9 @@
 """`python -m benchmarks probe`: name the laws, parameters and faults of random simulators, blind.
 
 A simulator is drawn with its law, step, armature, friction, delay and hold, and half of them with a
-fault. It is an integrator of its own in NumPy, MuJoCo, or an engine of `pronk.identify.simulators.engines`
-that is installed. `pronk.identify.simulators.probe` sees the `Simulator` only.
+fault. It is an integrator of its own in NumPy, MuJoCo, or an engine of
+`pronk.identify.simulators.engines` that is installed. `pronk.identify.simulators.probe` sees the
+`Simulator` only.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ class Drawn:
         return out
 
     def _numpy(self, command: Array, kp: Array, kd: Array, armature: Array) -> Array:
-        """The laws of `pronk.robots.drive_law` for one joint with Coulomb friction, shape (B, T)."""
+        """Laws of `pronk.robots.drive_law` for a joint with Coulomb friction, shape (B, T)."""
         truth, drive = self.truth, self.truth.robot.joint(self.truth.joint).drive
         links = links_of(truth.robot, truth.joint)
         arm = np.cross(links.axis[0], links.centre[0])

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from pronk.identify.excitation.plan import SweepPlan
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""Excitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for `LogChirp`."""
+"""Excitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for
+`LogChirp`."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
 COLUMNS = {

@@ -218,12 +218,12 @@ _FLAGS = ("damped", "step_live", "jump")
 class DeployLog:
     """A run as arrays: T ticks of the servo, P steps of the policy.
 
-    The fields of the records (`pronk.deploy.runtime.ipc`) are attributes: of `ticks` first, then those of
-    `steps` that have another name (`step_time`, `step_live`, `command`, `jump`, `observation`,
-    `action`, `target`, `contact`, `linear_velocity`). `time` is the begin of a tick, `state_time`
-    and `state_sequence` are of the newest state, `action_number` is of the policy's action;
-    differences of times have the names of `_DIFFERENCES`. Times are on CLOCK_MONOTONIC [s], joints
-    in file order; NaN where there was nothing.
+    The fields of the records (`pronk.deploy.runtime.ipc`) are attributes: of `ticks` first, then
+    those of `steps` that have another name (`step_time`, `step_live`, `command`, `jump`,
+    `observation`, `action`, `target`, `contact`, `linear_velocity`). `time` is the begin of a tick,
+    `state_time` and `state_sequence` are of the newest state, `action_number` is of the policy's
+    action; differences of times have the names of `_DIFFERENCES`. Times are on CLOCK_MONOTONIC [s],
+    joints in file order; NaN where there was nothing.
     """
 
     header: dict[str, Any]

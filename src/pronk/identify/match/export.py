@@ -1,8 +1,9 @@
 """Matched gains as configuration of a simulator, as text to read and to paste.
 
-Gains hold for one drive law at one step (`pronk.identify.simulators.profiles`): a target with another law or
-step is refused. Every text says what must be set beside it, which joints were not matched, which
-delay and friction it does not have, and how far the drives are from the law's stability limit.
+Gains hold for one drive law at one step (`pronk.identify.simulators.profiles`): a target with
+another law or step is refused. Every text says what must be set beside it, which joints were not
+matched, which delay and friction it does not have, and how far the drives are from the law's
+stability limit.
 
 Arguments of other frameworks, with their sources (read in November 2026):
 

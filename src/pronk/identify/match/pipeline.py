@@ -110,7 +110,8 @@ def match_frameworks(
     Args:
         logs: One or more logs of one robot; a joint may be excited in several.
         robot: The robot.
-        names: Profiles, as `pronk.identify.simulators.profiles.profile` takes them, for mode `gains`.
+        names: Profiles, as `pronk.identify.simulators.profiles.profile` takes them, for mode
+            `gains`.
         mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
             known and fits damping, armature, dry friction and delay, and by a torque channel
             armature, friction and torque scale.

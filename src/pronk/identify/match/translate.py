@@ -1,9 +1,9 @@
 """Gains of one framework as gains of another in which the joint responds alike, without a log.
 
-Both responses are closed forms of the robot's own model (`pronk.identify.simulators.linear`). Stiffness
-and damping give the magnitude in the band; the phase that is left is a delay. Dry friction has to
-be a torque in both frameworks. It goes with the stiffness: where friction stops a joint, and how it
-damps a motion of given amplitude, depend on the ratio of both.
+Both responses are closed forms of the robot's own model (`pronk.identify.simulators.linear`).
+Stiffness and damping give the magnitude in the band; the phase that is left is a delay. Dry
+friction has to be a torque in both frameworks. It goes with the stiffness: where friction stops a
+joint, and how it damps a motion of given amplitude, depend on the ratio of both.
 """
 
 from __future__ import annotations

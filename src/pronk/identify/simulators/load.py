@@ -24,9 +24,9 @@ def load_simulator(
 
     The choice is `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`; what it names
     is called with the robot and returns a `Simulator`. Threads are those of MuJoCo; its large runs
-    are simulated on `device`, one of `pronk.identify.simulators.mujoco.DEVICES`. With `python`, the path of
-    an interpreter, the simulator is made there (`pronk.identify.simulators.remote`). A PronkError says that
-    there is no such simulator, or that it lacks what the protocol needs.
+    are simulated on `device`, one of `pronk.identify.simulators.mujoco.DEVICES`. With `python`, the
+    path of an interpreter, the simulator is made there (`pronk.identify.simulators.remote`). A
+    PronkError says that there is no such simulator, or that it lacks what the protocol needs.
     """
     if choice == "mujoco":
         if python is not None:

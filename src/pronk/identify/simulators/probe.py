@@ -6,8 +6,8 @@ Two experiments on one joint, all others held at their default positions:
   of steps that the simulator holds a command for, and the whole steps of delay.
 - Chirps at three pairs of gains, and one with another armature where it can be set. One pair is not
   enough: explicit drives of inertia `J + h kd` respond as drives of inertia `J` with implicit
-  damping do. How the response changes with the gains separates the laws of `pronk.robots.drive_law`,
-  and an implicit drive that acts beside the explicit torque.
+  damping do. How the response changes with the gains separates the laws of
+  `pronk.robots.drive_law`, and an implicit drive that acts beside the explicit torque.
 
 A joint with friction is fitted to each law; the one that leaves least is the answer. Gravity and
 the inertia of the links are the robot's, which is what makes the gains absolute.

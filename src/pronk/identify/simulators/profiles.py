@@ -1,7 +1,7 @@
 """Profiles: the frameworks that gains can be matched for, without any of them installed.
 
-A profile is a drive law (`pronk.robots.drive_law`) with the step, the delays and the joint friction of
-one framework. MuJoCo computes all of them. Frameworks with the same law, step and friction need
+A profile is a drive law (`pronk.robots.drive_law`) with the step, the delays and the joint friction
+of one framework. MuJoCo computes all of them. Frameworks with the same law, step and friction need
 the same gains.
 """
 

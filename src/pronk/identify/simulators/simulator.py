@@ -1,8 +1,8 @@
 """The Simulator protocol: what an engine must offer so that its joints can be matched.
 
-An engine implements `Simulator`; MuJoCo is one of them (`pronk.identify.simulators.mujoco`). The match
-excites one joint at a time with many parameter sets, by `JointRigs`: those of MuJoCo are a fast
-path, those of every other simulator call its `rollout`.
+An engine implements `Simulator`; MuJoCo is one of them (`pronk.identify.simulators.mujoco`). The
+match excites one joint at a time with many parameter sets, by `JointRigs`: those of MuJoCo are a
+fast path, those of every other simulator call its `rollout`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """The test rig on a GPU: thousands of gain pairs at once in MuJoCo Warp.
 
-Model and commands are those of `pronk.identify.simulators.mujoco.JointTestRig`; MuJoCo Warp computes in
-single precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the paper's chirp
-on the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's largest
-difference is 3e-7 rad, the best cell is the same and its response agrees within 1e-5 dB. Only a
-stiff knee with little damping, which this chirp makes chaotic, differs visibly: by 0.09 rad and
-0.3 dB at the corner 27 N m/rad, 0.1 N m s/rad, where rounding the command to single precision
+Model and commands are those of `pronk.identify.simulators.mujoco.JointTestRig`; MuJoCo Warp
+computes in single precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the
+paper's chirp on the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's
+largest difference is 3e-7 rad, the best cell is the same and its response agrees within 1e-5 dB.
+Only a stiff knee with little damping, which this chirp makes chaotic, differs visibly: by 0.09 rad
+and 0.3 dB at the corner 27 N m/rad, 0.1 N m s/rad, where rounding the command to single precision
 moves the double precision just as far.
 
 A step costs a GPU about the same for one simulation as for thousands. So the grid is stepped

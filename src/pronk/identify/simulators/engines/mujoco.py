@@ -2,7 +2,8 @@
 
 Actuators have the effort limit, not the torque-speed line. Passive damping is implicit; with Euler,
 flag eulerdamp turned off makes it explicit where the law has it so.
-Unlike `pronk.identify.simulators.mujoco` it needs no robot's model, so it also runs in another Python.
+Unlike `pronk.identify.simulators.mujoco` it needs no robot's model, so it also runs in another
+Python.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """SAPIEN (PhysX 5, TGS): drives with a number of position iterations, or explicit torques.
 
 PhysX computes in single precision. A link sleeps below a threshold of energy, which is set to 0
-here. Law I of `pronk.robots.drive_law` holds for one joint; in a chain, PhysX solves joint by joint.
+here. Law I of `pronk.robots.drive_law` holds for one joint; in a chain, PhysX solves joint by
+joint.
 """
 
 from __future__ import annotations
