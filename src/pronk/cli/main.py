@@ -33,7 +33,6 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "pronk.cli.translate:translate",
         "Translate gains for a framework of another drive law.",
     ),
-    "shape": ("pronk.cli.shape:shape", "Filter commands so that drives respond as simulated."),
     "probe": ("pronk.cli.probe:probe", "Name what a simulator makes of a joint's settings."),
     "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),
     "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
