@@ -39,8 +39,9 @@ import pronk.identify.match.gains as gains_file
 from pronk.cli import console
 from pronk.cli.export import Target
 from pronk.cli.main import run
-from pronk.deploy.runtime.ipc import STEP, TICK, Mode
+from pronk.deploy.runtime.ipc import STEP, TICK
 from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
+from pronk.deploy.runtime.modes import Mode
 from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.identify.logs.joint_log import JointLog

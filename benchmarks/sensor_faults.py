@@ -41,7 +41,8 @@ from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
 from pronk.deploy.bench.server import RobotServer
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.realtime import Wanted, enter
-from pronk.deploy.runtime.ipc import Event, Mode, OperatorRequest
+from pronk.deploy.runtime.ipc import Event
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, Plan
 from pronk.deploy.runtime.run import Deployment
 from pronk.deploy.runtime.state_machine import Timing

@@ -28,7 +28,8 @@ from benchmarks.runner import Row, finish, rows_in, rows_of
 from pronk.arrays import Array
 from pronk.cli import console
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
-from pronk.deploy.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
+from pronk.deploy.runtime.ipc import ACTIONS, fill
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.safety import Decision, Limits, Reason, SafetyFilter
 from pronk.deploy.runtime.state_machine import StateMachine, Timing
 from pronk.errors import HardwareError

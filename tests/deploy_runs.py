@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pronk.deploy.links.link import Freshness
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.run import Deployment
 from pronk.deploy.runtime.state_machine import Timing
 from pronk.deploy.runtime.teleop import OperatorCommand

@@ -21,7 +21,7 @@ import pytest
 from command_line import invoke
 from hopper import ROBOT, write_hopper
 from pronk.deploy.links.link import wait_for
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import PronkError
 from pronk.jump.play.page import WebPage, free_port, readout

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from command_line import accepted
-from pronk.deploy.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.deploy.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, event, put_state
 from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.safety import FilterAction, Reason
 from pronk.errors import LogError
 from pronk.report import build, deploy_page, deploy_run

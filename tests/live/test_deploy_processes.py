@@ -19,10 +19,10 @@ from command_line import invoke
 from deploy_faults import FaultyLink, writes
 from deploy_runs import DAMPED_S, PATIENT, QUICK, hold, met, notified
 from hopper import write_hopper
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
 
 # Reading a log for the first time would keep this process from holding the stick.
 from pronk.deploy.runtime.log import is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Plan
 from pronk.deploy.runtime.run import Deployment
 from pronk.deploy.runtime.safety import Reason

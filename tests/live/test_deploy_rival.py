@@ -19,8 +19,8 @@ import pytest
 from deploy_runs import DAMPED_S, FRESH, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
 from pronk.deploy.links.address import Address
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
 from pronk.deploy.runtime.log import read_deploy_log
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, Plan
 from pronk.deploy.runtime.run import Deployment
 from pronk.errors import HardwareError

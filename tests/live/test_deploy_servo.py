@@ -16,8 +16,10 @@ import pytest
 
 from deploy_faults import FaultyLink
 from deploy_runs import PATIENT
+from pronk.deploy.bench.paced import CaptureRecorder
 from pronk.deploy.links.address import Address
-from pronk.deploy.runtime.ipc import ACTIONS, OPERATOR, TICK, Mode, OperatorRequest, Shared, fill
+from pronk.deploy.runtime.ipc import ACTIONS, OPERATOR, TICK, Shared, fill
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, Plan
 from pronk.deploy.runtime.servo import Servo
 from pronk.deploy.runtime.state_machine import Timing
@@ -166,7 +168,7 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("no folder")
     ground = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
-    with flown(ground, capture=folder / "seen.npz") as run:
+    with flown(ground, recorder=CaptureRecorder(path=folder / "seen.npz")) as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")
     assert "Not a directory" in why or "exists" in why

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from hopper import write_hopper
-from pronk.deploy.runtime.ipc import Mode
 from pronk.deploy.runtime.log import DeployLog, read_deploy_log
+from pronk.deploy.runtime.modes import Mode
 
 pytest.importorskip("onnxruntime")
 

@@ -21,8 +21,9 @@ from hypothesis import strategies as st
 from pronk.deploy.bench.faults import SWAPPED, spoiled
 from pronk.deploy.links.realtime import Histogram, Pace
 from pronk.deploy.runtime import ipc
-from pronk.deploy.runtime.ipc import STEP, TICK, Event, Mode, OperatorRequest, event, fill
+from pronk.deploy.runtime.ipc import STEP, TICK, Event, event, fill
 from pronk.deploy.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.preflight import delay_objection, refusals
 from pronk.deploy.runtime.run import RunSummary
 from pronk.deploy.runtime.safety import FilterAction, Limits, Reason, SafetyFilter

@@ -13,7 +13,8 @@ import pytest
 
 import pronk
 from pronk.deploy.links.realtime import Pace
-from pronk.deploy.runtime.ipc import OPERATOR, Mode, Shared, fill, put_state, state_dtype
+from pronk.deploy.runtime.ipc import OPERATOR, Shared, fill, put_state, state_dtype
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.plan import Link, Plan
 from pronk.deploy.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
 from pronk.policy.rollout import measurement

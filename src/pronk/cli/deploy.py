@@ -54,6 +54,7 @@ def deploy(
         tilt: Largest tilt of the trunk, in rad.
         ignore_latency: Start the policy even if the measured latency exceeds its training range.
     """
+    from pronk.deploy.bench.paced import CaptureRecorder
     from pronk.deploy.links.address import SIM
     from pronk.deploy.runtime.plan import Link, Plan
     from pronk.deploy.runtime.run import run
@@ -75,7 +76,7 @@ def deploy(
         link=Link(robot=robot or contract.robot, address=address, release=machine.release),
         policy=policy,
         log=log,
-        capture=capture,
+        recorder=None if capture is None else CaptureRecorder(path=capture),
         limits={"tilt": tilt},
         timing=Timing(blend_s=blend),
         ignore_latency=ignore_latency,

@@ -13,8 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from pronk.arrays import Array
-from pronk.deploy.runtime.ipc import REAL, VIRTUAL, Mode
+from pronk.deploy.runtime.ipc import REAL, VIRTUAL
 from pronk.deploy.runtime.log import DeployLog, read_deploy_log
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.safety import FilterAction
 from pronk.errors import PronkError
 from pronk.jump.trial.tables import Sheet, table

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from pronk.arrays import Array, Mask
-from pronk.deploy.runtime.ipc import Mode
 from pronk.deploy.runtime.log import DeployLog
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.safety import FilterAction, Reason
 from pronk.report.style import rms
 from pronk.robots.robot import RobotSpec

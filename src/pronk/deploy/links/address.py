@@ -18,14 +18,14 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 import msgspec
 
-from pronk import plugins
 from pronk.errors import HardwareError
+from pronk.plugins import load
 from pronk.robots.machine import Machine
 from pronk.robots.robot import RobotSpec
 
 SIM = "sim"
 BUILT_IN = {
-    SIM: "pronk.jump.virtual.robot:open_sim",
+    SIM: "pronk.deploy.bench.paced:open_sim",
     "lcm": "pronk.deploy.links.lcm.link:LcmMachine",
     "dds": "pronk.deploy.links.dds.link:DdsMachine",
 }
@@ -41,7 +41,7 @@ def find_link(name: str) -> Callable[..., Machine]:
     if name not in known.names:
         names = ", ".join((*BUILT_IN, *sorted(known.names)))
         raise HardwareError(f"no link {name!r}; the links are {names}.")
-    return plugins.load(known[name])  # type: ignore[no-any-return]
+    return load(known[name])  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.safety import FilterAction, Reason
 from pronk.errors import HardwareError
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
@@ -123,50 +124,6 @@ class Ring(_Slots):
             taken += 1
             self._counts[1] = taken
         return found
-
-
-class Mode(IntEnum):
-    """State of the servo."""
-
-    IDLE = 0
-    """Connected or not; nothing is sent."""
-    PREFLIGHT = 1
-    """States are checked; nothing is sent."""
-    DAMP = 2
-    """Joints damped, waiting."""
-    STAND = 3
-    """Standing up, and standing."""
-    POLICY = 4
-    """The policy runs."""
-    HALT = 5
-    """The policy runs with a zero command before the robot sits down."""
-    SIT = 6
-    """Sitting down."""
-    FAULT = 7
-    """Joints damped after a fault."""
-    ENDED = 8
-    """The link is closed."""
-    SWEEP = 9
-    """Joints are excited one after another."""
-
-
-class OperatorRequest(IntEnum):
-    """Requests of the operator."""
-
-    NONE = 0
-    DAMP = 1
-    """At once."""
-    STAND = 2
-    WALK = 3
-    """Start the policy."""
-    SIT = 4
-    """Stop, sit down, damp."""
-    RESET = 5
-    """Clear a latched fault whose cause is gone."""
-    QUIT = 6
-    """Damp and end."""
-    CLAMPED = 7
-    """The joints of a sweep are clamped as requested."""
 
 
 def _fields(kind: str, names: str, *shape: int) -> list[Any]:

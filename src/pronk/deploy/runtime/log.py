@@ -27,7 +27,8 @@ import orjson
 from numpy.typing import NDArray
 
 from pronk.deploy.links.realtime import leave
-from pronk.deploy.runtime.ipc import EVENT, STEP, TICK, VIRTUAL, Event, Mode, Shared
+from pronk.deploy.runtime.ipc import EVENT, STEP, TICK, VIRTUAL, Event, Shared
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.plan import Plan
 from pronk.deploy.runtime.safety import Reason
 from pronk.deploy.runtime.sweep import SweepLogs

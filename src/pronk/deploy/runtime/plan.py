@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.link import ClampOperator, Freshness
-from pronk.deploy.links.realtime import Wanted, sleep_until
+from pronk.deploy.links.realtime import Wanted
 from pronk.deploy.runtime.safety import Limits
 from pronk.deploy.runtime.state_machine import Timing
 from pronk.deploy.runtime.sweep import STALE_S, SweepTask
 from pronk.errors import HardwareError
-from pronk.jump.virtual.robot import VirtualRobot
 from pronk.robots import load_robot
-from pronk.robots.machine import Machine, State, TorqueKind
+from pronk.robots.machine import Machine, TorqueKind
 from pronk.robots.robot import RobotSpec
 
 SERVO_PRIORITY, STANDBY_PRIORITY, POLICY_PRIORITY = 60, 55, 50
@@ -35,59 +34,29 @@ class Link:
     """How fresh states must be at first; the usual if None."""
 
     def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
-        """Make the machine, not yet connected; the virtual robot in real time.
+        """Make the machine, not yet connected.
 
         HardwareError if the link's library is not installed.
         """
-        machine = self.address.machine(
+        return self.address.machine(
             load_robot(self.robot),
             clamp_operator=clamp_operator,
             release=self.release,
             fresh=self.fresh,
         )
-        return Paced(machine) if isinstance(machine, VirtualRobot) else machine
 
     def __str__(self) -> str:
         return str(self.address)
 
 
-class Paced:
-    """The virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
+class MachineRecorder(Protocol):
+    """Recorder of what a machine does besides its states; whoever makes the plan hands it in."""
 
-    `wait` runs the physics to the given time and then sleeps until it comes: nothing can be sent in
-    between, and the physics does not delay the loop.
-    """
+    def prepare(self, machine: Machine) -> None:
+        """Have a machine that is not connected yet keep what is recorded."""
 
-    virtual = True
-
-    def __init__(self, inner: VirtualRobot) -> None:
-        """Wrap a virtual robot that is not connected yet."""
-        self.inner = inner
-        self.robot = inner.robot
-        self.torque_kind: TorqueKind = inner.torque_kind
-        self.state_rate_hz = inner.state_rate_hz
-        self.send, self.clamp = inner.send, inner.clamp
-        self.damp, self.close = inner.damp, inner.close
-        self.now = time.monotonic
-        self._offset = 0.0
-
-    def connect(self) -> None:
-        """Start both clocks."""
-        self.inner.connect()
-        self._offset = time.monotonic() - self.inner.now()
-
-    def latest(self) -> State:
-        """The newest state."""
-        return self._shifted(self.inner.latest())
-
-    def wait(self, until: float) -> list[State]:
-        """Let time pass to `until` [s]; return the states measured meanwhile."""
-        states = self.inner.wait(until - self._offset)
-        sleep_until(until)
-        return [self._shifted(state) for state in states]
-
-    def _shifted(self, state: State) -> State:
-        return replace(state, time=state.time + self._offset)
+    def save(self, machine: Machine) -> None:
+        """Write what was recorded, once the run is over; an OSError or PronkError is reported."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,8 +69,8 @@ class Plan:
     """Instead of a policy."""
     log: Path | None = None
     """MCAP file; None for no log."""
-    capture: Path | None = None
-    """File for the trajectory of the virtual robot, written at the end; None for none."""
+    recorder: MachineRecorder | None = None
+    """Recorder of the machine's trajectory; None for none."""
     limits: Mapping[str, float] = field(default_factory=dict)
     """Other values for the scalar fields of `Limits`."""
     timing: Timing = field(default_factory=Timing)

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
-from pronk.deploy.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, fill, get_state, serve
+from pronk.deploy.runtime.ipc import ACTIONS, STEP, Shared, event, fill, get_state, serve
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.plan import POLICY_PRIORITY, Plan
 from pronk.errors import PronkError
 from pronk.policy.contract import Contract, check

@@ -19,8 +19,9 @@ import orjson
 from pronk import __version__
 from pronk.deploy.links.address import SIM
 from pronk.deploy.links.realtime import Interrupts, sleep_until, terminal_blocked
-from pronk.deploy.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
+from pronk.deploy.runtime.ipc import OPERATOR, Event, Shared, fill
 from pronk.deploy.runtime.log import READY, write_log
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import SERVO_PRIORITY, Plan
 from pronk.deploy.runtime.policy_process import serve_policy
 from pronk.deploy.runtime.servo import serve_robot

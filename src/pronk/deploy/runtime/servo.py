@@ -21,7 +21,8 @@ import numpy as np
 
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.deploy.runtime import ipc
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest, Shared
+from pronk.deploy.runtime.ipc import Shared
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import SERVO_PRIORITY, Plan
 from pronk.deploy.runtime.preflight import delay_objection, refusals
 from pronk.deploy.runtime.safety import (
@@ -98,9 +99,8 @@ class Servo:
         """Open the machine, tick until stopped, damp, close."""
         try:
             machine = self.plan.link(self._clamp)
-            inner = getattr(machine, "inner", None)
-            if inner is not None and self.plan.capture is None:
-                inner.capture_rate_hz = None  # else a second takes 0.7 MB
+            if self.plan.recorder is not None:
+                self.plan.recorder.prepare(machine)
             self._open(machine)
             while not self._over():
                 self._tick(machine)
@@ -375,22 +375,19 @@ class Servo:
                 while time.monotonic() < until:
                     machine.damp()
                     machine.wait(machine.now() + 1.0 / self.plan.servo_rate_hz)
-            self._save_capture(machine)
+            self._save_recording(machine)
         finally:
             machine.close()
             self.modes.enter(Mode.ENDED, time.monotonic())
             self._report("mode", self.modes.mode.name)
             self._publish(time.monotonic())
 
-    def _save_capture(self, machine: Machine) -> None:
-        """Save the trajectory of the virtual robot; an error is reported, not raised."""
-        inner = getattr(machine, "inner", None)
-        if self.plan.capture is None or inner is None:
+    def _save_recording(self, machine: Machine) -> None:
+        """Save what the plan's recorder kept; an error is reported, not raised."""
+        if self.plan.recorder is None:
             return
-        from pronk.jump.virtual.capture import save
-
         try:
-            save(self.plan.capture, inner.capture())
+            self.plan.recorder.save(machine)
         except (OSError, PronkError) as error:
             self._report("lost", f"the trajectory was not written: {error}")
 

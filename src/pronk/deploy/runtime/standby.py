@@ -20,7 +20,8 @@ import numpy as np
 
 from pronk.deploy.links.link import NetworkLink
 from pronk.deploy.links.realtime import Wanted, enter, leave, sleep_until
-from pronk.deploy.runtime.ipc import STANDBY, Mode, Shared
+from pronk.deploy.runtime.ipc import STANDBY, Shared
+from pronk.deploy.runtime.modes import DRIVEN, Mode
 from pronk.deploy.runtime.plan import STANDBY_PRIORITY, Plan
 
 _POLL_S = 0.004
@@ -28,8 +29,6 @@ _REPEAT_S = 0.01
 """Between two messages of damping [s]."""
 _LEAST_S = 3.0
 """Shortest time of damping, in which any robot here comes to rest [s]."""
-DRIVEN = (Mode.STAND, Mode.POLICY, Mode.HALT, Mode.SIT, Mode.SWEEP)
-"""Modes whose last command is not damping."""
 
 
 def serve_standby(plan: Plan, name: str, end: Connection) -> None:

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest, Record
+from pronk.deploy.runtime.ipc import Record
+from pronk.deploy.runtime.modes import SILENT, Mode, OperatorRequest
 from pronk.deploy.runtime.safety import FilterAction, Reason, SafetyFilter
 from pronk.errors import RobotError
 from pronk.robots.machine import Command
@@ -36,9 +37,6 @@ STRAY, STRAY_SHARE = 0.005, 1.4
 """Such a motion of another joint that is wrong: in rad, and as a share of that of the swung one."""
 FIRST_ACTION_S = 0.2
 """In which the policy must give its first action [s]."""
-
-SILENT = (Mode.IDLE, Mode.PREFLIGHT, Mode.ENDED)
-"""Modes in which nothing is sent."""
 
 
 @dataclass(frozen=True, kw_only=True)

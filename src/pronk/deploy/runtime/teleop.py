@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.deploy.links.link import ClampOperator
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.errors import HardwareError, PronkError
 from pronk.policy.script import STILL, Script, Velocity
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pronk.deploy.runtime.ipc import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.teleop import Operator
 from pronk.jump.trial.jumps import JumpRules, fallen_at, jump_flights
 from pronk.jump.virtual.capture import Capture

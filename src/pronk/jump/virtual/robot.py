@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from pronk.jump.virtual.ground import Ground, Start
 from pronk.jump.virtual.physics import Physics
 from pronk.jump.virtual.plant import Plant, legs_of
 from pronk.jump.virtual.sensors import Sensors
-from pronk.jump.virtual.sim_params import SimParams, load_sim_params
+from pronk.jump.virtual.sim_params import SimParams
 from pronk.robots.machine import Command, State, TorqueKind, check_command, damping_command
 from pronk.robots.robot import RobotSpec
 
@@ -216,16 +216,3 @@ class VirtualRobot:
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         rows = self._running().run(steps.tolist())
         return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
-
-
-def open_sim(
-    robot: RobotSpec,
-    *,
-    interface: str | None = None,
-    seed: int = 0,
-    params: str | None = None,
-    **common: Any,
-) -> VirtualRobot:
-    """Make the virtual robot of `sim://BASE?seed=0&params=FILE`, BASE bench or ground."""
-    base: Any = interface or "ground"
-    return VirtualRobot(robot, load_sim_params(params, robot), seed=seed, base=base)

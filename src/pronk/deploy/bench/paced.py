@@ -1,0 +1,125 @@
+"""The virtual robot in this program, in real time: the link `sim` of `pronk deploy`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pronk.deploy.links.realtime import sleep_until
+from pronk.errors import HardwareError
+from pronk.jump.virtual import capture
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.robots.machine import Command, Machine, State, TorqueKind
+from pronk.robots.robot import RobotSpec
+
+CAPTURE_RATE_HZ = 1000.0
+"""Samples per second of a recorded trajectory; a second takes 0.7 MB of memory."""
+
+
+class PacedRobot:
+    """A virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
+
+    `wait` runs the physics to the given time and then sleeps until it comes: nothing can be sent in
+    between, and the physics does not delay the loop.
+    """
+
+    virtual = True
+
+    def __init__(self, inner: VirtualRobot) -> None:
+        """Wrap a virtual robot that is not connected yet."""
+        self.inner = inner
+        self.robot = inner.robot
+        self.torque_kind: TorqueKind = inner.torque_kind
+        self.state_rate_hz = inner.state_rate_hz
+        self._offset = 0.0
+
+    def connect(self) -> None:
+        """Start both clocks."""
+        self.inner.connect()
+        self._offset = time.monotonic() - self.inner.now()
+
+    def now(self) -> float:
+        """Return the time of CLOCK_MONOTONIC [s]."""
+        return time.monotonic()
+
+    def latest(self) -> State:
+        """Return the newest state."""
+        return self._shifted(self.inner.latest())
+
+    def wait(self, until: float) -> list[State]:
+        """Let time pass to `until` [s]; return the states measured meanwhile."""
+        states = self.inner.wait(until - self._offset)
+        sleep_until(until)
+        return [self._shifted(state) for state in states]
+
+    def send(self, command: Command) -> None:
+        """Put a command into force."""
+        self.inner.send(command)
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        """Fix joints where they are, on the bench; () frees all."""
+        self.inner.clamp(joints)
+
+    def damp(self) -> None:
+        """Damp the joints without stiffness."""
+        self.inner.damp()
+
+    def close(self) -> None:
+        """Damp and close; closing twice does no harm."""
+        self.inner.close()
+
+    def _shifted(self, state: State) -> State:
+        """Return a state with its time on CLOCK_MONOTONIC."""
+        return replace(state, time=state.time + self._offset)
+
+
+def open_sim(
+    robot: RobotSpec,
+    *,
+    interface: str | None = None,
+    seed: int = 0,
+    params: str | None = None,
+    **common: Any,
+) -> PacedRobot:
+    """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`, not yet connected.
+
+    Args:
+        robot: Structure, masses and drives.
+        interface: What holds the trunk, `bench` or `ground`; the ground if None.
+        seed: Seed of all noise.
+        params: Path of the virtual robot's parameters; those that ship with pronk if None.
+        common: Options of network links, which have no meaning here.
+    """
+    base: Any = interface or "ground"
+    sim_params = load_sim_params(params, robot)
+    return PacedRobot(VirtualRobot(robot, sim_params, seed=seed, base=base, capture_rate_hz=None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureRecorder:
+    """Records the trajectory of the virtual robot into a file. Implements `MachineRecorder`."""
+
+    path: Path
+    """File of the capture, .npz."""
+
+    def prepare(self, machine: Machine) -> None:
+        """Have a machine keep its trajectory from its connection on; HardwareError if it cannot."""
+        if not isinstance(machine, PacedRobot):
+            raise HardwareError(
+                f"the trajectory of {machine.robot} cannot be recorded; only the virtual robot in "
+                "this program (--link sim) keeps one."
+            )
+        machine.inner.capture_rate_hz = CAPTURE_RATE_HZ
+
+    def save(self, machine: Machine) -> None:
+        """Write the trajectory.
+
+        Raises:
+            OSError: The file cannot be written.
+            PronkError: Nothing was captured.
+        """
+        if isinstance(machine, PacedRobot):
+            capture.save(self.path, machine.inner.capture())
