@@ -25,8 +25,9 @@ from benchmarks.runner import machine
 from pronk.arrays import Array, ComplexArray
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_logs
+from pronk.identify.logs.segment import Segment
 from pronk.identify.match.gains import MatchedGains
 from pronk.identify.match.measured_joint import (
     DB,

@@ -19,7 +19,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.cli.sweep import AMPLITUDES
 from pronk.deploy.runtime.sweep import SweepTask, record
-from pronk.identify.excitation.plan import Excitation, SweepPlan, make_plan
+from pronk.identify.excitation.plan import PlannedExcitation, SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp, Multisine, Signal
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
@@ -156,7 +156,7 @@ def _plans(leg: str, kinds: tuple[str, ...]) -> tuple[SweepPlan, SweepPlan]:
     joints = [f"{leg}_{kind}" for kind in kinds]
     sweep = make_plan(robot, joints, amplitudes=AMPLITUDES, repeats=REPEATS)
     extra = [
-        Excitation(
+        PlannedExcitation(
             joint=name,
             signal=signal,
             clamped=robot.joint(name).clamped,

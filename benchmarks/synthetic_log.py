@@ -12,7 +12,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from pronk.arrays import Array
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.segment import Segment
 from pronk.identify.simulators.command_trace import CommandTrace
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.identify.simulators.simulator import JointRigs

@@ -17,7 +17,8 @@ from scipy.optimize import least_squares
 
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.arrays import Array
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog, group_repeats
+from pronk.identify.logs.segment import Segment
 from pronk.identify.match.arm import ArmProblem, trusted
 from pronk.identify.match.fit import solve
 from pronk.identify.match.parameters import PARAMETERS
@@ -49,18 +50,13 @@ class Recording:
 
 
 def recordings(log: JointLog, joint: str, robot: RobotSpec) -> list[Recording]:
-    """Segments of a joint, those of the same kind and amplitude together as repeats."""
-    groups: dict[tuple[str, float], list[Segment]] = {}
-    for segment in log.segments:
-        groups.setdefault((segment.kind, segment.amplitude), []).append(segment)
+    """Excitations of a joint, repeats together."""
     found = []
-    for segments in groups.values():
+    for repeats in group_repeats(log.excitations(joint)):
         traces, positions = [], []
-        for segment in segments:
-            part = log.cut(segment)
-            traces.append(command_trace(part, segment, joint, robot))
-            column = part.position[:, part.column(joint)]
-            positions.append(np.interp(traces[-1].time, part.time, column))
+        for repeat in repeats:
+            traces.append(command_trace(repeat, robot))
+            positions.append(np.interp(traces[-1].time, repeat.time, repeat.position))
         steps = min(len(position) for position in positions)
         trace = replace(traces[0], command=traces[0].command[:steps])
         rows = np.array([position[:steps] for position in positions])

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
+from pronk.identify.logs.segment import Segment
 
 QUANTITIES = ("command", "position", "velocity", "torque")
 LEG = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")

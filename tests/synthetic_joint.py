@@ -8,7 +8,8 @@ import numpy as np
 from scipy.signal import chirp, cont2discrete, lfilter
 
 from pronk.arrays import Array, ComplexArray
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.segment import Segment
 
 KNEE = {"stiffness": 21.9, "damping": 0.54, "inertia": 0.0068}
 HIP = {"stiffness": 20.6, "damping": 0.49, "inertia": 0.02}

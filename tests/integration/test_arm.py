@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
+from pronk.identify.logs.segment import Segment
 from pronk.identify.match import gains as gains_file
 from pronk.identify.match import match_logs
 from pronk.identify.match.arm import fit_together, trusted_frequency, trusted_samples

@@ -133,7 +133,7 @@ def test_a_damaged_file_never_gives_wrong_numbers(whole: Path, data: st.DataObje
 KILLED = """
 import time
 from pathlib import Path
-from pronk.identify.logs.joint_log import Segment
+from pronk.identify.logs.segment import Segment
 from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 writer = McapLogWriter(Path({path!r}), LogHeader(robot="mini_cheetah", joints=("knee",)))
 writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))

@@ -51,9 +51,10 @@ def test_so101_recordings_run_at_49_85_hz() -> None:
         assert log.rate_hz == pytest.approx(49.85, abs=0.005)
         assert log.velocity is not None
         assert log.torque is not None
-        for segment in log.segments:
-            assert segment.kind == "unknown"
-            check_motion(log, segment.joints[0])
+        for joint in log.excited_joints:
+            for excitation in log.excitations(joint):
+                assert excitation.segment.kind == "unknown"
+                check_motion(excitation)
 
 
 @recorded
@@ -267,7 +268,8 @@ SWING = 0.25 * np.sin(2.0 * np.pi * np.cumsum(np.linspace(0.1, 8.0, 4000)) / 200
 
 
 def test_motion_that_passes() -> None:
-    check_motion(moved(0.8 * SWING, SWING), "FR_knee")
+    (excitation,) = moved(0.8 * SWING, SWING).excitations("FR_knee")
+    check_motion(excitation)
     assert not saturation_note(moved(0.8 * SWING, SWING), "FR_knee")
     # A joint with a dead band (play operator) rests at every turn, which is not saturation.
     position = np.zeros(len(SWING))
@@ -292,7 +294,7 @@ def test_saturation_is_noted(tmp_path: Path, limits: tuple[float, float]) -> Non
 )
 def test_no_motion_is_refused(position: np.ndarray, command: np.ndarray, words: str) -> None:
     with pytest.raises(LogError, match=f"FR_knee {words}"):
-        check_motion(moved(position, command), "FR_knee")
+        check_motion(moved(position, command).excitations("FR_knee")[0])
 
 
 @pytest.mark.parametrize("wrong", [np.rad2deg(SWING), 20.0 + SWING])

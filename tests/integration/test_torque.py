@@ -12,8 +12,9 @@ import pytest
 from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, rig, run
 from command_line import accepted, refused
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
+from pronk.identify.logs.segment import Segment
 from pronk.identify.match import gains, match_logs
 from pronk.identify.match.torque import fit_drives, fit_torque
 from pronk.jump.virtual.sim_params import load_sim_params

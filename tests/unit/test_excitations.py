@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from log_files import write_mcap
-from pronk.identify.logs.excitations import with_segments
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.measured_joint import measured_joints
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.time_fit import recorded
-from pronk.identify.response.estimate import estimate, excitations, excited_joints
+from pronk.identify.response.estimate import estimate
 from pronk.identify.simulators.chain import moves_together
 from pronk.robots import load_robot
 from synthetic_joint import KNEE, chirp_command, multisine_command, simulate_second_order
@@ -58,7 +57,7 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
         # The chirp, and a part of the rest before and after it.
         assert 21.0 * k - 0.6 < one.start <= 21.0 * k + 0.03
         assert 21.0 * k + 20.3 < one.stop < 21.0 * k + 21.03
-    assert [len(parts) for parts in excitations(log, "FR_knee")] == [3, 1]
+    assert [len(repeats) for repeats in group_repeats(log.excitations("FR_knee"))] == [3, 1]
     assert [one.excitation for one in recorded([log], "FR_knee", ROBOT)] == [0, 0, 0, 1]
     loud, quiet = estimate(log, "FR_knee")
     assert (len(loud.repeats), len(quiet.repeats)) == (3, 1)
@@ -71,7 +70,7 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
 
 def test_joints_after_one_another_do_not_move_together() -> None:
     parts = [(name, size * CHIRP) for name in LEG for size in (1.0, 1.0)]
-    log = with_segments(log_of(*parts, begin=POSE + np.array([0.3, -0.4, 0.5])))
+    log = log_of(*parts, begin=POSE + np.array([0.3, -0.4, 0.5])).segmented()
     assert [one.joints[0] for one in log.segments] == [name for name, _ in parts]
     assert not moves_together(log)
     assert any("changes of pose of FR_hip_roll, FR_hip_pitch" in note for note in log.notes)
@@ -87,15 +86,17 @@ def test_a_change_of_pose_between_excitations_is_not_left_out() -> None:
     moved = log_of(("FR_knee", CHIRP), ("FR_knee", CHIRP))
     command, half = moved.command.copy(), len(moved.time) // 2
     command[half - 100 :, 1] += np.minimum(np.arange(half + 100) / 500.0, 1.0)
-    log = with_segments(replace(moved, command=command))
-    assert set(excited_joints(log)) == set(LEG[1:])
+    log = replace(moved, command=command).segmented()
+    assert set(log.excited_joints) == set(LEG[1:])
     assert moves_together(log)
 
 
 def test_joints_at_once_move_together_and_repeat() -> None:
-    log = with_segments(log_of(("all", CHIRP), ("all", CHIRP)))
+    log = log_of(("all", CHIRP), ("all", CHIRP)).segmented()
     assert moves_together(log)
-    assert [len(parts) for name in LEG for parts in excitations(log, name)] == [2, 2, 2]
+    for name in LEG:
+        assert len(log.excitations(name)) == 2
+        assert len(group_repeats(log.excitations(name))) == 1
 
 
 SHORT = CHIRP[: round(4.0 * RATE)].copy()
@@ -118,7 +119,7 @@ STEPS = np.repeat([0.0, 0.1, 0.0, -0.1, 0.0], 500)
 )
 def test_what_is_no_repeat_stays_one_excitation(signals: tuple[np.ndarray, ...]) -> None:
     made = log_of(*(("FR_knee", signal) for signal in signals))
-    log = with_segments(made)
+    log = made.segmented()
     (one,) = log.segments
     assert (one.joints, one.start, one.stop) == (("FR_knee",), made.time[0], made.time[-1])
 
@@ -127,18 +128,18 @@ def test_what_is_no_repeat_stays_one_excitation(signals: tuple[np.ndarray, ...])
     "other", [np.repeat([0.0, 0.1, 0.2, 0.3, 0.4], 500), CHIRP[: round(7.03 * RATE)]]
 )
 def test_stairs_and_a_chirp_that_is_cut_are_excitations(other: np.ndarray) -> None:
-    log = with_segments(log_of(("FR_knee", CHIRP), ("FR_hip_roll", other)))
+    log = log_of(("FR_knee", CHIRP), ("FR_hip_roll", other)).segmented()
     assert not moves_together(log)
-    assert excited_joints(log) == ("FR_hip_roll", "FR_knee")
+    assert log.excited_joints == ("FR_hip_roll", "FR_knee")
 
 
 def test_noise_of_another_command_is_no_excitation() -> None:
     made = log_of(("FR_knee", CHIRP))
     command = made.command + 1e-4 * np.random.default_rng(0).random(made.command.shape) * [1, 1, 0]
-    log = with_segments(replace(made, command=command))
-    assert excited_joints(log) == ("FR_knee",)
+    log = replace(made, command=command).segmented()
+    assert log.excited_joints == ("FR_knee",)
     assert not moves_together(log)
 
 
 def test_a_log_that_stands_still_has_no_excitation() -> None:
-    assert with_segments(log_of(("FR_knee", np.zeros(2000)))).segments == ()
+    assert log_of(("FR_knee", np.zeros(2000))).segmented().segments == ()

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from benchmarks.synthetic_log import Excitation, simulate, synthetic_log
 from pronk.errors import LogError, PronkError
 from pronk.identify.excitation.signals import Chirp
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.segment import Segment
 from pronk.identify.match import MatchSettings, match_logs, predict
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.load import joint_rigs, load_simulator
@@ -123,7 +124,7 @@ def test_jitter_does_not_move_a_tick(seed: int, offset: float, rate: float) -> N
     exact = offset + np.arange(int(2.0 * rate)) / rate
     command = ticks[np.minimum(((exact - offset) / 0.02 + 1e-6).astype(int), 99)]
     log = log_of(exact + 50e-6 * rng.uniform(-1, 1, len(exact)), command)
-    trace = command_trace(log, log.segments[0], "FR_knee", ROBOT)
+    trace = command_trace(log.excitations("FR_knee")[0], ROBOT)
     assert trace.policy_held
     assert len(trace.command) >= 395
     np.testing.assert_array_equal(trace.command, np.repeat(ticks, 4)[: len(trace.command)])
@@ -136,7 +137,7 @@ def test_repeats_are_alike_at_any_tick_that_the_log_begins_in() -> None:
     trace = []
     for caught in (0, 7, 13):
         log = log_of(0.002 * np.arange(len(held))[caught:], held[caught:])
-        trace.append(command_trace(log, log.segments[0], "FR_knee", ROBOT))
+        trace.append(command_trace(log.excitations("FR_knee")[0], ROBOT))
     longer = replace(trace[0], command=np.append(trace[0].command, np.full(8, 1.6)))
     moved = replace(trace[0], command=np.append(trace[0].command, np.full(8, 1.7)))
     for same in (trace[1], trace[2], longer, replace(trace[0], joint="HL_knee")):
@@ -155,7 +156,7 @@ def test_a_command_off_the_policy_clock_is_held_step_by_step() -> None:
     time_ = np.arange(0.0, 4.0, 0.002)
     command = 1.6 + 0.2 * np.sin(2 * np.pi * np.floor(time_ / 0.033) * 0.033)
     log = log_of(time_, command)
-    trace = command_trace(log, log.segments[0], "FR_knee", ROBOT)
+    trace = command_trace(log.excitations("FR_knee")[0], ROBOT)
     assert not trace.policy_held
     middle = trace.time + 0.0025
     inside = middle < time_[-1]
@@ -179,7 +180,7 @@ def test_a_segment_that_cannot_be_simulated_is_refused() -> None:
         (wide, "FR_knee", "FR_hip_pitch was clamped"),
     ):
         with pytest.raises(LogError, match=words):
-            command_trace(bad, bad.segments[0], joint, ROBOT)
+            command_trace(bad.excitations(joint)[0], ROBOT)
 
 
 # --- the protocol ---------------------------------------------------------------------------------

@@ -37,7 +37,6 @@ def response(
         reading: How logs are read.
     """
     from pronk.identify.response import Estimator, estimate, save
-    from pronk.identify.response.estimate import excited_joints
     from pronk.report import figures, style
     from pronk.robots import load_robot
 
@@ -50,7 +49,7 @@ def response(
             source = Path(log.source or "log")
             folder, stem = out or source.parent, source.stem
             found: list[FrequencyResponse] = []
-            if not (joints := excited_joints(log)):
+            if not (joints := log.excited_joints):
                 raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
             for joint in joints:
                 mine = estimate(log, joint, Estimator())

@@ -23,9 +23,9 @@ from pronk.deploy.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dt
 from pronk.deploy.runtime.safety import Limits, SafetyFilter
 from pronk.deploy.runtime.state_machine import VALID_S
 from pronk.errors import HardwareError
-from pronk.identify.excitation.plan import POSE_RAMP_S, Excitation, SweepPlan
-from pronk.identify.logs.joint_log import Segment
+from pronk.identify.excitation.plan import POSE_RAMP_S, PlannedExcitation, SweepPlan
 from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter, reason_of
+from pronk.identify.logs.segment import Segment
 from pronk.names import file_name
 from pronk.robots.machine import Command, Machine, State, TorqueKind
 
@@ -67,7 +67,7 @@ class SweepTask:
         """Of the logs."""
         return [self.out_dir / f"{file_name(name)}.mcap" for name in self.excited]
 
-    def excitations(self, joint: str) -> list[Excitation]:
+    def excitations(self, joint: str) -> list[PlannedExcitation]:
         """Excitations of one joint's log."""
         return [each for each in self.plan.excitations if each.joint == joint]
 
@@ -417,7 +417,7 @@ class SweepController:
             )
         self.safety.limits = self._strict
 
-    def _excite(self, number: int, excitation: Excitation) -> Iterator[SweepStep]:
+    def _excite(self, number: int, excitation: PlannedExcitation) -> Iterator[SweepStep]:
         """One excitation and the rest after it."""
         rate = self.plan.rate_hz
         column = self.plan.robot.joint_names.index(excitation.joint)

@@ -25,7 +25,7 @@ _BISECTIONS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excitation:
+class PlannedExcitation:
     """A signal to one joint; repeats of it are numbered from 0."""
 
     joint: str
@@ -46,7 +46,7 @@ class SweepPlan:
     """Excitations in the order of the sweep. Build it with `make_plan`."""
 
     robot: RobotSpec
-    excitations: tuple[Excitation, ...]
+    excitations: tuple[PlannedExcitation, ...]
     rate_hz: float
     """Rate of the commands."""
     settle_s: float
@@ -69,7 +69,7 @@ class SweepPlan:
         """Excited joints, in order; one log file each."""
         return tuple(dict.fromkeys(each.joint for each in self.excitations))
 
-    def seconds(self, excitation: Excitation) -> float:
+    def seconds(self, excitation: PlannedExcitation) -> float:
         """Time of one excitation, its rest included [s]."""
         return excitation.signal.duration_s(self.rate_hz) + self.settle_s
 
@@ -117,7 +117,7 @@ class SweepPlan:
                 f"{100 * unsure.friction:.0f} %); {way_out}."
             )
 
-    def _fit(self, excitation: Excitation) -> float:
+    def _fit(self, excitation: PlannedExcitation) -> float:
         """Largest amplitude that fits, by bisection [rad], rounded down; 0 if none does."""
         fits, too_much = 0.0, 1.0
         for _ in range(_BISECTIONS):
@@ -132,7 +132,7 @@ class SweepPlan:
         return float(np.floor(amplitude / scale * (1.0 + 1e-12)) * scale)
 
     def _worst(
-        self, excitation: Excitation, cache: dict[tuple[object, ...], list[Forecast]]
+        self, excitation: PlannedExcitation, cache: dict[tuple[object, ...], list[Forecast]]
     ) -> list[Forecast]:
         """Forecasts of every joint of the chain; mirror-image legs are simulated once."""
         robot, joint = self.robot, self.robot.joint(excitation.joint)
@@ -207,7 +207,7 @@ def make_plan(
             )
     times = sorted(zip(amplitudes, counts, strict=True), reverse=True)
     excitations = tuple(
-        Excitation(
+        PlannedExcitation(
             joint=name,
             signal=replace(signal, amplitude=amplitude),
             repeat=repeat,

@@ -10,7 +10,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import Excitation, JointLog
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in each unit of time."""
@@ -135,21 +135,21 @@ def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
         )
 
 
-def check_motion(log: JointLog, joint: str) -> None:
-    """Refuse a joint that was not excited or did not move."""
-    where, column = log.source or "log", log.column(joint)
-    position = log.position[:, column]
-    travel, commanded = float(np.ptp(position)), float(np.ptp(log.command[:, column]))
-    if commanded == 0.0:
-        raise LogError(f"{where}: {joint} was not excited; its command is constant.")
-    levels = np.unique(position)
-    step = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
-    if travel < _UNMOVED * commanded or (travel <= _FEW_STEPS * step and travel < 0.5 * commanded):
-        unit = log.unit(joint) if log.unit(joint) != "unknown" else "of an unknown unit"
+def check_motion(excitation: Excitation) -> None:
+    """Refuse an excitation in which the joint did not move, with a LogError."""
+    travel = float(np.ptp(excitation.position))
+    commanded = float(np.ptp(excitation.command))
+    levels = np.unique(excitation.position)
+    encoder_step = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
+    few_steps = travel <= _FEW_STEPS * encoder_step and travel < 0.5 * commanded
+    if travel < _UNMOVED * commanded or few_steps:
+        unit = excitation.log.unit(excitation.joint)
+        if unit == "unknown":
+            unit = "of an unknown unit"
         raise LogError(
-            f"{where}: {joint} did not move: its command travels {commanded:.3g} {unit}, its "
-            f"position {travel:.3g}; check that its drive was enabled, the joint free, and "
-            "the columns named right."
+            f"{excitation.source or 'log'}: {excitation.joint} did not move: its command travels "
+            f"{commanded:.3g} {unit}, its position {travel:.3g}; check that its drive was enabled, "
+            "the joint free, and the columns named right."
         )
 
 

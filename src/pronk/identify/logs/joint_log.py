@@ -1,52 +1,21 @@
-"""JointLog: commanded and measured motion of joints, in memory."""
+"""JointLog: commanded and measured motion of joints, in memory, and its excitations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import LogError
+from pronk.identify.logs.segment import Segment
+from pronk.identify.logs.segmentation import Segmentation, find_segments
 from pronk.names import check_names
 
-SIGNAL_KINDS = ("chirp", "log_chirp", "multisine", "sine_steps", "unknown")
-_PER_JOINT = ("stiffness", "damping", "pose", "units")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Segment:
-    """One excitation: a signal sent to some joints between two instants of the log."""
-
-    kind: str
-    """One of `SIGNAL_KINDS`."""
-    joints: tuple[str, ...]
-    """Excited joints (several only with uncorrelated signals)."""
-    start: float
-    """First instant, on the clock of `JointLog.time` [s]."""
-    stop: float
-    """Last instant, settling included [s]."""
-    amplitude: float
-    """Peak of the command about the pose [rad]; NaN if unknown."""
-    repeat: int = 0
-    """Number of this repeat of the same excitation, from 0."""
-    band_hz: tuple[float, float] = (0.0, 0.0)
-    """Lowest and highest excited frequency [Hz]."""
-    period_s: float | None = None
-    """Period of a periodic signal [s]; None for chirps."""
-    clamped: tuple[str, ...] = ()
-    """Joints that were fixed mechanically meanwhile."""
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown kind and a segment that ends before it starts."""
-        if self.kind not in SIGNAL_KINDS:
-            raise LogError(
-                f"segment kind {self.kind!r}; expected one of {', '.join(SIGNAL_KINDS)}."
-            )
-        if not self.stop > self.start:
-            raise LogError(f"a segment ends at {self.stop} s, before it starts at {self.start} s.")
+_SAME_INSTANT_S = 1e-9
+"""Timestamps closer than this are the same instant [s]: far below a tick of any logger."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +42,7 @@ class JointLog:
     frequency: Array | None = None
     """Instantaneous frequency of the signal [Hz], shape (n,); NaN between excitations."""
     segments: tuple[Segment, ...] = ()
+    """Excitations as the recording names them, or as `read_log` found them in the commands."""
     stiffness: Array | None = None
     """Gains on the drives [N m/rad], shape (joints,); None if unknown."""
     damping: Array | None = None
@@ -96,32 +66,51 @@ class JointLog:
     def __post_init__(self) -> None:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
         where = self.source or "log"
-        n, width = len(self.time), len(self.joints)
+        samples = len(self.time)
+        width = len(self.joints)
         check_names((self.robot, *self.joints), where, LogError)
         check_increasing(self.time, where, "sample {}".format)
         if width == 0:
             raise LogError(f"{where}: no joints.")
         if len(set(self.joints)) != width:
             raise LogError(f"{where}: a joint is named twice in {', '.join(self.joints)}.")
-        shapes = dict.fromkeys(("command", "position", "velocity", "torque"), (n, width))
-        for name, shape in (shapes | dict.fromkeys(_PER_JOINT, (width,))).items():
-            values = getattr(self, name)
-            if values is None:
-                continue
-            if np.shape(values) != shape:
-                raise LogError(
-                    f"{where}: {name} has shape {np.shape(values)}; expected {shape} "
-                    f"({n} timestamps, {width} joints)."
-                )
-            if name in shapes and not np.isfinite(values).all():
-                row, column = np.argwhere(~np.isfinite(values))[0]
-                raise LogError(
-                    f"{where}: {name} of {self.joints[column]} is not finite at sample {row} "
-                    f"(t = {self.time[row]:.3f} s); drop or repair such rows before reading."
-                )
+        per_sample = {
+            "command": self.command,
+            "position": self.position,
+            "velocity": self.velocity,
+            "torque": self.torque,
+        }
+        per_joint = {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "pose": self.pose,
+            "units": self.units,
+        }
+        for name, values in per_sample.items():
+            if values is not None:
+                self._check_shape(name, np.shape(values), (samples, width))
+                self._check_finite(name, values)
+        for name, entries in per_joint.items():
+            if entries is not None:
+                self._check_shape(name, np.shape(entries), (width,))
         for segment in self.segments:
             for joint in segment.joints:
                 self.column(joint)
+
+    def _check_shape(self, name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+        if shape != expected:
+            raise LogError(
+                f"{self.source or 'log'}: {name} has shape {shape}; expected {expected} "
+                f"({len(self.time)} timestamps, {len(self.joints)} joints)."
+            )
+
+    def _check_finite(self, name: str, values: Array) -> None:
+        if not np.isfinite(values).all():
+            row, column = np.argwhere(~np.isfinite(values))[0]
+            raise LogError(
+                f"{self.source or 'log'}: {name} of {self.joints[column]} is not finite at sample "
+                f"{row} (t = {self.time[row]:.3f} s); drop or repair such rows before reading."
+            )
 
     def column(self, joint: str) -> int:
         """Index of a joint's column; a LogError lists the joints if it is not one of them."""
@@ -140,20 +129,190 @@ class JointLog:
         """Mean sample rate over the whole log [Hz]."""
         return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
 
-    def cut(self, segment: Segment) -> JointLog:
-        """The part of the log inside one segment, as a log of its own (same clock)."""
-        first = int(np.searchsorted(self.time, segment.start - 1e-9))
-        last = int(np.searchsorted(self.time, segment.stop + 1e-9, side="right"))
-        if last - first < 2:
+    def segmented(self) -> JointLog:
+        """Return the log with the excitations that its commands show, where it names none.
+
+        A log that `read_log` returned is segmented already.
+        """
+        if self.segments:
+            return self
+        found = self._segmentation
+        return replace(
+            self,
+            segments=found.segments,
+            pose=found.pose if self.pose is None else self.pose,
+            notes=(*self.notes, *found.notes),
+        )
+
+    @cached_property
+    def _segmentation(self) -> Segmentation:
+        return find_segments(self.time, self.command, self.joints)
+
+    @property
+    def excited_joints(self) -> tuple[str, ...]:
+        """Names of the joints that were excited, in the order of the columns."""
+        excited = set[str]()
+        for segment in self.segments or self._segmentation.segments:
+            excited.update(segment.joints)
+        return tuple(joint for joint in self.joints if joint in excited)
+
+    def excitations(self, joint: str) -> tuple[Excitation, ...]:
+        """Excitations of one joint: the largest amplitude first, repeats in order of time.
+
+        An amplitude that the recording does not state is read off the command.
+
+        Raises:
+            LogError: The joint was not excited, or its command stands still in a segment; the
+                message lists the joints that were excited.
+        """
+        self.column(joint)
+        log = self.segmented()
+        where = self.source or "log"
+        excitations = []
+        for segment in log.segments:
+            if joint not in segment.joints:
+                continue
+            excitation = Excitation(
+                log=log, joint=joint, segment=segment, samples=log.samples(segment)
+            )
+            travel = float(np.ptp(excitation.command))
+            if travel == 0.0:
+                raise LogError(
+                    f"{where}: the command of {joint} stands still between {segment.start:.3f} and "
+                    f"{segment.stop:.3f} s; the joint was not excited."
+                )
+            if np.isnan(segment.amplitude):
+                stated = replace(segment, amplitude=travel / 2.0)
+                excitation = replace(excitation, segment=stated)
+            excitations.append(excitation)
+        if not excitations:
+            excited = ", ".join(log.excited_joints) or "no joints"
+            raise LogError(f"{where}: {joint} was not excited; {excited} were.")
+        ordered: list[Excitation] = []
+        for repeats in group_repeats(excitations):
+            ordered += repeats
+        return tuple(ordered)
+
+    def samples(self, segment: Segment) -> slice:
+        """Rows of the log inside a segment, its ends included; a LogError if fewer than two."""
+        first = int(np.searchsorted(self.time, segment.start - _SAME_INSTANT_S))
+        stop = int(np.searchsorted(self.time, segment.stop + _SAME_INSTANT_S, side="right"))
+        if stop - first < 2:
             raise LogError(
                 f"{self.source or 'log'}: segment {segment.start:.3f} to {segment.stop:.3f} s "
-                f"holds {max(last - first, 0)} samples; the log spans {self.time[0]:.3f} to "
+                f"holds {max(stop - first, 0)} samples; the log spans {self.time[0]:.3f} to "
                 f"{self.time[-1]:.3f} s."
             )
-        names = ("time", "command", "position", "velocity", "torque", "frequency")
-        rows = {name: getattr(self, name) for name in names}
-        part: dict[str, Any] = {n: None if v is None else v[first:last] for n, v in rows.items()}
-        return replace(self, segments=(segment,), **part)
+        return slice(first, stop)
+
+    def cut(self, segment: Segment) -> JointLog:
+        """Return the part of the log inside one segment, as a log of its own (same clock)."""
+        rows = self.samples(segment)
+        return replace(
+            self,
+            segments=(segment,),
+            time=self.time[rows],
+            command=self.command[rows],
+            position=self.position[rows],
+            velocity=None if self.velocity is None else self.velocity[rows],
+            torque=None if self.torque is None else self.torque[rows],
+            frequency=None if self.frequency is None else self.frequency[rows],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excitation:
+    """One excitation of one joint: the signal, and what was recorded of the joint during it.
+
+    Arrays have shape (n,), a row for each sample of the excitation.
+    """
+
+    log: JointLog
+    """The log that holds the excitation."""
+    joint: str
+    """Name of the excited joint."""
+    segment: Segment
+    """The signal: its kind, amplitude (never NaN), repeat, band, period and clamped joints."""
+    samples: slice
+    """Rows of the log that were recorded during the excitation."""
+
+    @property
+    def amplitude(self) -> float:
+        """Peak of the command about the pose [rad]."""
+        return self.segment.amplitude
+
+    @property
+    def source(self) -> str:
+        """File or link that the log came from; empty if it has none."""
+        return self.log.source
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean sample rate during the excitation [Hz]."""
+        return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
+
+    @property
+    def time(self) -> Array:
+        """Measured timestamps, on the clock of the log [s], shape (n,)."""
+        return self.log.time[self.samples]
+
+    @property
+    def command(self) -> Array:
+        """Position command in force [rad], shape (n,)."""
+        return self._column(self.log.command)
+
+    @property
+    def position(self) -> Array:
+        """Measured position [rad], shape (n,)."""
+        return self._column(self.log.position)
+
+    @property
+    def velocity(self) -> Array | None:
+        """Measured velocity [rad/s], shape (n,); None if the log has none."""
+        return None if self.log.velocity is None else self._column(self.log.velocity)
+
+    @property
+    def torque(self) -> Array | None:
+        """Measured or current-derived joint torque [N m], shape (n,); None if the log has none."""
+        return None if self.log.torque is None else self._column(self.log.torque)
+
+    @property
+    def frequency(self) -> Array | None:
+        """Instantaneous frequency of the signal [Hz], shape (n,); None if the log has none."""
+        return None if self.log.frequency is None else self.log.frequency[self.samples]
+
+    @property
+    def pose(self) -> Array:
+        """Position of every joint of the log that the signal is centred on [rad], (joints,).
+
+        It is the first command of the excitation where the log has no pose.
+        """
+        if self.log.pose is not None:
+            return self.log.pose
+        return np.asarray(self.log.command[self.samples.start])
+
+    def _column(self, values: Array) -> Array:
+        return np.asarray(values[self.samples, self.log.column(self.joint)])
+
+
+def group_repeats(excitations: Sequence[Excitation]) -> tuple[tuple[Excitation, ...], ...]:
+    """Group excitations of one joint that repeat one another, the largest amplitude first.
+
+    Repeats have the same kind, amplitude, period, band and clamped joints.
+    """
+    groups: dict[tuple[object, ...], list[Excitation]] = {}
+    for excitation in excitations:
+        segment = excitation.segment
+        signal = (
+            round(segment.amplitude, 6),
+            segment.kind,
+            segment.period_s,
+            segment.band_hz,
+            segment.clamped,
+        )
+        groups.setdefault(signal, []).append(excitation)
+    by_amplitude = sorted(groups.values(), key=lambda repeats: -repeats[0].amplitude)
+    return tuple(tuple(repeats) for repeats in by_amplitude)
 
 
 def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import (
     BOOLEAN,
     INTEGER,
@@ -33,6 +33,7 @@ from pronk.identify.logs.mcap import (
     McapWriter,
     Record,
 )
+from pronk.identify.logs.segment import Segment
 
 Floats = Sequence[float] | Array
 

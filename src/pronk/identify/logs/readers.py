@@ -24,7 +24,6 @@ from pronk.identify.logs.checks import (
 )
 from pronk.identify.logs.columns import Columns, import_columns
 from pronk.identify.logs.csv_npz_reader import read_csv, read_npz
-from pronk.identify.logs.excitations import with_segments
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.pace_reader import read_pace
@@ -157,7 +156,7 @@ def read_log(
         if not isinstance(log, JointLog):
             raise LogError(f"{path}: the reader {kind} returned {type(log).__name__}.")
         notes = _examined(path, log, robot, rate_hz)
-        return with_segments(replace(log, notes=(*log.notes, *notes)))
+        return replace(log, notes=(*log.notes, *notes)).segmented()
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__

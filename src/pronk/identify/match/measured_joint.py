@@ -16,13 +16,10 @@ import numpy as np
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError, PronkError
-from pronk.identify.logs.excitations import with_segments
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.estimate import (
     estimate,
-    excitations,
-    excited_joints,
     log_rate,
     operator,
 )
@@ -143,7 +140,7 @@ def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[
     """Logs that excite each joint, joints in the robot's order; LogError if none does."""
     where: dict[str, list[JointLog]] = {}
     for log in logs:
-        for name in excited_joints(log):
+        for name in log.excited_joints:
             where.setdefault(name, []).append(log)
     for name in where:
         robot.joint(name)
@@ -186,8 +183,9 @@ def with_drive_gains(
     """
     by_joint = {} if given is None or given == "default" else gains_by_joint(robot, given)
     out = []
-    for log in map(with_segments, logs):
-        where, moved, pairs = log.source or "log", excited_joints(log), []
+    for log in logs:
+        log = log.segmented()
+        where, moved, pairs = log.source or "log", log.excited_joints, []
         for column, name in enumerate(log.joints):
             own: Pair | None = None
             if log.stiffness is not None and log.damping is not None:
@@ -232,20 +230,21 @@ def measured_joints(
     little of the band is coherent at the largest amplitude.
     """
     where = log.source or "log"
-    chosen = tuple(one for one in with_segments(log).segments if one.kind != "sine_steps")
+    chosen = tuple(one for one in log.segmented().segments if one.kind != "sine_steps")
     if not any(joint in segment.joints for segment in chosen):
         raise LogError(
             f"{where}: {joint} was excited by sine steps only; match a chirp or a multisine, and "
             "keep the steps to check it."
         )
     log = replace(log, segments=chosen)
-    known, parts = robot.joint(joint), excitations(log, joint)
-    rate_hz = log_rate(parts)
+    known, excitations = robot.joint(joint), log.excitations(joint)
+    rate_hz = log_rate(excitations)
     found: list[MeasuredJoint] = []
     warnings: list[str] = []
-    for (part, *_), response in zip(parts, estimate(log, joint, settings.estimator), strict=True):
+    groups = group_repeats(excitations)
+    for (part, *_), response in zip(groups, estimate(log, joint, settings.estimator), strict=True):
         # Of several repeats any one, their commands being the same.
-        command = partial(command_trace, part, part.segments[0], joint)
+        command = partial(command_trace, part)
         try:
             inside = _inside(response, known.band_hz, settings.coherence_min, where)
         except IdentifiabilityError as error:
@@ -259,7 +258,7 @@ def measured_joints(
                 trace=command(robot),
                 sign=known.original[1],
                 measured=response,
-                operator=cache(partial(operator, part, joint, settings.estimator, rate_hz)),
+                operator=cache(partial(operator, part, settings.estimator, rate_hz)),
                 command=command,
                 fit_mask=inside,
             )

@@ -59,7 +59,6 @@ from pronk.identify.match.time_fit import TIME_FIT, TimeFit, fit_joint, recorded
 from pronk.identify.match.torque import fit_drives, joint_fits
 from pronk.identify.match.translate import translated
 from pronk.identify.match.uncertainty import gain_interval
-from pronk.identify.response.estimate import excited_joints
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.chain import moves_together, published
 from pronk.identify.simulators.linear import Plant
@@ -143,8 +142,8 @@ def match_frameworks(
             "expected mode gains and simulator mujoco."
         )
     drives, remarks = fit_drives(logs, robot) if mode == "drive" else ({}, {})
-    logs, every = [log for log in logs if excited_joints(log)] or logs, logs
-    if (drives or remarks) and not any(map(excited_joints, logs)):
+    logs, every = [log for log in logs if log.excited_joints] or logs, logs
+    if (drives or remarks) and not any(log.excited_joints for log in logs):
         if not (by_torque := joint_fits(robot, {}, drives, remarks)):
             reasons = "; ".join(dict.fromkeys(remarks.values()))
             raise IdentifiabilityError(
@@ -385,7 +384,7 @@ class _Match:
         """Fit one joint in time, from some gains."""
         nominal = self._nominal(name)
         begin = nominal | dict(zip(GAINS, start, strict=True)) | {"delay": _START_S}
-        sources = [log for log in self.work.logs if name in excited_joints(log)]
+        sources = [log for log in self.work.logs if name in log.excited_joints]
         fit = fit_joint(rigs, recorded(sources, name, rigs.robot), fitted, begin, nominal)
         self.fits[name] = fit
         return fit

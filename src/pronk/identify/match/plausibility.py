@@ -51,7 +51,6 @@ from pronk.identify.match.identifiability import bench_inertia
 from pronk.identify.match.measured_joint import gains_on_drive
 from pronk.identify.match.result import JointFit
 from pronk.identify.match.time_fit import TimeFit
-from pronk.identify.response.estimate import excitations, excited_joints
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Joint, RobotSpec
 
@@ -172,7 +171,7 @@ class _Recorded(NamedTuple):
     @classmethod
     def of(cls, log: JointLog, joint: str, robot: RobotSpec) -> _Recorded:
         """Cut a log into the excitations of a joint."""
-        parts = [part for group in excitations(log, joint) for part in group]
+        parts = [log.cut(excitation.segment) for excitation in log.excitations(joint)]
         return cls(log, robot.joint(joint), log.column(joint), parts)
 
 
@@ -204,7 +203,7 @@ def findings(
     Also returns the causes out of `CAUSES` that would leave no trace in these logs.
     """
     found: list[Finding] = []
-    settled, logs = True, [log for log in logs if joint in excited_joints(log)]
+    settled, logs = True, [log for log in logs if joint in log.excited_joints]
     for own in (_Recorded.of(log, joint, robot) for log in logs):
         if dead := list(_dead(own)):
             found += dead

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains
 from pronk.identify.match.measured_joint import DriveGains, gains_on_drive, rms, with_drive_gains
 from pronk.identify.match.parameters import GAINS
@@ -198,30 +198,30 @@ def _joint_by_joint(
     """One joint after the other, segment by segment; returns as `_together`."""
     joints, left_out = [], {}
     for name in rigs.robot.joint_names:
-        mine = sorted((s for s in log.segments if name in s.joints), key=lambda s: s.start)
+        mine = []
+        if name in log.excited_joints:
+            mine = sorted(log.excitations(name), key=lambda excitation: excitation.segment.start)
         if mine and name not in matched:
             left_out[name] = _WITHOUT_GAINS.format(name)
         elif mine:
-            parts = [_replay(log.cut(one), one, name, rigs, matched[name]) for one in mine]
+            parts = [_replay(excitation, rigs, matched[name]) for excitation in mine]
             rows: dict[str, Any] = {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
-            joints.append(JointPrediction(joint=name, signal=mine[0].kind, **rows))
+            joints.append(JointPrediction(joint=name, signal=mine[0].segment.kind, **rows))
     return joints, left_out
 
 
-def _replay(
-    part: JointLog, segment: Segment, name: str, rigs: JointRigs, best: Mapping[str, float]
-) -> dict[str, Array]:
-    """The arrays of `JointPrediction` for a segment."""
-    trace, late = command_trace(part, segment, name, rigs.robot), best["delay"]
+def _replay(part: Excitation, rigs: JointRigs, best: Mapping[str, float]) -> dict[str, Array]:
+    """The arrays of `JointPrediction` for an excitation."""
+    trace, late = command_trace(part, rigs.robot), best["delay"]
     delayed = trace
     if late:
         edges = np.append(trace.time, trace.time[-1] + trace.timestep) - late
         delayed = replace(trace, command=held_mean(trace.time, trace.command, edges))
-    real = _on_drive(part, rigs.robot, name)
+    real = _on_drive(part.log, rigs.robot, part.joint)
     own = [n for n in ("armature", "frictionloss") if n in rigs.parameters]
     # The last state is that at the start of the last step: no sample may lie beyond it.
     inside = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
-    time, column = part.time[inside], part.column(name)
+    time = part.time[inside]
 
     def played(command: CommandTrace, values: Mapping[str, float], names: Sequence[str]) -> Array:
         position = rigs.play(command, {n: np.array([values[n]]) for n in names})[0]
@@ -229,8 +229,8 @@ def _replay(
 
     return {
         "time": time,
-        "command": part.command[inside, column],
-        "measured": part.position[inside, column],
+        "command": part.command[inside],
+        "measured": part.position[inside],
         "naive": played(trace, real, GAINS),
         "naive_delayed": played(delayed, real, GAINS),
         "matched": played(delayed, best, [*GAINS, *own]),

@@ -29,7 +29,6 @@ from pronk.identify.match.fit import CachedProblem, Solution, solve_together
 from pronk.identify.match.parameters import GAINS, PARAMETERS
 from pronk.identify.match.simulated import grouped
 from pronk.identify.match.uncertainty import Estimate, block_moves, estimate, jackknife
-from pronk.identify.response.estimate import excitations
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
@@ -101,8 +100,8 @@ def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Rep
 
     LogError if the joint was not excited, or its unit is not radians.
     """
-    parts = [part for log in logs for group in excitations(log, joint) for part in group]
-    pairs = [(part, command_trace(part, part.segments[0], joint, robot)) for part in parts]
+    parts = [part for log in logs for part in log.excitations(joint)]
+    pairs = [(part, command_trace(part, robot)) for part in parts]
     groups = grouped(pairs, lambda one, other: one[1].same_as(other[1], robot))
     groups.sort(key=lambda group: -group[0][1].amplitude)
     found = []
@@ -121,7 +120,7 @@ def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Rep
                     trace=group[0][1],
                     excitation=number,
                     time=part.time[inside] - trace.start,
-                    position=part.position[inside, part.column(joint)],
+                    position=part.position[inside],
                     weight=weight,
                 )
             )

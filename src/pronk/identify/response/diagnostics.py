@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 
 from pronk.arrays import Array
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.response.grid import analysis_rate
 from pronk.identify.response.periodic import read_steps
 from pronk.identify.response.response import Estimator, FrequencyResponse
@@ -78,24 +78,24 @@ def fit_delay(response: FrequencyResponse) -> float:
     return float(found.x[3])
 
 
-def third_harmonic(log: JointLog, joint: str) -> float:
-    """RMS at 3 f over RMS at f in the response to one excitation (`JointLog.cut`), at 1 to 4 Hz.
+def third_harmonic(excitation: Excitation) -> float:
+    """Measure the third harmonic of the response to one excitation: RMS at 3 f over RMS at f.
 
-    Sine steps are read exactly, chirps by demodulation. NaN where the log lacks the frequency, and
-    for multisines.
+    The excited frequencies f from 1 to 4 Hz count. Sine steps are read exactly, chirps by
+    demodulation. NaN where the log lacks the frequency, and for multisines.
     """
-    if log.frequency is None or not log.segments or log.segments[0].kind == "multisine":
+    if excitation.frequency is None or excitation.segment.kind == "multisine":
         return math.nan
-    if log.segments[0].kind == "sine_steps":
+    if excitation.segment.kind == "sine_steps":
         estimator = Estimator(min_hz=_LOW_BAND_HZ[0], max_hz=_LOW_BAND_HZ[1])
         try:
-            ratios = read_steps(log, joint, estimator, analysis_rate([log.time])).third
+            steps = read_steps(excitation, estimator, analysis_rate([excitation.time]))
         except LogError:
             # No step in the low band.
             return math.nan
-        known = ratios[np.isfinite(ratios)]
-        return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
-    return _of_chirp(log.time, log.position[:, log.column(joint)], log.frequency)
+        ratios = steps.third[np.isfinite(steps.third)]
+        return float(np.sqrt(np.mean(ratios**2))) if len(ratios) else math.nan
+    return _of_chirp(excitation.time, excitation.position, excitation.frequency)
 
 
 def _of_chirp(time: Array, position: Array, frequency: Array) -> float:

@@ -23,7 +23,7 @@ from scipy.signal import ShortTimeFFT, get_window
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.response.grid import (
     Grid,
     grid_over,
@@ -213,23 +213,23 @@ def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
 
 
 def estimate_averaged(
-    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
+    repeats: Sequence[Excitation], estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
-    """H1 over the segments of all repeats, one log each (`JointLog.cut`)."""
+    """Estimate H1 over the segments of all repeats of one excitation."""
+    first = repeats[0]
     each, padded = [], []
-    for part in parts:
-        column = part.column(joint)
-        grid = grid_over(part.time, rate_hz)
-        command = held_mean(part.time, part.command[:, column], grid.edges)
-        position = interpolate(part.time, part.position[:, column], grid)
+    for repeat in repeats:
+        grid = grid_over(repeat.time, rate_hz)
+        command = held_mean(repeat.time, repeat.command, grid.edges)
+        position = interpolate(repeat.time, repeat.position, grid)
         padded.append(rests(command, rate_hz))
         where = layout(grid, estimator, padded=padded[-1])
         each.append(sums(where.spectra(command), where.spectra(position), where))
     whole, omega = reduce(add, each), where.omega
     ends = "reaching over the ends at rest" if all(padded) else "inside the excitation"
     return FrequencyResponse(
-        joint=joint,
-        amplitude=parts[0].segments[0].amplitude,
+        joint=first.joint,
+        amplitude=first.amplitude,
         omega=omega,
         response=whole.response(omega, rate_hz),
         coherence=whole.coherence(),
@@ -239,8 +239,8 @@ def estimate_averaged(
         window=f"{estimator.window} {estimator.segment_s:g} s, {100.0 * estimator.overlap:.0f} % "
         f"overlap, {ends}, mean of each segment removed",
         segment_s=estimator.segment_s,
-        virtual=parts[0].virtual,
-        source=parts[0].source,
+        virtual=first.log.virtual,
+        source=first.source,
     )
 
 

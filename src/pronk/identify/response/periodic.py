@@ -20,7 +20,7 @@ from scipy.signal import get_window
 
 from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.response.grid import Grid, grid_over, held_mean, hold, interpolate
 from pronk.identify.response.h1 import H1Operator, Layout
 from pronk.identify.response.response import Estimator, FrequencyResponse
@@ -120,21 +120,22 @@ def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
     return best
 
 
-def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
-    """Spectra of the steady periods of one multisine (`JointLog.cut`) at its excited lines.
+def read_periods(excitation: Excitation, estimator: Estimator, rate_hz: float) -> Spectra:
+    """Spectra of the steady periods of one multisine at its excited lines.
 
     `rate_hz` is about that of the analysis grid. LogError without three equal periods.
     """
-    period = log.segments[0].period_s
+    time = excitation.time
+    period = excitation.segment.period_s
     if period is None:
         raise LogError(
-            f"{log.source or 'log'}: the {log.segments[0].kind} of {joint} gives no period_s; "
-            "name it, or call the segment `unknown` to have it averaged by segments."
+            f"{excitation.source or 'log'}: the {excitation.segment.kind} of {excitation.joint} "
+            "gives no period_s; name it, or call the segment `unknown` to have it averaged by "
+            "segments."
         )
-    column = log.column(joint)
-    found = multisine_operator(log.time, log.command[:, column], period, estimator, rate_hz)
+    found = multisine_operator(time, excitation.command, period, estimator, rate_hz)
     where, omega = found.layout, found.omega
-    position = where.spectra(interpolate(log.time, log.position[:, column], where.grid))
+    position = where.spectra(interpolate(time, excitation.position, where.grid))
     factor = hold(omega, where.grid.rate_hz)
     return Spectra(omega=omega, command=found.command, position=position / factor)
 
@@ -169,23 +170,25 @@ def _steady_step(
     return int(even[0]) + settle, end if end == periods else end - settle
 
 
-def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
-    """Read every step of one excitation (`JointLog.cut`) inside the band.
+def read_steps(excitation: Excitation, estimator: Estimator, rate_hz: float) -> Spectra:
+    """Read every step of one excitation by sine steps inside the band.
 
     `rate_hz` is about that of the grid; each step takes a whole number of samples a period.
     LogError without a channel of the frequency or steps of three periods in the band.
     """
-    where = log.source or "log"
-    if log.frequency is None:
+    where = excitation.source or "log"
+    if excitation.frequency is None:
         raise LogError(
             f"{where}: sine steps without the channel of instantaneous frequency; give it, or call "
             "the segment `unknown` to have it averaged by segments."
         )
-    column = log.column(joint)
-    time, command, position = log.time, log.command[:, column], log.position[:, column]
+    time = excitation.time
+    command = excitation.command
+    position = excitation.position
+    frequency = excitation.frequency
     steps = []
-    for first, stop in _runs(log.frequency):
-        hz = float(log.frequency[first])
+    for first, stop in _runs(frequency):
+        hz = float(frequency[first])
         if not estimator.min_hz - 1e-9 <= hz <= estimator.top_hz(rate_hz) + 1e-9:
             continue
         # The last sample's interval belongs to the step as well.
@@ -195,7 +198,7 @@ def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) 
         steps.append((hz, inside, dropped, end - dropped))
     if not steps:
         raise LogError(
-            f"{where}: no sine step of {joint} between {estimator.min_hz:g} and "
+            f"{where}: no sine step of {excitation.joint} between {estimator.min_hz:g} and "
             f"{estimator.top_hz(rate_hz):g} Hz."
         )
     hz, _, dropped, periods = min(steps, key=lambda step: step[3])
@@ -239,7 +242,7 @@ def _h1(command: ComplexArray, position: ComplexArray) -> ComplexArray:
 
 
 def estimate_periodic(
-    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
+    excitations: Sequence[Excitation], estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
     """Response to multisines or sine steps, averaged over the periods of every excitation.
 
@@ -247,19 +250,20 @@ def estimate_periodic(
     part of the scatter), one per period (of steps, per block of periods) otherwise. LogError as of
     `read_periods` and `read_steps`, and for repeats of different frequencies.
     """
-    if parts[0].segments[0].kind == "multisine":
-        read = [read_periods(part, joint, estimator, rate_hz) for part in parts]
-        length = float(parts[0].segments[0].period_s or 0.0)
+    segment = excitations[0].segment
+    if segment.kind == "multisine":
+        read = [read_periods(excitation, estimator, rate_hz) for excitation in excitations]
+        length = float(segment.period_s or 0.0)
         window = f"whole periods of {length:g} s, ramps and the first steady period dropped"
     else:
-        read = [read_steps(part, joint, estimator, rate_hz) for part in parts]
+        read = [read_steps(excitation, estimator, rate_hz) for excitation in excitations]
         length = float(2.0 * np.pi / read[0].omega[0])
         window = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
     omega = read[0].omega
     if any(one.omega.shape != omega.shape or not np.allclose(one.omega, omega) for one in read):
         raise LogError(
-            f"{parts[0].source or 'log'}: the repeats of {joint} excite different frequencies; "
-            "give them the same period, band and steps."
+            f"{excitations[0].source or 'log'}: the repeats of {excitations[0].joint} excite "
+            "different frequencies; give them the same period, band and steps."
         )
     u = np.concatenate([one.command for one in read])
     y = np.concatenate([one.position for one in read])
@@ -269,8 +273,8 @@ def estimate_periodic(
     power = (np.abs(u) ** 2).sum(axis=0) * (np.abs(y) ** 2).sum(axis=0)
     cross = np.abs((np.conj(u) * y).sum(axis=0)) ** 2
     return FrequencyResponse(
-        joint=joint,
-        amplitude=parts[0].segments[0].amplitude,
+        joint=excitations[0].joint,
+        amplitude=excitations[0].amplitude,
         omega=omega,
         response=_h1(u, y),
         coherence=np.clip(cross / np.maximum(power, np.finfo(np.float64).tiny), 0.0, 1.0),
@@ -279,6 +283,6 @@ def estimate_periodic(
         estimator="periodic",
         window=window,
         segment_s=length,
-        virtual=parts[0].virtual,
-        source=parts[0].source,
+        virtual=excitations[0].log.virtual,
+        source=excitations[0].source,
     )

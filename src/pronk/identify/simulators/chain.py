@@ -15,8 +15,8 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import LogError
-from pronk.identify.logs.excitations import MOVED_RAD
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.segmentation import MOVED_RAD
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.mujoco import Chain, Drives
 from pronk.identify.simulators.simulator import Closing

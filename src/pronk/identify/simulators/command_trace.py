@@ -14,7 +14,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.columns import in_force
-from pronk.identify.logs.joint_log import JointLog, Segment
+from pronk.identify.logs.joint_log import Excitation
 from pronk.robots.robot import RobotSpec
 
 _OFF_CLOCK = 0.25
@@ -99,35 +99,31 @@ def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float
     return float(time[0] + phase), float(np.median(np.abs(distance)))
 
 
-def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec) -> CommandTrace:
-    """Command to one joint in one segment of a log at every physics step of the robot.
+def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
+    """Command of one excitation at every physics step of the robot.
 
-    A LogError says that the joint was not excited in the segment, that its unit is unknown, or that
-    a joint that is clamped in the bench model stood elsewhere.
+    A LogError says that the unit of the joint is unknown, or that a joint that is clamped in the
+    bench model stood elsewhere.
     """
-    where = log.source or "log"
-    if joint not in segment.joints:
+    joint = excitation.joint
+    unit = excitation.log.unit(joint)
+    if unit != "rad":
         raise LogError(
-            f"{where}: {joint} is not excited from {segment.start:.3f} to {segment.stop:.3f} s; "
-            f"{', '.join(segment.joints)} are."
+            f"{excitation.source or 'log'}: {joint} is in unit {unit!r}; the simulator needs "
+            "radians, so give --scale JOINT=RADIANS."
         )
-    if log.unit(joint) != "rad":
-        raise LogError(
-            f"{where}: {joint} is in unit {log.unit(joint)!r}; the simulator needs radians, so "
-            "give --scale JOINT=RADIANS."
-        )
-    part = log.cut(segment)
-    command = part.command[:, part.column(joint)]
+    time = excitation.time
+    command = excitation.command
     tick = robot.timestep_s * robot.decimation
-    clock, distance = policy_clock(part.time, command, tick)
+    clock, distance = policy_clock(time, command, tick)
     on_clock = distance <= _OFF_CLOCK * 0.6
-    start, period = part.time[0], robot.timestep_s
+    start, period = time[0], robot.timestep_s
     if on_clock:
         # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
         start, period = clock + np.floor((start - clock) / tick + 0.5) * tick, tick
-    count = int(np.ceil((part.time[-1] - start) / period))
+    count = int(np.ceil((time[-1] - start) / period))
     middle = start + (np.arange(count) + 0.5) * period
-    steps = command[np.maximum(in_force(part.time, middle), 0)]
+    steps = command[np.maximum(in_force(time, middle), 0)]
     if on_clock:
         early = _early_ticks(steps)
         start -= early * tick
@@ -137,8 +133,8 @@ def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec)
         start=float(start),
         timestep=robot.timestep_s,
         command=steps,
-        pose=_pose(part, joint, robot),
-        amplitude=segment.amplitude,
+        pose=_pose(excitation, robot),
+        amplitude=excitation.amplitude,
         policy_held=bool(on_clock),
     )
 
@@ -155,14 +151,12 @@ def _early_ticks(values: Array) -> int:
     return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
 
 
-def _pose(log: JointLog, joint: str, robot: RobotSpec) -> Array:
-    """Pose of every joint of the robot.
-
-    The log's; where it has none, the first command of each of its joints, and the default
-    position of joints that it does not have.
-    """
+def _pose(excitation: Excitation, robot: RobotSpec) -> Array:
+    """Pose of every joint of the robot; the default position of joints that the log lacks."""
+    log = excitation.log
+    joint = excitation.joint
     pose = np.array([j.default_position for j in robot.joints])
-    logged = log.command[0] if log.pose is None else log.pose
+    logged = excitation.pose
     for i, name in enumerate(robot.joint_names):
         if name in log.joints and log.unit(name) == "rad":
             pose[i] = logged[log.column(name)]
