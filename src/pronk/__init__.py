@@ -14,6 +14,8 @@ Each name is imported from the module that defines it when it is first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from pronk.version import VERSION
+
 if TYPE_CHECKING:
     from pronk.identify.logs.readers import read_log, read_logs
     from pronk.identify.match.pipeline import match_logs as match
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
 
-__version__ = "0.1.0"
+__version__ = VERSION
 __all__ = ["load_policy", "load_robot", "match", "predict", "read_log", "read_logs", "response"]
 
 _HOMES = {

@@ -5,22 +5,28 @@ The command line prints them and ends with exit status 2.
 
 from __future__ import annotations
 
-_MOST_LETTERS = 2000
+_MAX_CHARACTERS = 2000
 """Longest message; a damaged file can have a name or a list of names of any length."""
 
 
 def printable(text: str) -> str:
-    """Text with control characters as escapes, so that no file can steer a terminal."""
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    """Return text with control characters as escapes, so that no file can steer a terminal."""
+    characters = []
+    for character in text:
+        harmless = character.isprintable() or character == "\n"
+        characters.append(character if harmless else ascii(character)[1:-1])
+    return "".join(characters)
 
 
 class PronkError(Exception):
     """Base of every error that the caller can fix."""
 
     def __str__(self) -> str:
-        """The message, printable and of limited length."""
+        """Return the message, printable and of limited length."""
         text = super().__str__()
-        return printable(text if len(text) < _MOST_LETTERS else f"{text[:_MOST_LETTERS]} ...")
+        if len(text) >= _MAX_CHARACTERS:
+            text = f"{text[:_MAX_CHARACTERS]} ..."
+        return printable(text)
 
 
 class LogError(PronkError):

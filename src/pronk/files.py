@@ -18,93 +18,132 @@ import yaml
 
 from pronk.errors import ArtefactError, PronkError
 
-T = TypeVar("T")
+Artefact = TypeVar("Artefact")
 
-LIMIT = "PRONK_MOST_MIB"
+SIZE_LIMIT = "PRONK_MOST_MIB"
 """Environment variable: the most that a log or artefact may unpack to [MiB]."""
-_MOST_MIB = 1024
-_YAML_BYTES, _YAML_NODES, _YAML_DEPTH, _YAML_SCALAR = 2**19, 2**16, 32, 4096
-"""Largest YAML file (500 joints in `gains.yaml`), most nodes with aliases followed, deepest
-nesting, longest scalar."""
+_DEFAULT_LIMIT_MIB = 1024
+_MAX_YAML_BYTES = 2**19
+"""Largest YAML file: 500 joints in `gains.yaml`."""
+_MAX_YAML_VALUES = 2**16
+"""Most values in a YAML file, with aliases followed."""
+_MAX_YAML_DEPTH = 32
+"""Deepest nesting in a YAML file."""
+_MAX_YAML_CHARACTERS = 4096
+"""Longest single value in a YAML file."""
 
 
-def most_bytes() -> int:
-    """The most that a log or artefact may unpack to [bytes], by `LIMIT`."""
-    text = os.environ.get(LIMIT, str(_MOST_MIB))
+def max_bytes() -> int:
+    """Return the most that a log or artefact may unpack to [bytes], by `SIZE_LIMIT`."""
+    text = os.environ.get(SIZE_LIMIT, str(_DEFAULT_LIMIT_MIB))
     if not text.isdecimal() or not 0 < len(text) < 9:
-        raise PronkError(f"{LIMIT} is {text!r}; expected a number of MiB, as in {_MOST_MIB}.")
+        raise PronkError(
+            f"{SIZE_LIMIT} is {text!r}; expected a number of MiB, as in {_DEFAULT_LIMIT_MIB}."
+        )
     return int(text) << 20
 
 
 def check_size(path: Path, size: int, kind: type[PronkError]) -> None:
-    """Refuse what takes or unpacks to more bytes than `most_bytes`."""
-    if size > (most := most_bytes()):
+    """Refuse what takes or unpacks to more bytes than `max_bytes`.
+
+    Args:
+        path: The file, for the message.
+        size: Its size [bytes].
+        kind: Class of the error.
+    """
+    limit = max_bytes()
+    if size > limit:
         raise kind(
-            f"{path}: it unpacks to more than {most >> 20} MiB; split it, or set {LIMIT} to more "
-            f"than {size >> 20}."
+            f"{path}: it unpacks to more than {limit >> 20} MiB; split it, or set {SIZE_LIMIT} to "
+            f"more than {size >> 20}."
         )
 
 
 def check_archive(path: Path, kind: type[PronkError]) -> None:
-    """Refuse a zip archive that claims to unpack to more than `most_bytes`; zipfile holds it so."""
+    """Refuse a zip archive that claims to unpack to more than `max_bytes`.
+
+    The module zipfile holds the archive to what it claims.
+    """
     with zipfile.ZipFile(path) as archive:
-        check_size(path, sum(info.file_size for info in archive.infolist()), kind)
+        unpacked = sum(member.file_size for member in archive.infolist())
+    check_size(path, unpacked, kind)
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """The safe loader, which also refuses keys that are there twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        if len(set(keys)) < len(keys):
-            twice = next(key for key in keys if keys.count(key) > 1)
-            raise yaml.constructor.ConstructorError(None, None, f"{twice[:40]!r} is there twice")
-        found: dict[Hashable, Any] = super().construct_mapping(node, deep)
-        return found
+        """Return a mapping as a dictionary; a ConstructorError names a key that is there twice."""
+        keys = set()
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                continue
+            key = key_node.value
+            if key in keys:
+                raise yaml.constructor.ConstructorError(None, None, f"{key[:40]!r} is there twice")
+            keys.add(key)
+        mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
+        return mapping
 
 
 def read_yaml(path: Path, kind: type[PronkError] = ArtefactError, missing: str = "") -> Any:
-    """Read a YAML file of limited size and depth; `missing` is the way out where there is none."""
+    """Read a YAML file of limited size and depth.
+
+    Args:
+        path: The file.
+        kind: Class of the error where it is missing or cannot be read.
+        missing: What to do where there is no such file, for the message.
+    """
     try:
         with path.open("rb") as file:
-            data = file.read(_YAML_BYTES + 1)
-        if len(data) > _YAML_BYTES:
-            raise ValueError(f"larger than {_YAML_BYTES >> 10} KiB")
-        text = data.decode()
+            content = file.read(_MAX_YAML_BYTES + 1)
+        if len(content) > _MAX_YAML_BYTES:
+            raise ValueError(f"larger than {_MAX_YAML_BYTES >> 10} KiB")
+        text = content.decode()
         _check_yaml(text)
         return yaml.load(text, _Loader)
     except FileNotFoundError:
-        raise kind(f"{path}: no such file{missing and f'; {missing}'}.") from None
-    except (OSError, ValueError, OverflowError, AttributeError, yaml.YAMLError) as error:
-        reason = getattr(error, "strerror", None) or getattr(error, "problem", None) or error
-        words = " ".join(str(reason).split())[:120].rstrip(".")
-        raise kind(f"{path}: cannot be read as YAML ({words}).") from None
+        remedy = f"; {missing}" if missing else ""
+        raise kind(f"{path}: no such file{remedy}.") from None
+    except OSError as error:
+        reason = str(error.strerror or error)
+    except yaml.MarkedYAMLError as error:
+        reason = str(error.problem or error)
+    except (ValueError, OverflowError, AttributeError, yaml.YAMLError) as error:
+        reason = str(error)
+    sentence = " ".join(reason.split())[:120].rstrip(".")
+    raise kind(f"{path}: cannot be read as YAML ({sentence}).")
 
 
 def _check_yaml(text: str) -> None:
-    """Refuse depth and size, with aliases followed, before anything is built; a ValueError."""
-    sizes, anchors, total = [0], dict[str, int](), 0
-    names: list[str | None] = []
+    """Refuse depth and size, with aliases followed, before anything is built.
+
+    Raises:
+        ValueError: The text is nested too deep, or has too many or too long values.
+    """
+    anchor_sizes: dict[str, int] = {}
+    open_anchors: list[str | None] = []
+    sizes = [0]  # Values in each open collection, the whole text first.
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.CollectionStartEvent):
-            names.append(event.anchor)
+            open_anchors.append(event.anchor)
             sizes.append(1)
         elif isinstance(event, yaml.CollectionEndEvent):
             size = sizes.pop()
-            if anchor := names.pop():
-                anchors[anchor] = size
+            anchor = open_anchors.pop()
+            if anchor:
+                anchor_sizes[anchor] = size
             sizes[-1] += size
         elif isinstance(event, yaml.AliasEvent):
-            sizes[-1] += anchors.get(event.anchor or "", 1)
+            sizes[-1] += anchor_sizes.get(event.anchor or "", 1)
         elif isinstance(event, yaml.ScalarEvent):
             sizes[-1] += 1
-            if len(event.value) > _YAML_SCALAR:
+            if len(event.value) > _MAX_YAML_CHARACTERS:
                 raise ValueError(f"a value of {len(event.value)} characters")
-        total = max(total, sizes[-1])
-        if len(sizes) > _YAML_DEPTH:
-            raise ValueError(f"nested deeper than {_YAML_DEPTH} levels")
-        if total > _YAML_NODES:
-            raise ValueError(f"more than {_YAML_NODES} values")
+        if len(sizes) > _MAX_YAML_DEPTH:
+            raise ValueError(f"nested deeper than {_MAX_YAML_DEPTH} levels")
+        if sizes[-1] > _MAX_YAML_VALUES:
+            raise ValueError(f"more than {_MAX_YAML_VALUES} values")
 
 
 @contextmanager
@@ -112,45 +151,47 @@ def written_whole(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; rename it to `path` when the block succeeds.
 
     A block that raises, or a process that dies, leaves `path` as it was. Missing folders are made.
-    An OSError becomes a PronkError.
+
+    Raises:
+        PronkError: The file cannot be written.
     """
-    aside = None
+    temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
             prefix=f".{path.name[:100]}.", suffix=path.suffix, dir=path.parent
         )
         os.close(handle)
-        aside = Path(name)
-        yield aside
+        temporary = Path(name)
+        yield temporary
         # mkstemp makes the file private; give it the mode that open() would have given.
         umask = os.umask(0)
         os.umask(umask)
-        aside.chmod(0o666 & ~umask)
-        aside.replace(path)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
     except BaseException as error:
-        if aside is not None:
-            aside.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise PronkError(f"{path}: cannot be written ({error.strerror or error}).") from error
         raise
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path` whole or not at all."""
-    with written_whole(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+    """Write text to a file, whole or not at all."""
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def sha256(path: Path) -> str:
-    """Hex SHA-256 of a file's bytes."""
+    """Return the SHA-256 of the bytes of a file as hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def save_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]) -> None:
     """Write named arrays and a JSON header with a `schema` to one `.npz`; no pickle."""
-    with written_whole(path) as aside, aside.open("wb") as file:
+    with written_whole(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
 
@@ -158,10 +199,16 @@ def save_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]
 def stored_arrays(
     path: Path, schema: str, *, what: str, writer: str
 ) -> Iterator[tuple[dict[str, Any], Mapping[str, Any]]]:
-    """Open what `save_arrays` wrote: the header and the arrays by name, read inside the block.
+    """Yield the header and the arrays by name of a file that `save_arrays` wrote.
 
-    An ArtefactError says that the file is missing, damaged, of another schema, or that the block
-    failed; it names `what` the file is (as in `a match file`) and the command that writes one.
+    Args:
+        path: The file.
+        schema: The schema that is expected.
+        what: What the file is, for the message, as in `a match file`.
+        writer: The command that writes one, for the message.
+
+    Raises:
+        ArtefactError: The file is missing, damaged or of another schema, or the block failed.
     """
     try:
         check_archive(path, ArtefactError)
@@ -183,46 +230,78 @@ def stored_arrays(
 
 
 def save_artefact(path: Path, value: Any, schema: str) -> None:
-    """Write a dataclass of numbers, text, arrays and further dataclasses to one `.npz`."""
+    """Write a dataclass of numbers, text, arrays and further dataclasses to one `.npz`.
+
+    Arrays are stored under their number, which stands in the header in their place.
+    """
     arrays: dict[str, Any] = {}
 
-    def hook(item: Any) -> Any:
+    def encode(item: Any) -> Any:
         if isinstance(item, np.ndarray):
-            arrays[str(len(arrays))] = item
-            return str(len(arrays) - 1)
-        return item.item() if isinstance(item, np.generic) else dict(item)
+            number = str(len(arrays))
+            arrays[number] = item
+            return number
+        if isinstance(item, np.generic):
+            return item.item()
+        return dict(item)
 
-    content = msgspec.to_builtins(value, enc_hook=hook)
+    content = msgspec.to_builtins(value, enc_hook=encode)
     save_arrays(path, {"schema": schema, "content": content}, arrays)
 
 
-def load_artefact(path: Path, kind: type[T], schema: str, *, what: str, writer: str) -> T:
-    """Read what `save_artefact` wrote; arguments and errors are those of `stored_arrays`."""
+def load_artefact(
+    path: Path, kind: type[Artefact], schema: str, *, what: str, writer: str
+) -> Artefact:
+    """Read what `save_artefact` wrote.
+
+    Args:
+        path: The file.
+        kind: Class of the artefact.
+        schema: The schema that is expected.
+        what: What the file is, for the message, as in `a match file`.
+        writer: The command that writes one, for the message.
+
+    Raises:
+        ArtefactError: The file is missing, damaged or of another schema.
+    """
     with stored_arrays(path, schema, what=what, writer=writer) as (header, arrays):
-        return converted(header["content"], kind, path, lambda _, key: arrays[key])
+        return converted(header["content"], kind, path, lambda _, number: arrays[number])
 
 
 def converted(
-    data: Any, kind: type[T], path: Path, hook: Any = None, error: type[PronkError] = ArtefactError
-) -> T:
-    """Make a dataclass of YAML or JSON data; an error names a wrong or unknown field."""
+    data: Any,
+    kind: type[Artefact],
+    path: Path,
+    hook: Any = None,
+    error: type[PronkError] = ArtefactError,
+) -> Artefact:
+    """Make a dataclass of YAML or JSON data.
+
+    Args:
+        data: Mappings, lists, text and numbers.
+        kind: Class of the result.
+        path: Where the data come from, for the message.
+        hook: Makes objects of classes that msgspec does not know.
+        error: Class of the error, which names a wrong or unknown field.
+    """
     try:
-        out = msgspec.convert(data, kind, dec_hook=hook)
-    except msgspec.ValidationError as wrong:
-        raise error(f"{path}: {str(wrong).rstrip('.')}.") from None
+        artefact = msgspec.convert(data, kind, dec_hook=hook)
+    except msgspec.ValidationError as refusal:
+        raise error(f"{path}: {str(refusal).rstrip('.')}.") from None
     if hook is None:
-        _refuse_unknown(data, msgspec.to_builtins(out), path, "")
-    return out
+        _refuse_unknown(data, msgspec.to_builtins(artefact), path, "")
+    return artefact
 
 
-def _refuse_unknown(data: Any, known: Any, path: Path, where: str) -> None:
-    """Compare the keys of two trees."""
-    if not isinstance(data, dict) or not isinstance(known, dict):
+def _refuse_unknown(data: Any, expected: Any, path: Path, where: str) -> None:
+    """Refuse a key of nested mappings that the expected ones do not have."""
+    if not isinstance(data, dict) or not isinstance(expected, dict):
         return
     for name in data:
-        if name not in known:
+        if name not in expected:
             place = f" of {where}" if where else ""
             raise ArtefactError(
-                f"{path}: unknown field {name!r}{place}; the fields are {', '.join(known)}."
+                f"{path}: unknown field {name!r}{place}; the fields are {', '.join(expected)}."
             )
-        _refuse_unknown(data[name], known[name], path, f"{where}.{name}" if where else name)
+        inner = f"{where}.{name}" if where else name
+        _refuse_unknown(data[name], expected[name], path, inner)

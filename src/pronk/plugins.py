@@ -1,4 +1,4 @@
-"""Extensions of installed packages."""
+"""Extensions that installed packages bring by entry points."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from typing import Any
 from pronk.errors import PronkError
 
 
-def load(point: EntryPoint) -> Any:
-    """Import what an entry point names; PronkError if it cannot be imported."""
+def load_entry_point(entry_point: EntryPoint) -> Any:
+    """Import what an entry point names.
+
+    Raises:
+        PronkError: It cannot be imported; the message names the package to reinstall or remove.
+    """
     try:
-        return point.load()
+        return entry_point.load()
     except Exception as error:  # Code of another package may fail in any way.
         raise PronkError(
-            f"{point.value} of the entry points {point.group} cannot be loaded "
+            f"{entry_point.value} of the entry points {entry_point.group} cannot be loaded "
             f"({type(error).__name__}: {error}); reinstall or remove its package."
         ) from error

@@ -9,13 +9,13 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 from pronk.errors import PronkError
 
-J = TypeVar("J")
-R = TypeVar("R")
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
@@ -24,55 +24,76 @@ _SET_PARENT_DEATH_SIGNAL = 1
 def die_with_parent(number: int = signal.SIGKILL) -> None:
     """Have the system send this process a signal when its parent ends, however that ends.
 
-    Linux only; the parent is the thread that started this process.
+    This works on Linux only. The parent is the thread that started this process.
     """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None, use_errno=True).prctl(_SET_PARENT_DEATH_SIGNAL, int(number))
     parent = multiprocessing.parent_process()
-    if parent is not None and parent.pid != os.getppid():  # It ended before.
+    ended_already = parent is not None and parent.pid != os.getppid()
+    if ended_already:
         os.kill(os.getpid(), number)
 
 
 @contextmanager
 def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of processes that die with this one; a fork of a program with threads hangs.
+    """Yield a pool of processes that die with this one.
 
-    At the end they are killed: the executor itself waits for each of them, so for ever for one that
-    was stopped, or killed while it held the lock of the queue.
+    They are spawned, since the fork of a program with threads can hang. At the end they are killed:
+    the executor itself waits for each of them, so for ever for one that was stopped, or that was
+    killed while it held the lock of the queue.
     """
-    before, context = multiprocessing.active_children(), multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=die_with_parent) as own:
+    children_before = multiprocessing.active_children()
+    executor = ProcessPoolExecutor(
+        processes, mp_context=multiprocessing.get_context("spawn"), initializer=die_with_parent
+    )
+    with executor:
         try:
-            yield own
+            yield executor
         finally:
-            for process in multiprocessing.active_children():
-                if process not in before:
-                    process.kill()
+            for child in multiprocessing.active_children():
+                if child not in children_before:
+                    child.kill()
 
 
 def in_processes(
-    work: Callable[[J], R],
-    jobs: Sequence[J],
+    work: Callable[[Job], Result],
+    jobs: Sequence[Job],
     *,
     processes: int = 1,
     progress: Callable[[float], None] | None = None,
-) -> list[R]:
-    """Do every job, in this process or in several; `work` is a function of a module."""
+) -> list[Result]:
+    """Do every job, in this process or in several, and return the results in order.
+
+    Args:
+        work: A function of a module, so that other processes can import it.
+        jobs: Its arguments, one for each call.
+        processes: How many jobs are done at a time.
+        progress: Called with the share that is done, 0 to 1.
+
+    Raises:
+        PronkError: The number of processes is impossible, or one of them was killed.
+    """
     if processes < 1:
         raise PronkError(f"{processes} processes; expected 1 or more.")
-    done: list[R] = []
-    with ExitStack() as stack:
-        run: Callable[..., Iterator[R]] = map
-        if processes > 1 and len(jobs) > 1:
-            run = stack.enter_context(pool(min(processes, len(jobs)))).map
+    if processes == 1 or len(jobs) <= 1:
+        return _collected(map(work, jobs), len(jobs), progress)
+    with pool(min(processes, len(jobs))) as executor:
         try:
-            for result in run(work, jobs):
-                done.append(result)
-                if progress is not None:
-                    progress(len(done) / len(jobs))
+            return _collected(executor.map(work, jobs), len(jobs), progress)
         except BrokenProcessPool:
             raise PronkError(
                 "one of the processes was killed, most likely for want of memory; "
                 "give fewer files, joints or processes at a time."
             ) from None
-    return done
+
+
+def _collected(
+    results: Iterator[Result], count: int, progress: Callable[[float], None] | None
+) -> list[Result]:
+    """Return results as a list and report the share that has arrived."""
+    collected = []
+    for result in results:
+        collected.append(result)
+        if progress is not None:
+            progress(len(collected) / count)
+    return collected

@@ -21,7 +21,7 @@ import pytest
 
 from command_line import invoke
 from deploy_runs import DAMPED_S, FRESH, free_port, simulated
-from pronk.cli.console import Person
+from pronk.cli.console import RigOperator
 from pronk.cli.sweep import record_wire
 from pronk.deploy.links.address import Address
 from pronk.deploy.runtime.plan import Link
@@ -189,7 +189,7 @@ def test_a_person_clamps_joints_when_requested(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reading, writing = os.pipe()
-    person = Person()
+    person = RigOperator()
     with os.fdopen(reading) as stdin, os.fdopen(writing, "w") as keys:
         monkeypatch.setattr(sys, "stdin", stdin)
         for joints, printed in (

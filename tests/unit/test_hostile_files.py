@@ -16,7 +16,7 @@ import yaml
 from benchmarks.fuzz import fuzz
 from command_line import accepted
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
-from pronk.files import LIMIT, read_yaml, write_text
+from pronk.files import SIZE_LIMIT, read_yaml, write_text
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import McapWriter
 from pronk.identify.logs.mcap_log import HEADER, SAMPLE, SEGMENT, TOPICS
@@ -177,7 +177,7 @@ def test_a_robot_file_made_of_any_joint_names_can_be_read(tmp_path: Path) -> Non
 def test_bombs_are_refused_and_the_error_names_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(LIMIT, "16")
+    monkeypatch.setenv(SIZE_LIMIT, "16")
     names = ("time", "command", "position")
     for name, size in (("declared", 16 << 20), ("converted", 4 << 20)):
         zeros = dict.fromkeys(names, np.zeros(size, bool))
@@ -189,11 +189,11 @@ def test_bombs_are_refused_and_the_error_names_the_limit(
     writer.close()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for path in sorted(tmp_path.iterdir()):
-        with pytest.raises(LogError, match=LIMIT):
+        with pytest.raises(LogError, match=SIZE_LIMIT):
             read_log(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10
-    monkeypatch.setenv(LIMIT, "lots")
-    with pytest.raises(PronkError, match=LIMIT):
+    monkeypatch.setenv(SIZE_LIMIT, "lots")
+    with pytest.raises(PronkError, match=SIZE_LIMIT):
         read_log(tmp_path / "cells.csv")
 
 

@@ -1,6 +1,6 @@
 """Output of the commands: tables, progress, figures as JSON; confirmations before a robot moves.
 
-Results go to standard output; progress and warnings go to standard error, so that a table can be
+Results go to standard output. Progress and warnings go to standard error, so that a table can be
 piped into a file.
 """
 
@@ -13,26 +13,29 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from pronk.errors import HardwareError
 from pronk.files import write_text
+from pronk.tables import Table
 
-if TYPE_CHECKING:
-    from pronk.jump.trial.tables import Sheet
-
-_LOOK_S = 0.2
+_PIPED_WIDTH = 200
+"""Characters of a line where standard output is not a terminal."""
+_LONG_TEXT = 24
+"""Characters of a cell from which on a column of text is set to the left."""
+_POLL_S = 0.2
+"""Time between two looks at standard input while a person works at the rig [s]."""
 
 
 def err() -> Console:
-    """Standard error; made anew each time, so that a redirected stream is found."""
+    """Return standard error, made anew each time, so that a redirected stream is found."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
@@ -41,9 +44,9 @@ def say(text: str) -> None:
     Console(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
-def note(text: str, **look: Any) -> None:
+def note(text: str, style: str | None = None) -> None:
     """Print one line to standard error."""
-    err().print(text, markup=False, **look)
+    err().print(text, markup=False, style=style)
 
 
 def warn(text: str) -> None:
@@ -64,21 +67,23 @@ JsonFile = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a command leaves when it has ended."""
+    """Result of a command that has ended."""
 
     figures: Mapping[str, Any]
-    """What `--json` writes; arrays become lists, and numbers that are not finite null."""
+    """Numbers that `--json` writes; arrays become lists, and numbers that are not finite null."""
     wrote: Sequence[Path] = ()
+    """Files that were written."""
     following: Sequence[str] = ()
     """Commands to run next."""
     status: int = 0
+    """Exit status."""
 
     def end(self, json_file: Path | None) -> int:
         """Print what was written and what to do next, write the figures; return the exit status."""
         for path in self.wrote:
             say(f"wrote {path}")
         if json_file is not None:
-            encoded = msgspec.json.encode(dict(self.figures), enc_hook=_plain)
+            encoded = msgspec.json.encode(dict(self.figures), enc_hook=_json_value)
             write_text(json_file, json.dumps(msgspec.json.decode(encoded), indent=2) + "\n")
             say(f"wrote {json_file}")
         if self.following:
@@ -86,15 +91,46 @@ class Outcome:
         return self.status
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
+    """Return arrays as lists and paths as text."""
     return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
+
+
+def show(table: Table | RichTable) -> None:
+    """Print a table and its notes.
+
+    A stream that is not a terminal gets the width that the table needs.
+    """
+    if isinstance(table, RichTable):  # Until the last caller of `table` below is converted.
+        console = Console(highlight=False)
+        if not console.is_terminal:
+            console = Console(highlight=False, width=_PIPED_WIDTH)
+        console.print(table)
+        return
+    rich_table = RichTable(
+        title=Text(table.title), title_style="bold", header_style="bold", title_justify="left"
+    )
+    text_rows = table.text_rows()
+    for index, column in enumerate(table.columns):
+        is_name = index == 0
+        is_long = any(len(text_row[index]) > _LONG_TEXT for text_row in text_rows)
+        justify = "left" if is_name or is_long else "right"
+        rich_table.add_column(Text(column.title), justify=justify, no_wrap=is_name)  # type: ignore[arg-type]
+    for text_row in text_rows:
+        rich_table.add_row(*map(Text, text_row))
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=_PIPED_WIDTH)
+    console.print(rich_table)
+    for sentence in table.notes:
+        say(f"  {sentence}")
 
 
 def table(
     title: str, columns: Iterable[str], rows: Iterable[Sequence[str]] = (), caption: str = ""
-) -> Table:
-    """Make a table of text without markup whose first column is a name, the others numbers."""
-    made = Table(title=Text(title), title_style="bold", header_style="bold")
+) -> RichTable:
+    """Make a table of text; to be replaced by `pronk.tables.Table`."""
+    made = RichTable(title=Text(title), title_style="bold", header_style="bold")
     made.caption = Text(caption) if caption else None
     made.title_justify = made.caption_justify = "left"
     for i, column in enumerate(columns):
@@ -104,31 +140,23 @@ def table(
     return made
 
 
-def show(made: Table) -> None:
-    """Print a table; a stream that is not a terminal gets the width the table needs."""
-    console = Console(highlight=False)
-    (console if console.is_terminal else Console(highlight=False, width=200)).print(made)
-
-
-def show_sheet(sheet: Sheet | None, title: str = "") -> None:
-    """Print a table and its notes."""
+def show_sheet(sheet: Any, title: str = "") -> None:
+    """Print a sheet of a trial; to be replaced by `show`."""
     if sheet is not None:
-        made = table(sheet.title or title, sheet.columns, sheet.rows)
-        made.columns[-1].justify = "left" if sheet.columns[-1] == "equation" else "right"
-        show(made)
-        for note in sheet.notes:
-            say(f"  {note}")
+        show(table(sheet.title or title, sheet.columns, sheet.rows))
+        for sentence in sheet.notes:
+            say(f"  {sentence}")
 
 
 def show_table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str) -> None:
-    """Print a table; arguments are those of `pronk.jump.trial.tables.table`."""
-    from pronk.jump.trial.tables import table
+    """Print a table; to be replaced by `show`."""
+    from pronk.jump.trial.tables import table as make_sheet
 
-    show_sheet(table(columns, rows, *notes, title=title))
+    show_sheet(make_sheet(columns, rows, *notes, title=title))
 
 
 def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Print some fields of rows: heading (and digits, as in `peak [dB];2`) to name of a field."""
+    """Print some fields of rows; to be replaced by `show`."""
     cells = [[row[name] for name in columns.values()] for row in rows]
     show_table(" | ".join(columns), cells, title=title)
 
@@ -137,22 +165,31 @@ class Reporter(Progress):
     """Progress of one command on standard error: named stages, each from 0 to 1."""
 
     def __call__(self, stage: str, share: float) -> None:
-        """Set the share of `stage` that is done, 0 to 1."""
-        known = [task.id for task in self.tasks if task.description == stage]
-        task = known[0] if known else self.add_task(stage, total=1.0)
-        self.update(task, completed=min(max(share, 0.0), 1.0))
+        """Set the share of a stage that is done, 0 to 1."""
+        task_id = None
+        for task in self.tasks:
+            if task.description == stage:
+                task_id = task.id
+        if task_id is None:
+            task_id = self.add_task(stage, total=1.0)
+        self.update(task_id, completed=min(max(share, 0.0), 1.0))
 
     def bar(self, stage: str) -> Callable[[float], None]:
-        """Begin a stage; the result sets its share."""
+        """Begin a stage; return a function that sets its share."""
         self(stage, 0.0)
         return lambda share: self(stage, share)
 
 
 def progress() -> Reporter:
     """Show progress inside a `with` block."""
-    share = TextColumn("{task.percentage:>3.0f} %")
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), share)
-    return Reporter(*columns, TimeElapsedColumn(), console=err())
+    return Reporter(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        console=err(),
+    )
 
 
 def confirm(robot: str, where: str) -> None:
@@ -169,28 +206,36 @@ def confirm(robot: str, where: str) -> None:
         raise HardwareError(f"that was not {robot!r}; nothing was moved.")
 
 
-class Person:
+class RigOperator:
     """A person at the test rig who clamps joints and confirms it."""
 
-    _fixed: tuple[str, ...] = ()
+    def __init__(self) -> None:
+        self._clamped: tuple[str, ...] = ()
 
     def __call__(self, joints: tuple[str, ...]) -> None:
-        """Have these joints clamped and all others freed; returns when they are."""
-        if set(joints) == set(self._fixed):
+        """Have these joints clamped and all others freed; return when they are.
+
+        Raises:
+            HardwareError: Standard input has ended.
+        """
+        if set(joints) == set(self._clamped):
             return
-        free = [name for name in self._fixed if name not in joints]
-        words = [f"fix {', '.join(joints)} mechanically where they are"] if joints else []
-        words += [f"free {', '.join(free)}"] if free else []
+        instructions = []
+        if joints:
+            instructions.append(f"fix {', '.join(joints)} mechanically where they are")
+        to_free = [name for name in self._clamped if name not in joints]
+        if to_free:
+            instructions.append(f"free {', '.join(to_free)}")
         say(
-            f"Please {', and '.join(words)}. The drives hold the pose meanwhile; keep "
+            f"Please {', and '.join(instructions)}. The drives hold the pose meanwhile; keep "
             "clear of the legs afterwards. Press Enter when it is done."
         )
         # Polling lets a fault end the program meanwhile.
-        while not select.select([sys.stdin], [], [], _LOOK_S)[0]:
+        while not select.select([sys.stdin], [], [], _POLL_S)[0]:
             pass
         if not sys.stdin.readline():
             raise HardwareError(
                 "standard input has ended, so no joint can be clamped; sweep joints that need no "
                 "clamp (--joints), or run this from a terminal."
             )
-        self._fixed = joints
+        self._clamped = joints

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pronk
 from pronk.cli import console
 from pronk.cli.match import summary
 from pronk.cli.predict import prediction_rows
@@ -102,7 +101,7 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     """Return the policies of a folder, or of pronk's source if None; the matched one first."""
     from pronk.jump.trial.trial import load_subjects
 
-    place = folder or Path(pronk.__file__).parents[2] / "policies"
+    place = folder or Path(__file__).parents[3] / "policies"
     found = [*place.glob("policy.onnx"), *place.glob("*/policy.onnx")]
     found.sort(key=lambda path: (path.parent.name != "matched", path.parent.name))
     if folder is not None and not found:

@@ -19,8 +19,9 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_type_hints
 
-from pronk import __version__, opengl
+from pronk import opengl
 from pronk.errors import PronkError
+from pronk.version import VERSION
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
@@ -46,19 +47,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 }
 """Name of a command: where its function is, and what it does."""
 
-RENAMED = {
-    "twin": "`pronk twin` is now `pronk simulate`.",
-    "bench": "`pronk bench NAME` is now `python -m benchmarks NAME`, run in a checkout.",
-    "--link twin": "`--link twin` is now `--link sim`.",
-    "--truth": "`--truth` is now `--sim-params`.",
-    "--free": "`--free` is now `--fit`.",
-    "--release": "`--release` is now `--disable-onboard-controller`.",
-    "--any-delay": "`--any-delay` is now `--ignore-latency-check`.",
-    "--blend": "`--blend` is now `--blend-time-s`.",
-    "--like": "`--like` is now `--ranges-from`.",
-}
-"""Names of the release before, each with the hint that replaces it."""
-_JSON = "json_file"
+_JSON_PARAMETER = "json_file"
+"""Parameter of the option `--json`, which commands with an `Outcome` get."""
 
 
 def run(
@@ -66,7 +56,13 @@ def run(
     commands: Mapping[str, tuple[str, str]] = COMMANDS,
     program: str = "pronk",
 ) -> int:
-    """Run one of `commands` with the words after the program's name; return its exit status."""
+    """Run a command and return its exit status.
+
+    Args:
+        arguments: The words after the program's name.
+        commands: Where the function of each command is, and what it does.
+        program: The program's name, for messages.
+    """
     try:
         return _dispatch(commands, list(arguments), program)
     except SystemExit as stop:  # The help of a command was printed.
@@ -75,88 +71,118 @@ def run(
         sys.stderr.close()  # The reader of a pipe has closed it.
         return 0
     except PronkError as error:
-        status, text = 2, str(error)
+        status = 2
+        message = str(error)
     except KeyboardInterrupt:
-        status, text = 130, "interrupted."
+        status = 130
+        message = "interrupted."
     except MemoryError:
-        status, text = 1, "out of memory; give fewer logs or joints at a time."
+        status = 1
+        message = "out of memory; give fewer logs or joints at a time."
     except Exception as error:
         if os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
         status = 1
-        text = (
+        message = (
             f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
             "PRONK_DEBUG=1 shows where it happened."
         )
-    print(f"pronk: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    print(f"pronk: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
     return status
 
 
 def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], program: str) -> int:
+    """Print the help or the version, or run the command that the first word names."""
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
-        width = max(map(len, commands))
-        lines = [f"usage: {program} [--version] COMMAND ...", "", "commands:"]
-        lines += [f"  {name:{width}}  {text}" for name, (_, text) in commands.items()]
-        lines += ["", f"`{program} COMMAND --help` lists the options of a command."]
-        print("\n".join(lines))  # noqa: T201
+        print(_overview(commands, program))  # noqa: T201
         return 0
     if name == "--version":
-        print(f"pronk {__version__}")  # noqa: T201
+        print(f"pronk {VERSION}")  # noqa: T201
         return 0
     if name not in commands:
-        hint = RENAMED.get(name) or f"the commands are {', '.join(commands)}."
-        raise PronkError(f"there is no command {name!r}; {hint}")
-    command = pkgutil.resolve_name(commands[name][0])
+        raise PronkError(f"there is no command {name!r}; the commands are {', '.join(commands)}.")
+    location, _ = commands[name]
+    command = pkgutil.resolve_name(location)
     values = _parse(command, arguments[1:], f"{program} {name}")
-    json_file = values.pop(_JSON, None)
+    json_file = values.pop(_JSON_PARAMETER, None)
     outcome = command(**values)
     return 0 if outcome is None else int(outcome.end(json_file))
 
 
+def _overview(commands: Mapping[str, tuple[str, str]], program: str) -> str:
+    """Return the list of commands with what each of them does."""
+    width = max(map(len, commands))
+    lines = [f"usage: {program} [--version] COMMAND ...", "", "commands:"]
+    for name, (_, summary) in commands.items():
+        lines.append(f"  {name:{width}}  {summary}")
+    lines += ["", f"`{program} COMMAND --help` lists the options of a command."]
+    return "\n".join(lines)
+
+
 def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> dict[str, Any]:
-    """Return the values of a command's parameters; SystemExit if the help was printed."""
+    """Return the values of a command's parameters by name.
+
+    Raises:
+        SystemExit: The help was printed.
+        PronkError: An option is unknown, missing or has an impossible value.
+    """
     import tyro
 
     from pronk.cli.console import JsonFile, Outcome
 
     signature = inspect.signature(command, eval_str=True)
-    options = list(signature.parameters.values())
+    parameters = list(signature.parameters.values())
     if signature.return_annotation is Outcome:
-        known = {"default": None, "annotation": JsonFile}
-        options.append(inspect.Parameter(_JSON, inspect.Parameter.KEYWORD_ONLY, **known))
+        json_option = inspect.Parameter(
+            _JSON_PARAMETER, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=JsonFile
+        )
+        parameters.append(json_option)
 
-    def call(**values: Any) -> dict[str, Any]:
+    def collect(**values: Any) -> dict[str, Any]:
         return values
 
-    call.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
-    call.__doc__ = command.__doc__
-    call.__annotations__ = {option.name: option.annotation for option in options}
-    kinds = dict(call.__annotations__)
-    for kind in call.__annotations__.values():
-        kinds |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
-    for name, kind in kinds.items():
-        if kind == bool | None:  # tyro wants a value there: --x True.
-            option = name.replace("_", "-")
-            words = {f"--{option}": f"--{option}=True", f"--no-{option}": f"--{option}=False"}
-            arguments = [words.get(word, word) for word in arguments]
-    config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
+    # tyro makes the options of what it finds at a function.
+    annotations = {parameter.name: parameter.annotation for parameter in parameters}
+    collect.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    collect.__doc__ = command.__doc__
+    collect.__annotations__ = annotations
+    words = _with_explicit_values(arguments, annotations)
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
-            return tyro.cli(call, prog=program, args=arguments, config=config)
+            return tyro.cli(
+                collect,
+                prog=program,
+                args=words,
+                config=(tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes),
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise PronkError(_sentence(messages.getvalue(), arguments, program)) from None
+        raise PronkError(_sentence(messages.getvalue(), program)) from None
 
 
-def _sentence(box: str, arguments: list[str], program: str) -> str:
+def _with_explicit_values(arguments: list[str], annotations: Mapping[str, Any]) -> list[str]:
+    """Write `--x` and `--no-x` of options `bool | None` as `--x=True` and `--x=False`.
+
+    tyro expects a value there.
+    """
+    kinds = dict(annotations)
+    for kind in annotations.values():
+        if dataclasses.is_dataclass(kind):
+            kinds |= get_type_hints(kind)
+    explicit = {}
+    for name, kind in kinds.items():
+        if kind == bool | None:
+            option = name.replace("_", "-")
+            explicit[f"--{option}"] = f"--{option}=True"
+            explicit[f"--no-{option}"] = f"--{option}=False"
+    return [explicit.get(word, word) for word in arguments]
+
+
+def _sentence(box: str, program: str) -> str:
     """Make one sentence of the message that tyro prints in a box."""
-    words = " ".join(arguments)
-    for old, hint in RENAMED.items():
-        if old.startswith("-") and re.search(rf"(?:^| ){re.escape(old)}(?:[ =]|$)", words):
-            return hint
     text = " ".join(re.sub(r"[│╭╮╰╯─]|-{3,}", " ", box).split())
     text = text.split("For full helptext")[0].rstrip(". ")
     title = r"^(Parsing error|Required options|Unrecognized options|Value error|Invalid choice) "

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -21,6 +21,7 @@ Layout = Literal["cheetah", "wtw"]
 """Messages on LCM: Cheetah-Software's, or walk-these-ways'."""
 Base = Literal["bench", "ground"]
 """What the virtual robot's trunk is fixed to, or stands on."""
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,25 +46,36 @@ class LinkOptions:
     sim_params: Path | None = None
     """Parameters of the virtual robot, instead of the shipped ones."""
     seed: int = 0
-    """Of the virtual robot's noise."""
+    """Seed of the virtual robot's noise."""
     yes: bool = False
     """No confirmation before real hardware moves."""
 
     def address(self, base: Base | None = None) -> Address:
-        """The machine's address, with what belongs to its link; None as base for the link's own."""
+        """Return the machine's address with the options of its link.
+
+        Args:
+            base: What the virtual robot stands on; the link's own choice if None.
+
+        Raises:
+            HardwareError: An option does not belong to this link.
+        """
         from pronk.deploy.links.address import SIM, Address
 
-        options: dict[str, Any] = {"layout": self.layout, "port": self.port, "domain": self.domain}
-        where = self.interface
-        if self.link.partition(":")[0] == SIM:
-            params = None if self.sim_params is None else str(self.sim_params)
-            options |= {"seed": self.seed or None, "params": params}
-            where = base or self.interface
-        elif self.sim_params is not None:
+        options: dict[str, Any] = {
+            "layout": self.layout,
+            "port": self.port,
+            "domain": self.domain,
+        }
+        scheme = self.link.partition(":")[0]
+        if scheme == SIM:
+            options["seed"] = self.seed or None
+            options["params"] = None if self.sim_params is None else str(self.sim_params)
+            return Address.parse(self.link, base or self.interface, **options)
+        if self.sim_params is not None:
             raise HardwareError(
                 "--sim-params is of --link sim; give it to `pronk simulate` instead."
             )
-        return Address.parse(self.link, where, **options)
+        return Address.parse(self.link, self.interface, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,43 +113,70 @@ class Reading:
         """Read every log that some paths stand for, on all cores."""
         from pronk.identify.logs.readers import read_logs
 
-        options = vars(self) | {
-            "format": self.log_format,
-            "columns": _pairs("--columns", self.columns),
+        options: dict[str, Any] = {
+            "unit": self.unit,
+            "time_unit": self.time_unit,
+            "columns": named_values("--columns", self.columns, str),
+            "joint_names": named_values("--joint-names", self.joint_names, str),
+            "joint_order": self.joint_order,
             "drop_duplicates": self.drop_duplicates or None,
-            "joint_names": _pairs("--joint-names", self.joint_names),
-            "scale": _pairs("--scale", self.scale, float),
-            **_pairs("--reader-option", self.reader_options),
+            "scale": named_values("--scale", self.scale, float),
+            "rate_hz": self.rate_hz,
+            "format": self.log_format,
+            "measured_topic": self.measured_topic,
+            "command_topic": self.command_topic,
+            "command_field": self.command_field,
         }
-        del options["log_format"], options["reader_options"]
-        given = {name: value for name, value in options.items() if value not in (None, {})}
-        return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **given)
+        options |= named_values("--reader-option", self.reader_options, str)
+        stated = {name: value for name, value in options.items() if value not in (None, {})}
+        return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **stated)
 
 
-def _pairs(option: str, entries: Sequence[str], kind: Callable[[str], Any] = str) -> dict[str, Any]:
-    found = {}
+def named_values(
+    option: str, entries: Sequence[str], convert: Callable[[str], Value]
+) -> dict[str, Value]:
+    """Return the values of a repeated option NAME=VALUE by name.
+
+    Args:
+        option: The option, for the message.
+        entries: Its words.
+        convert: Makes a value of its text; a ValueError says what was expected.
+
+    Raises:
+        PronkError: An entry is not NAME=VALUE, or its value is impossible.
+    """
+    values = {}
     for entry in entries:
-        name, _, value = entry.partition("=")
+        name, _, text = entry.partition("=")
+        if not name or not text:
+            raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")
         try:
-            if not (name and value):
-                raise ValueError("expected NAME=VALUE")
-            found[name] = kind(value)
+            values[name] = convert(text)
         except ValueError as error:
             raise PronkError(f"{option} {entry!r}: {error}.") from None
-    return found
+    return values
 
 
 def drive_gains(
     entries: Sequence[str], option: str = "--drive-gains"
 ) -> dict[str, tuple[float, float]] | Literal["default"] | None:
-    """Gains of joints by NAME=STIFFNESS,DAMPING, or `default`; None where none was given."""
+    """Return stiffness [N m/rad] and damping [N m s/rad] by joint of NAME=STIFFNESS,DAMPING.
+
+    The single word `default` is returned as it is; None stands for no entry.
+    """
     if tuple(entries) == ("default",):
         return "default"
-    return _pairs(option, entries, _gains) or None
+    return named_values(option, entries, _stiffness_and_damping) or None
 
 
-def _gains(text: str) -> tuple[float, float]:
+def _stiffness_and_damping(text: str) -> tuple[float, float]:
+    """Return the two numbers of STIFFNESS,DAMPING; ValueError if they are impossible."""
+    expected = "expected NAME=STIFFNESS,DAMPING, the stiffness above 0, as in knee=25,.5"
     words = text.split(",")
-    if len(words) != 2 or not (0.0 < float(words[0]) < 1e6 and 0.0 <= float(words[1]) < 1e6):
-        raise ValueError("expected NAME=STIFFNESS,DAMPING, the stiffness above 0, as in knee=25,.5")
-    return float(words[0]), float(words[1])
+    if len(words) != 2:
+        raise ValueError(expected)
+    stiffness = float(words[0])
+    damping = float(words[1])
+    if not 0.0 < stiffness < 1e6 or not 0.0 <= damping < 1e6:
+        raise ValueError(expected)
+    return stiffness, damping

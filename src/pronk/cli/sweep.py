@@ -151,7 +151,7 @@ def record_wire(
 
     metadata = {"link": str(link.address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    job, operator = Plan(link=link, sweep=task, **more), BenchOperator(console.Person())
+    job, operator = Plan(link=link, sweep=task, **more), BenchOperator(console.RigOperator())
     whole: list[str] = []
 
     def notify(event: Event) -> None:

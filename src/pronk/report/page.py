@@ -11,7 +11,7 @@ from typing import Any
 
 import jinja2
 
-from pronk import __version__
+from pronk.version import VERSION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,4 +69,4 @@ def page(title: str, parts: Sequence[Part]) -> str:
         for part in parts
     ]
     template = environment.get_template("page.html.j2")
-    return template.render(version=__version__, title=title, parts=parts, rendered=rendered)
+    return template.render(version=VERSION, title=title, parts=parts, rendered=rendered)

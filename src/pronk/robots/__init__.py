@@ -10,8 +10,8 @@ from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from pronk import plugins
 from pronk.errors import RobotError
+from pronk.plugins import load_entry_point
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
@@ -37,7 +37,7 @@ def load_robot(name: str | Path) -> RobotSpec:
                 f"there is no robot {str(name)!r}; the robots are {', '.join(ROBOT_NAMES)}, or "
                 "give the path of a robot.yaml, an MJCF or a URDF."
             )
-        path = Path(plugins.load(known[str(name)])())
+        path = Path(load_entry_point(known[str(name)])())
     if path.is_dir():
         path = path / "robot.yaml"
     if path.suffix not in _FILES + _MODELS:

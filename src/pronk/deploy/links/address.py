@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 import msgspec
 
 from pronk.errors import HardwareError
-from pronk.plugins import load
+from pronk.plugins import load_entry_point
 from pronk.robots.machine import Machine
 from pronk.robots.robot import RobotSpec
 
@@ -41,7 +41,7 @@ def find_link(name: str) -> Callable[..., Machine]:
     if name not in known.names:
         names = ", ".join((*BUILT_IN, *sorted(known.names)))
         raise HardwareError(f"no link {name!r}; the links are {names}.")
-    return load(known[name])  # type: ignore[no-any-return]
+    return load_entry_point(known[name])  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,6 @@ from typing import Any, Self
 import numpy as np
 import orjson
 
-from pronk import __version__
 from pronk.deploy.links.address import SIM
 from pronk.deploy.links.realtime import Interrupts, sleep_until, terminal_blocked
 from pronk.deploy.runtime.ipc import OPERATOR, Event, Shared, fill
@@ -30,6 +29,7 @@ from pronk.deploy.runtime.teleop import Operator, OperatorCommand
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
+from pronk.version import VERSION
 
 _RATE_HZ = 50.0
 """Of the operator's program."""
@@ -397,5 +397,5 @@ def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
         | {name: getattr(contract, name) for name in shown},
         "limits": vars(plan.safety()),
         "timing": vars(plan.timing),
-        "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
+        "versions": {"pronk": VERSION, "onnxruntime": onnxruntime.__version__},
     }

@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_strea
 from mcap.writer import CompressionType, IndexType, Writer
 
 from pronk.errors import LogError
-from pronk.files import LIMIT, most_bytes
+from pronk.files import SIZE_LIMIT, max_bytes
 
 NUMBER: dict[str, Any] = {"type": "number"}
 INTEGER: dict[str, Any] = {"type": "integer"}
@@ -107,12 +107,12 @@ def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[l
     """Messages of a file, chunk by chunk, in the order written.
 
     No record can be longer than the file's `size`, and all messages may take `most` [bytes];
-    `most_bytes` if left out. A DamagedError says that the file ends early, or a chunk's checksum
+    `max_bytes` if left out. A DamagedError says that the file ends early, or a chunk's checksum
     does not fit; what was yielded before is sound.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    unpacked, most = 0, most or most_bytes()
+    unpacked, most = 0, most or max_bytes()
     reader = _Reader(stream, emit_chunks=True, record_size_limit=size)
     try:
         for record in reader.records:
@@ -212,7 +212,7 @@ def read_records(path: Path) -> tuple[list[Record], str]:
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
     except TooLargeError as error:
-        raise LogError(f"{path}: {error}; split it, or set {LIMIT} to more.") from None
+        raise LogError(f"{path}: {error}; split it, or set {SIZE_LIMIT} to more.") from None
     except DamagedError as error:
         damage = str(error)
     if not found:

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 
-from pronk import plugins
 from pronk.errors import LogError, PronkError
 from pronk.identify.logs.checks import (
     check_radians,
@@ -28,6 +27,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.pace_reader import read_pace
 from pronk.identify.logs.sage_reader import is_sage, read_sage
+from pronk.plugins import load_entry_point
 from pronk.processes import in_processes
 from pronk.robots.robot import RobotSpec
 
@@ -88,7 +88,7 @@ def readers() -> dict[str, Reader]:
     found = {each.name: each for each in _BUILT_IN}
     for point in entry_points(group=GROUP):
         try:
-            each = plugins.load(point)
+            each = load_entry_point(point)
         except PronkError as error:  # The other formats can still be read.
             warnings.warn(str(error), stacklevel=2)
             continue

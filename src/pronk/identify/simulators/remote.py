@@ -37,7 +37,6 @@ from typing import IO, Any
 
 import numpy as np
 
-from pronk import plugins
 from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
 from pronk.identify.simulators.engines.links import Links, SentRobot, links_of
@@ -48,6 +47,7 @@ from pronk.identify.simulators.simulator import (
     SimulatorInfo,
     factory,
 )
+from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
@@ -226,7 +226,7 @@ def serve() -> None:
             if simulator is None:
                 choice, entry = header["choice"], header["entry"]
                 point = EntryPoint(choice, entry, ENTRY_POINTS)
-                own = plugins.load(point) if entry else factory(choice)
+                own = load_entry_point(point) if entry else factory(choice)
                 simulator = own(_from_json(header["robot"], header["links"]))
                 answer = {
                     "info": asdict(simulator.info),

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from pronk import plugins
 from pronk.arrays import Array
 from pronk.errors import PronkError
+from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
 
@@ -222,7 +222,7 @@ def factory(choice: str) -> Any:
                 f"simulator {choice!r}; expected FILE.py:NAME or one of "
                 f"{', '.join(['mujoco', *sorted(known.names)])}."
             )
-        return plugins.load(known[choice])
+        return load_entry_point(known[choice])
     path = Path(file)
     if not path.is_file():
         raise PronkError(f"simulator {choice}: there is no file {path}.")

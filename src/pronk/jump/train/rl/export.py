@@ -21,7 +21,6 @@ import torch
 from mjlab.envs import ManagerBasedRlEnvCfg
 from torch import Tensor, nn
 
-import pronk
 from pronk.files import written_whole
 from pronk.jump.train.mdp import actions, commands
 from pronk.jump.train.rl.networks import EstimatorActor
@@ -29,6 +28,7 @@ from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_lay
 from pronk.policy.observation import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
+from pronk.version import VERSION
 
 OPSET = 18
 TOLERANCE = 1e-5
@@ -39,7 +39,7 @@ def versions() -> dict[str, str]:
     """Versions of the packages that a run is computed with."""
     modules = ("mjlab", "mujoco", "mujoco_warp", "warp", "torch", "rsl_rl", "numpy")
     packages = {"warp": "warp-lang", "rsl_rl": "rsl-rl-lib"}
-    found = {"python": platform.python_version(), "pronk": pronk.__version__}
+    found = {"python": platform.python_version(), "pronk": VERSION}
     return found | {name: metadata.version(packages.get(name, name)) for name in modules}
 
 
@@ -97,7 +97,7 @@ def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None
                 dynamo=False,
             )
         model = onnx.load(aside)
-        model.producer_name, model.producer_version = "pronk", pronk.__version__
+        model.producer_name, model.producer_version = "pronk", VERSION
         model.doc_string = (
             f"{contract.robot}: {'walks and jumps' if contract.jump else 'walks'}; trained with "
             f"{contract.gains} gains; the contract is JSON in the metadata under {METADATA_KEY}."
