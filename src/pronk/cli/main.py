@@ -17,11 +17,14 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from pronk import opengl
 from pronk.errors import PronkError
 from pronk.version import VERSION
+
+if TYPE_CHECKING:
+    from pronk.cli.console import Outcome
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
@@ -107,7 +110,28 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
     values = _parse(command, arguments[1:], f"{program} {name}")
     json_file = values.pop(_JSON_PARAMETER, None)
     outcome = command(**values)
-    return 0 if outcome is None else int(outcome.end(json_file))
+    if outcome is None:
+        return 0
+    if outcome.page_of is not None:
+        outcome = _with_page(outcome)
+    return int(outcome.end(json_file))
+
+
+def _with_page(outcome: Outcome) -> Outcome:
+    """Write the page of a command's artefact, and name it first in what to do next.
+
+    Pages are made here, so that no command imports the report.
+    """
+    from pronk.report.build import write_artefact_page
+
+    assert outcome.page_of is not None
+    page = write_artefact_page(outcome.page_of)
+    return dataclasses.replace(
+        outcome,
+        figures={**outcome.figures, "page": page},
+        wrote=[*outcome.wrote, page],
+        following=[f"open {page} in a browser", *outcome.following],
+    )
 
 
 def _overview(commands: Mapping[str, tuple[str, str]], program: str) -> str:

@@ -44,6 +44,14 @@ def artefacts(root: Path, pattern: str) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.parts), path))
 
 
+def write_artefact_page(artefact: Path) -> Path:
+    """Write the page of one artefact beside it, for instance `match.html` of `match.npz`."""
+    artefact_part = replace(KINDS[artefact.name](artefact), source=artefact.name)
+    page_path = artefact.with_suffix(".html")
+    write_text(page_path, page(artefact_part.title, [artefact_part]))
+    return page_path
+
+
 def write_report(
     root: Path, progress: Callable[[str, float], None] = lambda stage, share: None
 ) -> tuple[Path, list[Part]]:
