@@ -44,6 +44,7 @@ def build(
     read: tuple[str, ...] = ("measured", "jump"),
     observation: TensorDict | None = None,
     multi_gpu: dict[str, int] | None = None,
+    estimator: dict[str, Any] | None = None,
     **algorithm: Any,
 ) -> EstimatorPPO:
     """Build it as rsl_rl's runner does from mjlab's configuration."""
@@ -55,7 +56,7 @@ def build(
     del made["critic"]["distribution_cfg"]
     cfg = {
         **made,
-        "algorithm": asdict(EstimatorPpoCfg(**algorithm)),
+        "algorithm": asdict(EstimatorPpoCfg(**algorithm)) | {"estimator": estimator or {}},
         "obs_groups": {"actor": [*read], "critic": ["critic", "critic_jump"]},
         "num_steps_per_env": STEPS,
         "multi_gpu": multi_gpu,

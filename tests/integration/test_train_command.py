@@ -18,8 +18,8 @@ from pronk.errors import PronkError
 from pronk.jump.train import devices
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
-from pronk.jump.train.provenance import RunFolder
-from pronk.jump.train.run import stop_signals, train
+from pronk.jump.train.rl.runner import stop_signals
+from pronk.jump.train.run import train
 from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.tasks import load_task
 
@@ -78,11 +78,6 @@ def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "provenance.json").write_text(content)
     with pytest.raises(PronkError):
         train(TrainSettings(task="walk", out=tmp_path, resume=True))
-
-
-def test_a_folder_is_trained_in_by_one_process(tmp_path: Path) -> None:
-    with RunFolder(tmp_path).locked(), pytest.raises(PronkError, match="another process"):
-        RunFolder(tmp_path).locked().__enter__()
 
 
 def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:

@@ -91,8 +91,8 @@ def test_noise_is_limited_where_it_is_larger_and_still_learned() -> None:
         ({"read": ("jump", "measured")}, "expected measured and jump"),
         ({"observation": observe().set("measured", torch.zeros(ROBOTS, 104))}, "104 numbers"),
         ({"observation": observe().exclude("estimator_target")}, "estimator_target"),
-        ({"estimator_epochs": 0}, "more than 0"),
-        ({"estimator_learning_rate": math.nan}, "more than 0"),
+        ({"estimator": {"epochs": 0}}, "more than 0"),
+        ({"estimator": {"learning_rate": math.nan}}, "more than 0"),
     ],
 )
 def test_impossible_inputs_are_refused(changes: dict[str, Any], words: str) -> None:
@@ -124,7 +124,7 @@ def test_ppo_and_supervision_change_different_weights() -> None:
 
 def test_losses_are_means_over_the_rollout() -> None:
     # With a learning rate of nearly nothing the mean over mini-batches is that of the rollout.
-    algorithm = build(estimator_learning_rate=1e-30, estimator_epochs=2, estimator_mini_batches=4)
+    algorithm = build(estimator={"learning_rate": 1e-30, "epochs": 2, "mini_batches": 4})
     roll_out(algorithm)
     actor, rollout = algorithm.get_policy(), algorithm.storage.observations.flatten(0, 1).clone()
     with torch.no_grad():
@@ -146,7 +146,7 @@ def test_the_estimator_learns_a_known_function() -> None:
         obs["estimator_target"] = target
         return obs
 
-    algorithm = build(hidden=(8,), estimator_epochs=4, num_learning_epochs=1)
+    algorithm = build(hidden=(8,), estimator={"epochs": 4}, num_learning_epochs=1)
     for _ in range(100):
         learn(algorithm, known)
     fresh = known()

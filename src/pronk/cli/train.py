@@ -22,40 +22,60 @@ def train(settings: TrainSettings) -> console.Outcome:
 
     from pronk.jump.train.run import train as run
 
-    again = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
+    resume = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
     try:
-        found = run(settings, report=console.say)
+        record = run(settings, report=console.say)
     except KeyboardInterrupt:
-        console.following(again)
+        console.following(resume)
         raise
+    _show_phases(record["phases"])
+    session = record["sessions"][-1]
+    console.say(f"{session['seconds']:.0f} s in all")
+    if session["stopped"]:
+        console.say(f"stopped: {session['stopped']}")
+    if record["finished"]:
+        return console.Outcome(figures=record, following=_next_steps(settings, record))
+    status = 130 if session["stopped"].startswith("SIG") else 0
+    return console.Outcome(figures=record, following=[resume], status=status)
+
+
+def _show_phases(phases: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print the figures of the phases that are over, if any."""
+    if not phases:
+        return
+    rows = []
+    for name, figures in phases.items():
+        rows.append(
+            (
+                name,
+                figures["iterations"],
+                figures["env_steps"],
+                figures["steps_per_second"],
+                figures["seconds"],
+            )
+        )
     columns = "phase | iterations | environment steps | steps/s;0 | wall clock [s];1"
-    fields = ("iterations", "env_steps", "steps_per_second", "seconds")
-    rows = [(name, *(one[f] for f in fields)) for name, one in found["phases"].items()]
-    if rows:
-        console.show_table(columns, rows, title="Training")
-    session = found["sessions"][-1]
-    console.say(f"{session['seconds']:.0f} s, {session['build_s'] or 0.0:.0f} s of it building")
-    if stopped := session["stopped"]:
-        console.say(f"stopped: {stopped}")
-    if found["finished"]:
-        return console.Outcome(figures=found, following=_next_steps(settings, found))
-    status = 130 if stopped.startswith("SIG") else 0
-    return console.Outcome(figures=found, following=[again], status=status)
+    console.show_table(columns, rows, title="Training")
 
 
-def _next_steps(settings: TrainSettings, found: Mapping[str, Any]) -> list[str]:
+def _next_steps(settings: TrainSettings, record: Mapping[str, Any]) -> list[str]:
+    """Return the commands that may follow a finished run."""
     folder = settings.out
-    policy, copy = folder / "policy.onnx", folder / "gains.yaml"
-    matched = found["gains"]["name"] == "matched"
-    gains = ["--gains", copy if matched else "naive"]
-    if not matched and found["gains"]["sha256"]:
-        gains += ["--ranges-from", copy]
-    walked = ["pronk", "train", "jump", "--init-checkpoint", folder, *gains]
-    steps = [
-        ["pronk", "evaluate", policy, *gains, "--out", folder / "evaluation.json"],
-        [*walked, "--out", f"{folder}_jump"]
-        if settings.task == "walk"
-        else ["pronk", "trial", policy],
-        ["tensorboard", "--logdir", folder],
-    ]
-    return [shlex.join(map(str, words)) for words in steps]
+    policy = str(folder / "policy.onnx")
+    gains_copy = str(folder / "gains.yaml")
+    if record["gains"]["name"] == "matched":
+        gains_options = ["--gains", gains_copy]
+    else:
+        gains_options = ["--gains", "naive"]
+        if record["gains"]["sha256"]:
+            gains_options += ["--ranges-from", gains_copy]
+    evaluation = str(folder / "evaluation.json")
+    evaluate = ["pronk", "evaluate", policy, *gains_options, "--out", evaluation]
+    if settings.task == "walk":
+        start = ["--init-checkpoint", str(folder)]
+        out = ["--out", f"{folder}_jump"]
+        use = ["pronk", "train", "jump", *start, *gains_options, *out]
+    else:
+        use = ["pronk", "trial", policy]
+    curves = ["tensorboard", "--logdir", str(folder)]
+    return [shlex.join(evaluate), shlex.join(use), shlex.join(curves)]

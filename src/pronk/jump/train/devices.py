@@ -15,7 +15,7 @@ from typing import Any
 
 from pronk.errors import PronkError
 
-_MODULES = (
+KERNEL_MODULES = (
     "smooth",
     "sensor",
     "passive",
@@ -25,7 +25,8 @@ _MODULES = (
     "support",
     "constraint",
 )
-"""Of MuJoCo Warp, launched in every step of every model, the longest to compile first."""
+"""Modules of MuJoCo Warp that are launched in every step of every model, the longest to compile
+first."""
 
 
 def require_extra() -> None:
@@ -39,21 +40,31 @@ def require_extra() -> None:
 
 
 def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[str, ...]:
-    """The GPUs to compute on, one a process, as `CUDA_VISIBLE_DEVICES` names them; () is the CPU.
+    """Find the GPUs to compute on, one a process.
 
-    `requested` is `auto`, `cpu` or `cuda`; `gpu_ids` are numbers of the visible GPUs, as in `0,1`,
-    or `all`, the first alone if None. A PronkError if there is no such GPU.
+    Args:
+        requested: `auto`, `cpu` or `cuda`.
+        gpu_ids: Numbers of the visible GPUs, as in `0,1`, or `all`; None for the first alone.
+
+    Returns:
+        The GPUs as `CUDA_VISIBLE_DEVICES` names them; empty for the CPU.
+
+    Raises:
+        PronkError: There is no such GPU.
     """
-    words = [] if gpu_ids is None else [word.strip() for word in gpu_ids.split(",")]
-    numbers = all(word.isdigit() for word in words)
-    if words != ["all"] and not (numbers and len(set(words)) == len(words)):
+    words = []
+    if gpu_ids is not None:
+        words = [word.strip() for word in gpu_ids.split(",")]
+    are_numbers = all(word.isdigit() for word in words)
+    are_different = len(set(words)) == len(words)
+    if words != ["all"] and not (are_numbers and are_different):
         raise PronkError(f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all.")
     if requested == "cpu":
         if words:
             raise PronkError(f"--gpu-ids {gpu_ids} goes with a GPU; leave it or --device cpu out.")
         return ()
-    found = visible_gpus()
-    if not found:
+    gpus = visible_gpus()
+    if not gpus:
         if requested == "cuda" or words:
             raise PronkError(
                 "no GPU was found (PyTorch sees none; CUDA_VISIBLE_DEVICES is "
@@ -62,29 +73,38 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
             )
         return ()
     if words == ["all"]:
-        return found
-    chosen = [int(word) for word in words] or [0]
-    if max(chosen) >= len(found):
+        return gpus
+    numbers = [int(word) for word in words] or [0]
+    if max(numbers) >= len(gpus):
         raise PronkError(
-            f"--gpu-ids {gpu_ids}: this host has {len(found)} visible GPU(s), numbered 0 to "
-            f"{len(found) - 1}."
+            f"--gpu-ids {gpu_ids}: this host has {len(gpus)} visible GPU(s), numbered 0 to "
+            f"{len(gpus) - 1}."
         )
-    return tuple(found[i] for i in chosen)
+    return tuple(gpus[number] for number in numbers)
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """The GPUs that PyTorch may use, as `CUDA_VISIBLE_DEVICES` names them."""
+    """Return the GPUs that PyTorch may use, as `CUDA_VISIBLE_DEVICES` names them."""
     import torch
 
     count = torch.cuda.device_count()
-    every = ",".join(map(str, range(count)))
-    named = os.environ.get("CUDA_VISIBLE_DEVICES", every).split(",")
+    all_numbers = ",".join(str(number) for number in range(count))
+    names = os.environ.get("CUDA_VISIBLE_DEVICES", all_numbers).split(",")
+    gpus = [name.strip() for name in names if name.strip()]
     # The variable may name more than there are.
-    return tuple(word.strip() for word in named if word.strip())[:count]
+    return tuple(gpus[:count])
 
 
 def device_facts(device: str, count: int = 1) -> dict[str, Any]:
-    """Name of a device, `cpu` or `cuda`; of GPUs their number and CUDA's version."""
+    """Describe a device for a record.
+
+    Args:
+        device: `cpu` or `cuda`.
+        count: Number of GPUs.
+
+    Returns:
+        Its kind and name; of GPUs their number and CUDA's version, of a CPU the number of cores.
+    """
     if device == "cuda":
         import torch
 
@@ -108,7 +128,7 @@ def compile_kernels(device: str) -> None:
     import warp as wp
 
     modules = []
-    for name in _MODULES:
+    for name in KERNEL_MODULES:
         # Another version of MuJoCo Warp may have no such module.
         with contextlib.suppress(ImportError):
             import_module(f"mujoco_warp._src.{name}")
@@ -116,16 +136,17 @@ def compile_kernels(device: str) -> None:
     wp.force_load(device=device, modules=modules, max_workers=os.cpu_count() or 1)
 
 
-def check_cuda_graphs(simulation: Any) -> str | None:
-    """A warning if mjlab's simulation on a GPU runs without CUDA graphs."""
-    if simulation.use_cuda_graph:
+def check_cuda_graphs(simulation: Any, device: str) -> str | None:
+    """Return a warning if mjlab's simulation runs on a GPU without CUDA graphs."""
+    if device == "cpu" or simulation.use_cuda_graph:
         return None
     import warp as wp
 
     driver = wp.get_cuda_driver_version()
     version = "unknown" if driver is None else ".".join(str(part) for part in driver)
+    memory_pools = "on" if wp.is_mempool_enabled(simulation.wp_device) else "off"
     return (
         "this GPU runs without CUDA graphs and is about six times slower than it could be: its "
         f"driver supports CUDA {version} (12.4 or newer is needed) and memory pools are "
-        f"{'on' if wp.is_mempool_enabled(simulation.wp_device) else 'off'} (they must be on)."
+        f"{memory_pools} (they must be on)."
     )

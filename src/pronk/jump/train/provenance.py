@@ -11,14 +11,10 @@ walk.onnx, policy.onnx               the policy after phase 1 and the last one
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -50,49 +46,40 @@ class RunFolder:
         return self.path / "gains.yaml"
 
     def checkpoint(self) -> Path:
-        """The last numbered checkpoint; ArtefactError if there is none."""
-        found = checkpoint.latest(self.path)
-        if found is None:
+        """Return the last numbered checkpoint; ArtefactError if there is none."""
+        path = checkpoint.latest(self.path)
+        if path is None:
             raise ArtefactError(
                 f"{self.path}: no checkpoints in it; expected the folder of a run, a checkpoint, "
                 "or an exported policy.onnx."
             )
-        return found
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other processes from training in this folder inside the block."""
-        handle = os.open(self.path, os.O_RDONLY)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(handle)
-            raise PronkError(
-                f"--out {self.path}: another process is training in it; wait for it, or give "
-                "another folder."
-            ) from None
-        try:
-            yield
-        finally:
-            os.close(handle)
+        return path
 
     def check_fresh(self) -> None:
         """Refuse a folder that already holds something, or a file."""
         if self.path.is_file():
             raise PronkError(f"--out {self.path}: is a file; expected a folder, new or empty.")
-        inside = sorted(p.name for p in self.path.iterdir()) if self.path.is_dir() else []
-        if inside:
-            names = ", ".join(inside[:3]) + (", ..." if len(inside) > 3 else "")
+        if not self.path.is_dir():
+            return
+        names = sorted(path.name for path in self.path.iterdir())
+        if names:
+            listed = ", ".join(names[:3])
+            if len(names) > 3:
+                listed += ", ..."
             raise PronkError(
-                f"--out {self.path}: is not empty ({names}); give --resume to continue the run in "
+                f"--out {self.path}: is not empty ({listed}); give --resume to continue the run in "
                 "it, or another folder."
             )
 
     def read(self) -> dict[str, Any]:
-        """The provenance; ArtefactError if there is none or it is damaged or of another schema."""
+        """Read the provenance.
+
+        Raises:
+            ArtefactError: There is none, or it is damaged or of another schema.
+        """
         path = self.provenance
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            record = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise ArtefactError(
                 f"{self.path} holds no run (no {path.name}); leave --resume out to begin one."
@@ -100,61 +87,57 @@ class RunFolder:
         except (OSError, ValueError, RecursionError) as error:
             text = f"{path}: cannot be read as JSON ({type(error).__name__})."
             raise ArtefactError(text) from error
-        schema = found.get("schema") if isinstance(found, dict) else type(found).__name__
+        schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
         if schema != SCHEMA:
             raise ArtefactError(f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r}.")
-        return found
+        return record
 
-    @contextmanager
-    def changed(self) -> Iterator[dict[str, Any]]:
-        """Read the provenance, let the block change it, and write it."""
-        found = self.read()
-        yield found
-        self.write(found)
-
-    def write(self, provenance: dict[str, Any]) -> None:
+    def write(self, record: dict[str, Any]) -> None:
         """Write the provenance, whole or not at all."""
-        write_text(self.provenance, json.dumps(provenance, indent=2, allow_nan=False) + "\n")
+        write_text(self.provenance, json.dumps(record, indent=2, allow_nan=False) + "\n")
 
 
 def new_session() -> dict[str, Any]:
-    """One start of a run: now, by this command, with what is installed."""
+    """Describe one start of a run: now, by this command, with what is installed."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "start": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": None,
         "stopped": "",
         "device": None,
-        "build_s": None,
         "versions": versions(),
         "git": git_state(),
     }
 
 
-def changed_versions(provenance: dict[str, Any]) -> list[str]:
-    """Packages in other versions than when the run was last started, as text."""
-    last = provenance["sessions"][-1]["versions"]
-    return [
-        f"{name} was {last.get(name)} and is {version}"
-        for name, version in versions().items()
-        if last.get(name) != version
-    ]
+def changed_versions(record: dict[str, Any]) -> list[str]:
+    """List packages in other versions than when the run was last started, as text."""
+    versions_before = record["sessions"][-1]["versions"]
+    changes = []
+    for name, version in versions().items():
+        version_before = versions_before.get(name)
+        if version_before != version:
+            changes.append(f"{name} was {version_before} and is {version}")
+    return changes
 
 
 def git_state() -> dict[str, Any] | None:
-    """Commit of pronk's sources and whether they were changed since; None outside git.
+    """Return the commit of pronk's sources and whether they were changed since; None outside git.
 
     An installed pronk may lie inside another repository; then that is not its commit.
     """
+    folder = str(Path(pronk.__file__).parent)
 
     def git(*words: str) -> str:
-        command = ["git", "-C", str(Path(pronk.__file__).parent), *words]
-        found = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
-        return found.stdout.strip()
+        process = subprocess.run(
+            ["git", "-C", folder, *words], capture_output=True, text=True, timeout=20, check=True
+        )
+        return process.stdout.strip()
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")
-        commit, changed = git("rev-parse", "HEAD"), git("status", "--porcelain", "--", ".")
-        return {"commit": commit, "changed": bool(changed)}
+        commit = git("rev-parse", "HEAD")
+        changed_files = git("status", "--porcelain", "--", ".")
     except (OSError, subprocess.SubprocessError):
         return None
+    return {"commit": commit, "changed": changed_files != ""}

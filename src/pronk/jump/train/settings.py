@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import tyro
 
 from pronk.errors import PronkError
 from pronk.jump.train.phases import TASKS
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceSettings:
+    """The devices that a run computes on."""
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: a GPU if there is one; the CPU is for tests."""
+    gpu_ids: str | None = None
+    """GPUs of this host, as in 0,1, or all; 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +35,7 @@ class TrainSettings:
     robot: str | None = None
     """Name or robot.yaml of a robot with a task; mini_cheetah."""
     gains: str | None = None
-    """gains.yaml of `pronk match`, or naive: the gains of the real drives as they are."""
+    """gains.yaml of `pronk match`, or naive: the nominal gains of the real drives."""
     ranges_from: Path | None = None
     """With naive gains: the gains.yaml whose ranges and delay are used."""
     init_checkpoint: Path | None = None
@@ -33,15 +43,14 @@ class TrainSettings:
     envs: int | None = None
     """Robots on each device; 4096."""
     seed: int | None = None
-    """Of all draws; 1. Process r of several draws from seed + r."""
+    """Seed of all draws; 1. Process r of several draws from seed + r."""
     phase: tuple[str, ...] = ()
     """PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."""
     ellipsoid: bool | None = None
     """Draw gains from each group's ellipsoid, or its box; box."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """auto: a GPU if there is one; the CPU is for tests."""
-    gpu_ids: str | None = None
-    """GPUs of this host, as in 0,1, or all; 0."""
+    devices: Annotated[DeviceSettings, tyro.conf.arg(name="")] = field(
+        default_factory=DeviceSettings
+    )
     resume: bool = False
     """Continue the run in --out; options left out are those of the run."""
     save_interval: int = 50
@@ -53,13 +62,9 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and options that do not go together."""
-        for option, value, least in (
-            ("envs", self.envs, 2),
-            ("seed", self.seed, 0),
-            ("save-interval", self.save_interval, 1),
-        ):
-            if value is not None and not least <= value < 2**31:
-                raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
+        self._check_whole_number("envs", self.envs, minimum=2)
+        self._check_whole_number("seed", self.seed, minimum=0)
+        self._check_whole_number("save-interval", self.save_interval, minimum=1)
         if self.minutes is not None and not self.minutes > 0.0:
             raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
         if self.ranges_from is not None and self.gains not in (None, "naive"):
@@ -72,68 +77,118 @@ class TrainSettings:
                 f"--init-checkpoint {self.init_checkpoint} goes with jump; {self.task} begins with "
                 "random weights."
             )
-        self.iterations  # noqa: B018 (checks them)
+        _ = self.iterations  # checks the phases
+
+    def _check_whole_number(self, option: str, value: int | None, minimum: int) -> None:
+        """Refuse a number out of range."""
+        if value is not None and not minimum <= value < 2**31:
+            raise PronkError(f"--{option} is {value}; expected {minimum} or more, below 2^31.")
 
     @property
     def iterations(self) -> Mapping[str, int]:
         """PPO iterations of each phase; `walk` of the task jump is those of the walking policy."""
-        known = {n: count for n, count in TASKS[self.task].items() if count > 0}
+        iterations = dict(TASKS[self.task])
+        allowed = [name for name, count in iterations.items() if count > 0]
         if self.task == "jump":
-            del known["walk"]
-        given: dict[str, int] = {}
+            allowed.remove("walk")
+        changed: set[str] = set()
         for entry in self.phase:
             name, _, count = entry.partition("=")
             if not (name and count.isdigit()):
                 raise PronkError(f"--phase {entry!r}: expected PHASE=ITERATIONS, as in walk=300.")
-            if name not in known:
+            if name not in allowed:
                 raise PronkError(
-                    f"{self.task} has no phase {name!r}; its phases are {', '.join(known)}."
+                    f"{self.task} has no phase {name!r}; its phases are {', '.join(allowed)}."
                 )
-            if name in given:
+            if name in changed:
                 raise PronkError(f"--phase {name} is given twice; once is enough.")
             if int(count) < 1:
                 raise PronkError(f"phase {name} has {count} iterations; expected 1 or more.")
-            given[name] = int(count)
-        return {**TASKS[self.task], **given}
+            changed.add(name)
+            iterations[name] = int(count)
+        return iterations
 
     @property
     def gains_file(self) -> Path | None:
         """The gains.yaml that is read, if any."""
-        return self.ranges_from if self.gains in (None, "naive") else Path(self.gains)
+        if self.gains in (None, "naive"):
+            return self.ranges_from
+        return Path(self.gains)
 
     def completed(self) -> Self:
-        """With the defaults of a new run in place of None; refuses what a new run lacks."""
+        """Return them with the defaults of a new run in place of None.
+
+        Raises:
+            PronkError: Something is left out that a new run needs.
+        """
         if self.gains is None:
             raise PronkError(
-                "a new run needs --gains: the gains.yaml of `pronk match`, or naive for the gains "
-                "of the real drives as they are."
+                "a new run needs --gains: the gains.yaml of `pronk match`, or naive for the "
+                "nominal gains of the real drives."
             )
         if self.task == "jump" and self.init_checkpoint is None:
             raise PronkError(
                 "jump needs --init-checkpoint: the folder of a walking run, or one of its "
                 "checkpoints; `pronk train all` does both."
             )
-        defaults: Mapping[str, Any]
-        defaults = {"robot": "mini_cheetah", "envs": 4096, "seed": 1, "ellipsoid": False}
-        return replace(self, **{n: v for n, v in defaults.items() if getattr(self, n) is None})
+        return replace(
+            self,
+            robot="mini_cheetah" if self.robot is None else self.robot,
+            envs=4096 if self.envs is None else self.envs,
+            seed=1 if self.seed is None else self.seed,
+            ellipsoid=False if self.ellipsoid is None else self.ellipsoid,
+        )
 
     def resumed(self, stored: Mapping[str, Any]) -> Self:
-        """With the values of the run, as of `stored_values`; another value of it is refused."""
+        """Return them with the values of the run that is continued.
+
+        Args:
+            stored: `stored_values` of the run.
+
+        Raises:
+            PronkError: An option has another value than the run.
+        """
         for name, value in self.stored_values().items():
-            if value and value != stored[name]:
+            is_given = value is not None and value != []
+            if is_given and value != stored[name]:
+                stored_text = "none" if stored[name] is None else stored[name]
                 raise PronkError(
                     f"--resume: --{name.replace('_', '-')} is {value}, but the run in {self.out} "
-                    f"has {'none' if stored[name] is None else stored[name]}; leave it out to "
-                    "continue that run, or give a new --out."
+                    f"has {stored_text}; leave it out to continue that run, or give a new --out."
                 )
-        values: dict[str, Any] = {**stored, "phase": tuple(stored["phase"])}
-        for name in ("ranges_from", "init_checkpoint"):
-            values[name] = values[name] and Path(values[name])
-        return replace(self, **values)
+        return replace(
+            self,
+            task=stored["task"],
+            robot=stored["robot"],
+            gains=stored["gains"],
+            ranges_from=_optional_path(stored["ranges_from"]),
+            init_checkpoint=_optional_path(stored["init_checkpoint"]),
+            envs=stored["envs"],
+            seed=stored["seed"],
+            ellipsoid=stored["ellipsoid"],
+            phase=tuple(stored["phase"]),
+        )
 
     def stored_values(self) -> dict[str, Any]:
-        """What decides the result of a run, as JSON holds it."""
-        names = ("task", "robot", "gains", "ranges_from", "init_checkpoint", "envs", "seed")
-        values = {name: getattr(self, name) for name in (*names, "ellipsoid")}
-        stored = {n: str(v) if isinstance(v, Path) else v for n, v in values.items()}
-        return {**stored, "phase": list(self.phase)}
+        """Return what decides the result of a run, as JSON holds it."""
+        return {
+            "task": self.task,
+            "robot": self.robot,
+            "gains": self.gains,
+            "ranges_from": _optional_text(self.ranges_from),
+            "init_checkpoint": _optional_text(self.init_checkpoint),
+            "envs": self.envs,
+            "seed": self.seed,
+            "ellipsoid": self.ellipsoid,
+            "phase": list(self.phase),
+        }
+
+
+def _optional_path(text: str | None) -> Path | None:
+    """Return a path, or None where there is none."""
+    return None if text is None else Path(text)
+
+
+def _optional_text(path: Path | None) -> str | None:
+    """Return a path as text, or None where there is none."""
+    return None if path is None else str(path)

@@ -20,17 +20,27 @@ from pronk.files import written_whole
 from pronk.jump.train.rl.networks import JUMP_WEIGHT
 
 NETWORKS = ("actor_state_dict", "critic_state_dict")
+"""Entries of a checkpoint with the networks."""
 OPTIMIZERS = ("optimizer_state_dict", "estimator_optimizer_state_dict")
+"""Entries of a checkpoint with the optimizers."""
 
 
 def write(path: Path, state: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
-    with written_whole(path) as aside:
-        torch.save(dict(state), aside)
+    with written_whole(path) as temporary_path:
+        torch.save(dict(state), temporary_path)
 
 
 def read(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint of `pronk train` or mjlab's `train`; ArtefactError for any other file."""
+    """Read a checkpoint of `pronk train` or mjlab's `train`.
+
+    Args:
+        path: The file.
+        device: Device of the tensors.
+
+    Raises:
+        ArtefactError: Any other file.
+    """
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:
@@ -40,8 +50,10 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
             f"{path}: not a checkpoint of pronk ({type(error).__name__}); expected a model_*.pt of "
             "`pronk train`."
         ) from error
-    needed = (*NETWORKS, *OPTIMIZERS, "iter", "infos")
-    missing = [key for key in needed if not isinstance(state, dict) or key not in state]
+    missing = []
+    for key in (*NETWORKS, *OPTIMIZERS, "iter", "infos"):
+        if not isinstance(state, dict) or key not in state:
+            missing.append(key)
     if missing:
         raise ArtefactError(
             f"{path}: a checkpoint without {', '.join(missing)}; expected one of `pronk train`."
@@ -50,30 +62,49 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def latest(folder: Path) -> Path | None:
-    """The numbered checkpoint of the highest iteration in a folder; None if there is none."""
-    return next(reversed(numbered(folder)), None)
+    """Return the numbered checkpoint of the highest iteration in a folder; None without one."""
+    paths = numbered(folder)
+    return paths[-1] if paths else None
 
 
 def numbered(folder: Path) -> list[Path]:
-    """All numbered checkpoints in a folder, `model_ITERATION.pt`, in order."""
-    found = [path for path in folder.glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
-    return sorted(found, key=lambda path: int(path.stem.removeprefix("model_")))
+    """Return all numbered checkpoints in a folder, `model_ITERATION.pt`, in order."""
+    paths = [path for path in folder.glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
+    return sorted(paths, key=_iteration)
+
+
+def _iteration(path: Path) -> int:
+    """Return the iteration in the name of a numbered checkpoint."""
+    return int(path.stem.removeprefix("model_"))
 
 
 def jumps(state: Mapping[str, Any]) -> bool:
-    """Whether the actor of a checkpoint uses its jump input: whether it has weights but zero."""
-    actor = state["actor_state_dict"]
-    return any(bool(actor[name].any()) for name in actor if name.endswith(JUMP_WEIGHT))
+    """Return whether the actor of a checkpoint uses its jump input: its weights are not zero."""
+    for name, weight in state["actor_state_dict"].items():
+        if name.endswith(JUMP_WEIGHT) and bool(weight.any()):
+            return True
+    return False
 
 
 def not_finite(tree: Any, name: str = "") -> str | None:
-    """Path of the first tensor with a number that is not finite; None if there is none."""
+    """Find a number that is not finite in nested mappings and sequences of tensors.
+
+    Args:
+        tree: The mappings, sequences and tensors; anything else counts as finite.
+        name: Path of `tree` in what contains it.
+
+    Returns:
+        Path of the first tensor with such a number; None if there is none.
+    """
     if isinstance(tree, Tensor):
         return None if bool(tree.isfinite().all()) else name
-    inside: Any = ()
+    entries: Any = ()
     if isinstance(tree, Mapping):
-        inside = tree.items()
-    elif isinstance(tree, (list, tuple)):
-        inside = enumerate(tree)
-    found = (not_finite(value, f"{name}/{key}" if name else str(key)) for key, value in inside)
-    return next((path for path in found if path is not None), None)
+        entries = tree.items()
+    elif isinstance(tree, list | tuple):
+        entries = enumerate(tree)
+    for key, value in entries:
+        path = not_finite(value, f"{name}/{key}" if name else str(key))
+        if path is not None:
+            return path
+    return None

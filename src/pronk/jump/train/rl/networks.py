@@ -30,6 +30,8 @@ from pronk.policy.observation import (
 
 JUMP_WEIGHT = "jump_weight"
 """Last part of the name of a jump input's weights in a network's state."""
+ESTIMATOR_HIDDEN_DIMS = (256, 128)
+"""Sizes of the estimator's hidden layers (paper N1)."""
 
 Observations = TensorDict | Mapping[str, Tensor]
 """Groups of observations by name, each (..., size)."""
@@ -46,7 +48,7 @@ class JumpCriticCfg(RslRlModelCfg):
 
 @dataclass
 class EstimatorActorCfg(JumpCriticCfg):
-    """Configuration of the actor, which is as large, and the estimator in it."""
+    """Configuration of the actor, which is as large, with the estimator in it."""
 
     distribution_cfg: dict[str, Any] | None = field(
         default_factory=lambda: {
@@ -55,8 +57,6 @@ class EstimatorActorCfg(JumpCriticCfg):
             "std_type": "scalar",
         }
     )
-    estimator_hidden_dims: tuple[int, ...] = (256, 128)
-    """Of the estimator (paper N1)."""
     class_name: str = "pronk.jump.train.rl.networks:EstimatorActor"
 
 
@@ -83,9 +83,21 @@ class JumpLinear(nn.Linear):
         jump = x[..., self.in_features :]
         return super().forward(narrow) + nn.functional.linear(jump, self.jump_weight)
 
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        state.setdefault(f"{prefix}{JUMP_WEIGHT}", torch.zeros_like(self.jump_weight))
-        super()._load_from_state_dict(state, prefix, *rest)
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Load the weights, `jump_weight` as zeros where the state has none."""
+        state_dict.setdefault(f"{prefix}{JUMP_WEIGHT}", torch.zeros_like(self.jump_weight))
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
 
 
 class RolloutNormalization(EmpiricalNormalization):
@@ -112,7 +124,15 @@ class RolloutNormalization(EmpiricalNormalization):
 
 
 def average(value: Tensor, world_size: int) -> Tensor:
-    """Mean of `value` over the processes, in place; every one must call with the same shape."""
+    """Average a tensor over the processes, in place.
+
+    Args:
+        value: The tensor; every process must call with one of the same shape.
+        world_size: Number of processes.
+
+    Returns:
+        The same tensor.
+    """
     if world_size > 1:
         torch.distributed.all_reduce(value)
         value /= world_size
@@ -120,14 +140,34 @@ def average(value: Tensor, world_size: int) -> Tensor:
 
 
 class JumpModel(MLPModel):
-    """An MLP over a normalized group and a raw jump group behind it."""
+    """An MLP over a normalized group of observations and a raw jump group behind it."""
 
     group: ClassVar[str]
     jump_group: ClassVar[str]
     jump_size: int
 
-    def __init__(self, *args: Any, **cfg: Any) -> None:
-        super().__init__(*args, **cfg)
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        hidden_dims: Sequence[int] = (1024, 512, 256),
+        activation: str = "elu",
+        obs_normalization: bool = True,
+        distribution_cfg: dict[str, Any] | None = None,
+    ) -> None:
+        """Build the network; arguments are those of `rsl_rl.models.MLPModel`."""
+        super().__init__(
+            obs,
+            obs_groups,
+            obs_set,
+            output_dim,
+            hidden_dims,
+            activation,
+            obs_normalization,
+            distribution_cfg,
+        )
         if self.obs_normalization:
             self.obs_normalizer = RolloutNormalization(self.obs_dim - self.jump_size)
         self.mlp[0] = JumpLinear(self.mlp[0], self.jump_size)
@@ -135,6 +175,7 @@ class JumpModel(MLPModel):
     def _get_obs_dim(
         self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str
     ) -> tuple[list[str], int]:
+        """Return the groups that the network reads and the number of their numbers."""
         groups, size = super()._get_obs_dim(obs, obs_groups, obs_set)
         if tuple(groups) != (self.group, self.jump_group):
             raise PronkError(
@@ -147,11 +188,11 @@ class JumpModel(MLPModel):
     def get_latent(
         self, obs: Observations, masks: Tensor | None = None, hidden_state: Any = None
     ) -> Tensor:
-        """The network's input."""
+        """Return the network's input, the normalized group and the jump group."""
         return torch.cat([self.obs_normalizer(obs[self.group]), obs[self.jump_group]], dim=-1)
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """No-op: rsl_rl calls it in every step; see `learn_normalization`."""
+        """Do nothing: rsl_rl calls it in every step; see `learn_normalization`."""
 
     def learn_normalization(self, obs: Observations, world_size: int = 1) -> None:
         """Update the statistics with the observations of a rollout."""
@@ -167,27 +208,32 @@ class Estimator(nn.Module):
     normalized measurement, then the jump input, (..., 102 + jump_size).
     """
 
-    def __init__(self, jump_size: int = 1, hidden_dims: Sequence[int] = (256, 128)) -> None:
+    def __init__(self, jump_size: int = 1) -> None:
         super().__init__()
-        self.mlp = MLP(len(ESTIMATOR_INDICES) + jump_size, ESTIMATE_SIZE, list(hidden_dims), "elu")
+        input_size = len(ESTIMATOR_INDICES) + jump_size
+        self.mlp = MLP(input_size, ESTIMATE_SIZE, list(ESTIMATOR_HIDDEN_DIMS), "elu")
         self.mlp[0] = JumpLinear(self.mlp[0], jump_size)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Contact probabilities (..., 4), velocity in the trunk's frame [m/s] (..., 3)."""
+        """Return contact probabilities (..., 4) and the velocity in the trunk's frame [m/s]."""
         contact, velocity = self.mlp(x).split(list(ESTIMATE.values()), dim=-1)
         return torch.sigmoid(contact), velocity
 
     def losses(self, x: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean cross entropy of the contacts [nat], mean squared velocity error [m^2/s^2].
+        """Compute the losses of a batch.
 
-        `target` has contacts (0 or 1), then velocity, (N, 7).
+        Args:
+            x: Inputs, (N, 102 + jump_size).
+            target: True contacts (0 or 1), then the true velocity [m/s], (N, 7).
+
+        Returns:
+            Mean cross entropy of the contacts [nat] and mean squared velocity error [m^2/s^2].
         """
         contact, velocity = self.mlp(x).split(list(ESTIMATE.values()), dim=-1)
         true_contact, true_velocity = target.split(list(ESTIMATE.values()), dim=-1)
-        return (
-            nn.functional.binary_cross_entropy_with_logits(contact, true_contact),
-            nn.functional.mse_loss(velocity, true_velocity),
-        )
+        contact_loss = nn.functional.binary_cross_entropy_with_logits(contact, true_contact)
+        velocity_loss = nn.functional.mse_loss(velocity, true_velocity)
+        return contact_loss, velocity_loss
 
 
 class EstimatorActor(JumpModel):
@@ -197,29 +243,52 @@ class EstimatorActor(JumpModel):
     jump_group = "jump"
 
     def __init__(
-        self, *args: Any, estimator_hidden_dims: Sequence[int] = (256, 128), **cfg: Any
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        hidden_dims: Sequence[int] = (1024, 512, 256),
+        activation: str = "elu",
+        obs_normalization: bool = True,
+        distribution_cfg: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(*args, **cfg)
-        if self.obs_dim - self.jump_size != MEASURED_SIZE:
+        """Build both networks; arguments are those of `rsl_rl.models.MLPModel`."""
+        super().__init__(
+            obs,
+            obs_groups,
+            obs_set,
+            output_dim,
+            hidden_dims,
+            activation,
+            obs_normalization,
+            distribution_cfg,
+        )
+        measured_size = self.obs_dim - self.jump_size
+        if measured_size != MEASURED_SIZE:
             raise PronkError(
-                f"the measured vector has {self.obs_dim - self.jump_size} numbers; expected"
-                f" {MEASURED_SIZE}, as in pronk.policy.observation."
+                f"the measured vector has {measured_size} numbers; expected {MEASURED_SIZE}, as in "
+                "pronk.policy.observation."
             )
-        self.estimator = Estimator(self.jump_size, estimator_hidden_dims)
-        for name, indices in (("actor", ACTOR_INDICES), ("estimator", ESTIMATOR_INDICES)):
-            self.register_buffer(f"_{name}_indices", torch.tensor(indices), persistent=False)
+        self.estimator = Estimator(self.jump_size)
+        actor_indices = torch.tensor(ACTOR_INDICES)
+        estimator_indices = torch.tensor(ESTIMATOR_INDICES)
+        self.register_buffer("_actor_indices", actor_indices, persistent=False)
+        self.register_buffer("_estimator_indices", estimator_indices, persistent=False)
 
     def _get_latent_dim(self) -> int:
+        """Return the size of the acting network's input."""
         return ESTIMATE_SIZE + len(ACTOR_INDICES) + self.jump_size
 
     def get_latent(
         self, obs: Observations, masks: Tensor | None = None, hidden_state: Any = None
     ) -> Tensor:
-        """The acting network's input: estimate 7, current measurement 45, jump input."""
+        """Return the acting network's input: estimate 7, current measurement 45, jump input."""
         measured = self.obs_normalizer(obs[self.group])
         with torch.no_grad():
-            estimate = self.estimator(self._estimator_input(measured, obs))
-        return torch.cat([*estimate, measured[..., self._actor_indices], obs[self.jump_group]], -1)
+            contact, velocity = self.estimator(self._estimator_input(measured, obs))
+        current = measured[..., self._actor_indices]
+        return torch.cat([contact, velocity, current, obs[self.jump_group]], -1)
 
     def limit_noise(self, largest: float) -> None:
         """Lower the standard deviations of the actions to `largest` at most."""
@@ -227,14 +296,15 @@ class EstimatorActor(JumpModel):
             self.distribution.std_param.clamp_(max=largest)
 
     def estimator_input(self, obs: Observations) -> Tensor:
-        """The estimator's input, (..., 102 + jump)."""
+        """Return the estimator's input for observations, (..., 102 + jump_size)."""
         return self._estimator_input(self.obs_normalizer(obs[self.group]), obs)
 
     def estimate(self, obs: Observations) -> tuple[Tensor, Tensor]:
-        """The estimator's output for observations."""
+        """Return the estimator's output for observations."""
         return self.estimator(self.estimator_input(obs))
 
     def _estimator_input(self, measured: Tensor, obs: Observations) -> Tensor:
+        """Return the estimator's input from the normalized measurement."""
         return torch.cat([measured[..., self._estimator_indices], obs[self.jump_group]], dim=-1)
 
 

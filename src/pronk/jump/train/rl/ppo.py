@@ -8,13 +8,14 @@ changes before PPO has used them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from mjlab.rl import RslRlPpoAlgorithmCfg
 from rsl_rl.algorithms import PPO
-from rsl_rl.storage import RolloutStorage
+from rsl_rl.extensions import Symmetry
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
@@ -24,23 +25,52 @@ TARGET_GROUP = "estimator_target"
 """The group of observations that the estimator is trained on."""
 
 
+@dataclass(kw_only=True)
+class EstimatorTrainingCfg:
+    """Configuration of the estimator's training."""
+
+    learning_rate: float = 1e-3
+    """Learning rate of the estimator's own Adam; a phase sets it."""
+    epochs: int = 2
+    """Passes of the estimator over the samples of a rollout."""
+    mini_batches: int = 12
+    """Steps of the estimator in an epoch."""
+    contact_coef: float = 1.0
+    """Weight of the contacts' cross entropy [nat]."""
+    velocity_coef: float = 1.0
+    """Weight of the velocity's mean squared error [m^2/s^2]."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which nothing would be learned."""
+        if not (self.epochs > 0 and self.mini_batches > 0 and self.learning_rate > 0.0):
+            raise PronkError(
+                f"the estimator has {self.epochs} epochs, {self.mini_batches} mini-batches and a "
+                f"learning rate of {self.learning_rate:g}; expected more than 0 of each."
+            )
+
+
 @dataclass
 class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
     """Configuration of PPO and of the estimator's training."""
 
-    estimator_learning_rate: float = 1e-3
-    """Of the estimator's own Adam; a phase sets it."""
-    estimator_epochs: int = 2
-    """Passes of the estimator over the samples of a rollout."""
-    estimator_mini_batches: int = 12
-    """Steps of the estimator in an epoch."""
-    estimator_contact_coef: float = 1.0
-    """Weight of the contacts' cross entropy [nat]."""
-    estimator_velocity_coef: float = 1.0
-    """Weight of the velocity's mean squared error [m^2/s^2]."""
+    estimator: EstimatorTrainingCfg = field(default_factory=EstimatorTrainingCfg)
+    """Training of the estimator."""
     symmetry_cfg: dict[str, Any] | None = None
     """Arguments of `rsl_rl.extensions.Symmetry`, except its environment; None for none."""
     class_name: str = "pronk.jump.train.rl.ppo:EstimatorPPO"
+
+
+class MirrorAugmentation(Symmetry):
+    """rsl_rl's symmetry extension for data augmentation alone.
+
+    rsl_rl computes the mirror loss also where it is only logged, which is one more pass of the
+    actor over every mini-batch. An update has six passes otherwise (actor and critic, forward, and
+    backward at twice the work), and updates take a third of the training time on a GPU.
+    """
+
+    def compute_loss(self, actor: nn.Module, batch: Any, original_batch_size: int) -> Tensor:
+        """Return zero in place of the mirror loss."""
+        return batch.advantages.new_zeros(())
 
 
 class EstimatorPPO(PPO):
@@ -49,61 +79,77 @@ class EstimatorPPO(PPO):
     _raw_actor: EstimatorActor
     _raw_critic: JumpCritic
     optimizer: torch.optim.Optimizer
+    estimator_cfg: EstimatorTrainingCfg
+    estimator_optimizer: torch.optim.Optimizer
 
-    def __init__(
-        self,
-        actor: EstimatorActor,
-        critic: JumpCritic,
-        storage: RolloutStorage,
-        *,
-        estimator_learning_rate: float,
-        estimator_epochs: int,
-        estimator_mini_batches: int,
-        estimator_contact_coef: float,
-        estimator_velocity_coef: float,
-        **cfg: Any,
-    ) -> None:
-        """Called by rsl_rl with the fields of `EstimatorPpoCfg`."""
-        if TARGET_GROUP not in storage.observations.keys():  # noqa: SIM118 (a TensorDict)
+    @staticmethod
+    def construct_algorithm(
+        obs: TensorDict, env: Any, cfg: dict[str, Any], device: str
+    ) -> EstimatorPPO:
+        """Construct the algorithm, as rsl_rl's runner does.
+
+        Args:
+            obs: Observations of the environment by group.
+            env: The environment, of which the number of robots and of actions is read.
+            cfg: Configuration of the runner; its entry `algorithm` has the fields of
+                `EstimatorPpoCfg`.
+            device: Device of networks and storage.
+
+        Returns:
+            The algorithm.
+
+        Raises:
+            PronkError: An impossible configuration, or observations without a target for the
+                estimator.
+        """
+        groups = [str(name) for name in obs.keys()]  # noqa: SIM118 (a TensorDict)
+        if TARGET_GROUP not in groups:
             raise PronkError(
-                f"the environment gives the groups {', '.join(storage.observations.keys())};"
-                f" the estimator is trained on {TARGET_GROUP!r}."
+                f"the environment gives the groups {', '.join(groups)}; the estimator is trained "
+                f"on {TARGET_GROUP!r}."
             )
-        if not (min(estimator_epochs, estimator_mini_batches) > 0 < estimator_learning_rate):
-            raise PronkError(
-                f"estimator_epochs is {estimator_epochs}, estimator_mini_batches "
-                f"{estimator_mini_batches} and estimator_learning_rate "
-                f"{estimator_learning_rate:g}; expected more than 0."
-            )
-        super().__init__(actor, critic, storage, **cfg)
-        self._augments = self.symmetry is not None and not self.symmetry.use_mirror_loss
-        if self._augments:
-            # rsl_rl computes the mirror loss even where it is only logged: one more pass of the
-            # actor over every mini-batch.
-            self.symmetry.compute_loss = lambda _, batch, rows: batch.advantages.new_zeros(())
-        self.estimator_epochs = estimator_epochs
-        self.estimator_mini_batches = estimator_mini_batches
-        self._coefficients = torch.tensor(
-            [estimator_contact_coef, estimator_velocity_coef], device=self.device
-        ).unbind()
-        # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
-        estimator = list(actor.estimator.parameters())
-        own = set(estimator)
-        others = [p for p in (*actor.parameters(), *critic.parameters()) if p not in own]
+        estimator_cfg = EstimatorTrainingCfg(**cfg["algorithm"].pop("estimator"))
+        # The class that this constructs is the one that the configuration names.
+        algorithm: EstimatorPPO = PPO.construct_algorithm(obs, env, cfg, device)
+        algorithm.separate_estimator(estimator_cfg)
+        symmetry = algorithm.symmetry
+        if symmetry is not None and not symmetry.use_mirror_loss:
+            algorithm.symmetry = MirrorAugmentation(**cfg["algorithm"]["symmetry_cfg"])
+        return algorithm
+
+    def separate_estimator(self, estimator_cfg: EstimatorTrainingCfg) -> None:
+        """Give the estimator an optimizer of its own.
+
+        PPO has put the whole actor, of which the estimator is a part, under its optimizer.
+        """
+        self.estimator_cfg = estimator_cfg
+        estimator_parameters = list(self._raw_actor.estimator.parameters())
+        estimator_ids = {id(parameter) for parameter in estimator_parameters}
+        ppo_parameters = []
+        for model in (self._raw_actor, self._raw_critic):
+            for parameter in model.parameters():
+                if id(parameter) not in estimator_ids:
+                    ppo_parameters.append(parameter)
         # On a GPU the fused kernel steps all parameters at once; PyTorch's default launches a dozen
         # kernels a step.
-        fused: dict[str, Any] = {"fused": True} if estimator[0].is_cuda else {}
-        kind: Any = type(self.optimizer)
-        self.optimizer = kind(others, lr=self.learning_rate, **fused)
-        self.estimator_optimizer = torch.optim.Adam(estimator, lr=estimator_learning_rate, **fused)
+        options: dict[str, Any] = {}
+        if estimator_parameters[0].is_cuda:
+            options["fused"] = True
+        optimizer_class: Any = type(self.optimizer)
+        self.optimizer = optimizer_class(ppo_parameters, lr=self.learning_rate, **options)
+        self.estimator_optimizer = torch.optim.Adam(
+            estimator_parameters, lr=estimator_cfg.learning_rate, **options
+        )
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout; returns mean losses by name.
+        """Learn from the stored rollout.
 
-        PPO's, `estimator_contact` [nat] and `estimator_velocity` [m^2/s^2].
+        Returns:
+            Mean losses by name: PPO's, `estimator_contact` [nat] and `estimator_velocity`
+            [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
-        if self._augments:
+        if isinstance(self.symmetry, MirrorAugmentation):
             del losses["symmetry"]
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
@@ -112,31 +158,40 @@ class EstimatorPPO(PPO):
         return losses
 
     def _update_estimator(self) -> dict[str, float]:
-        estimator, optimizer = self._raw_actor.estimator, self.estimator_optimizer
+        """Take the supervised steps of an iteration; returns the mean losses by name."""
+        cfg = self.estimator_cfg
+        estimator = self._raw_actor.estimator
+        optimizer = self.estimator_optimizer
         parameters = list(estimator.parameters())
         observations = self.storage.observations
         with torch.no_grad():
             inputs = self._raw_actor.estimator_input(observations).flatten(0, 1)
         targets = observations[TARGET_GROUP].flatten(0, 1)
+        coefficients = torch.tensor(
+            [cfg.contact_coef, cfg.velocity_coef], device=self.device
+        ).unbind()
         history: list[Tensor] = []
-        for _ in range(self.estimator_epochs):
+        for _ in range(cfg.epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
-            for rows in order.tensor_split(self.estimator_mini_batches):
-                losses = estimator.losses(inputs[rows], targets[rows])
+            for rows in order.tensor_split(cfg.mini_batches):
+                contact_loss, velocity_loss = estimator.losses(inputs[rows], targets[rows])
                 optimizer.zero_grad()
-                torch.autograd.backward(losses, self._coefficients)
+                torch.autograd.backward((contact_loss, velocity_loss), coefficients)
                 if self.gpu_world_size > 1:
                     gradients = [p.grad for p in parameters if p.grad is not None]
-                    together = nn.utils.parameters_to_vector(gradients)
-                    average(together, self.gpu_world_size)
-                    nn.utils.vector_to_parameters(together, gradients)
+                    gradient_vector = nn.utils.parameters_to_vector(gradients)
+                    average(gradient_vector, self.gpu_world_size)
+                    nn.utils.vector_to_parameters(gradient_vector, gradients)
                 nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 optimizer.step()
-                history += [loss.detach() for loss in losses]
+                history.append(torch.stack((contact_loss, velocity_loss)).detach())
         # PPO clips and reduces the gradients that it finds in the actor: leave none.
         optimizer.zero_grad()
-        contact, velocity = torch.stack(history).view(-1, 2).mean(dim=0).tolist()
-        return {"estimator_contact": contact, "estimator_velocity": velocity}
+        mean_contact_loss, mean_velocity_loss = torch.stack(history).mean(dim=0).tolist()
+        return {
+            "estimator_contact": mean_contact_loss,
+            "estimator_velocity": mean_velocity_loss,
+        }
 
     def set_estimator_rate(self, rate: float) -> None:
         """Set the learning rate of the estimator."""
@@ -154,12 +209,16 @@ class EstimatorPPO(PPO):
             self.estimator_optimizer.state.pop(parameter, None)
 
     def _jump_weights(self) -> set[Tensor]:
-        models = (self._raw_actor, self._raw_critic)
-        named = (pair for model in models for pair in model.named_parameters())
-        return {parameter for name, parameter in named if name.endswith(JUMP_WEIGHT)}
+        """Return the weights of the jump inputs in all networks."""
+        jump_weights = set()
+        for model in (self._raw_actor, self._raw_critic):
+            for name, parameter in model.named_parameters():
+                if name.endswith(JUMP_WEIGHT):
+                    jump_weights.add(parameter)
+        return jump_weights
 
     def save(self) -> dict[str, Any]:
-        """State of the networks and both optimizers."""
+        """Return the state of the networks and both optimizers."""
         state: dict[str, Any] = super().save()
         state["estimator_optimizer_state_dict"] = self.estimator_optimizer.state_dict()
         return state
@@ -170,17 +229,29 @@ class EstimatorPPO(PPO):
         load_cfg: Mapping[str, bool] | None = None,
         strict: bool = True,
     ) -> bool:
-        """Load what `save` gave; `load_cfg` as rsl_rl has it, its `optimizer` means both.
+        """Load what `save` returned.
 
         A state of networks without jump inputs is widened: they get weights of zero, and Adam keeps
         moments and step counts of every weight that was there.
+
+        Args:
+            loaded_dict: The state.
+            load_cfg: Parts to load, as rsl_rl has them; `optimizer` means both optimizers. None
+                for everything.
+            strict: Whether all weights must be there.
+
+        Returns:
+            Whether training continues with the iteration of the state.
         """
         state = dict(loaded_dict)
         if load_cfg is None or load_cfg.get("optimizer"):
-            for name in ("optimizer", "estimator_optimizer"):
-                key = f"{name}_state_dict"
-                state[key] = self._widened(state[key], getattr(self, name))
-            self.estimator_optimizer.load_state_dict(state[key])
+            state["optimizer_state_dict"] = self._widened(
+                state["optimizer_state_dict"], self.optimizer
+            )
+            estimator_state = self._widened(
+                state["estimator_optimizer_state_dict"], self.estimator_optimizer
+            )
+            self.estimator_optimizer.load_state_dict(dict(estimator_state))
         return bool(super().load(state, load_cfg, strict))
 
     def _widened(
@@ -188,10 +259,17 @@ class EstimatorPPO(PPO):
     ) -> Mapping[str, Any]:
         """Number the parameters of an optimizer's state as `optimizer` does."""
         (group,) = narrow["param_groups"]
-        wide, jump = optimizer.param_groups[0]["params"], self._jump_weights()
-        kept = [i for i, parameter in enumerate(wide) if parameter not in jump]
-        if len(group["params"]) != len(kept):
-            return narrow  # of networks that have the inputs, or of others
-        places = dict(zip(group["params"], kept, strict=True))
-        moments = {places[i]: moment for i, moment in narrow["state"].items()}
-        return {"state": moments, "param_groups": [{**group, "params": list(range(len(wide)))}]}
+        parameters = optimizer.param_groups[0]["params"]
+        jump_weights = self._jump_weights()
+        places = []
+        for place, parameter in enumerate(parameters):
+            if parameter not in jump_weights:
+                places.append(place)
+        if len(group["params"]) != len(places):
+            return narrow  # of networks that have the jump inputs, or of other networks
+        place_of = dict(zip(group["params"], places, strict=True))
+        moments = {}
+        for number, moment in narrow["state"].items():
+            moments[place_of[number]] = moment
+        wide_group = {**group, "params": list(range(len(parameters)))}
+        return {"state": moments, "param_groups": [wide_group]}

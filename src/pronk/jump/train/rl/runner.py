@@ -7,107 +7,70 @@ writes the policy, `walk.onnx` and `policy.onnx`, and a checkpoint named after t
 from __future__ import annotations
 
 import math
+import signal
+import statistics
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
-from mjlab.rl import MjlabOnPolicyRunner
-from rsl_rl.utils.logger import Logger
-from torch import Tensor
+from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 
 from pronk.errors import ArtefactError, PronkError
+from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 
-_KEPT = 3
+KEPT_CHECKPOINTS = 3
 """Numbered checkpoints that are kept."""
-_COMPARED = 4096
+COMPARED_OBSERVATIONS = 4096
 """Observations that an exported policy is compared on."""
+PROGRESS_S = 10.0
+"""Shortest time between two lines of progress [s]."""
 
 
-class Stopped(Exception):  # noqa: N818 (a signal, not an error)
-    """Training ends after the present iteration."""
+@dataclass
+class JumpRunnerCfg(RslRlOnPolicyRunnerCfg):
+    """mjlab's configuration of a runner, and what `pronk train` adds."""
 
-
-class DeviceLogger(Logger):
-    """rsl_rl's logger with episode figures summed on the device, copied once an iteration.
-
-    rsl_rl copies returns and lengths of finished episodes to the host in every environment step,
-    and each copy waits for the GPU. Means are over the episodes that ended in the last iterations,
-    100 or more of them.
-    """
-
-    def __init__(self, runner: PronkRunner) -> None:
-        """Take the place of the logger that rsl_rl has given the runner."""
-        self.__dict__.update(vars(runner.logger))
-        self.device = "cpu"
-        """rsl_rl averages the figures of an iteration here."""
-        self._runner = runner
-        self._sums = torch.zeros(3, device=runner.device)
-        """Of the iteration: returns, lengths and number of finished episodes."""
-        self._recent: list[list[float]] = []
-
-    def process_env_step(
-        self,
-        rewards: Tensor,
-        dones: Tensor,
-        extras: dict[str, Any],
-        intrinsic_rewards: Tensor | None = None,
-    ) -> None:
-        """Add the figures of one environment step."""
-        self.ep_extras.append(extras["log"])
-        self.cur_reward_sum += rewards
-        self.cur_episode_length += 1.0
-        ended = dones > 0
-        done = ended.to(rewards.dtype)
-        returns, lengths = self.cur_reward_sum, self.cur_episode_length
-        self._sums += torch.stack([torch.dot(returns, done), torch.dot(lengths, done), done.sum()])
-        returns.masked_fill_(ended, 0.0)
-        lengths.masked_fill_(ended, 0.0)
-
-    def log(self, it: int, *, loss_dict: dict[str, float], **figures: Any) -> None:
-        """Write the figures of an iteration, then let the runner finish it."""
-        self._recent.append(self._sums.tolist())
-        self._sums.zero_()
-        while sum(count for *_, count in self._recent[1:]) >= 100:
-            self._recent.pop(0)
-        returns, lengths, count = (sum(column) for column in zip(*self._recent, strict=True))
-        self.rewbuffer.clear()
-        self.lenbuffer.clear()
-        if count:
-            self.rewbuffer.append(returns / count)
-            self.lenbuffer.append(lengths / count)
-        self.ep_extras[:] = [_means(self.ep_extras)]
-        seconds = figures["collect_time"] + figures["learn_time"]
-        if self.writer is not None:
-            super().log(it, loss_dict=loss_dict, **figures)
-        self.ep_extras.clear()
-        self._runner.finish_iteration(it, loss_dict, seconds)
-
-
-def _means(logs: list[dict[str, Any]]) -> dict[str, Tensor]:
-    """Mean of every figure over the steps that have it."""
-    gathered: dict[str, list[Tensor]] = {}
-    for log in logs:
-        for name, value in log.items():
-            gathered.setdefault(name, []).append(torch.as_tensor(value))
-    return {name: torch.stack(values).double().mean() for name, values in gathered.items()}
+    show_progress: bool = False
+    """Whether a line about the progress is printed now and then, on standard error."""
+    stop_at: float | None = None
+    """Time at which training stops, at a checkpoint [Unix time, s]; None for no limit."""
+    start_sha256: str = ""
+    """Hash of the checkpoint that training began with, for the exported policy's contract."""
 
 
 class PronkRunner(MjlabOnPolicyRunner):
-    """Trains all phases; `current_learning_iteration` counts the finished iterations."""
+    """Trains all phases; `current_learning_iteration` is the number of the iteration under way."""
+
+    current_learning_iteration: int
 
     def __init__(
         self, env: Any, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu"
     ) -> None:
-        """As mjlab makes its runners; the curriculum's iterations must be as long as its own."""
+        """Build algorithm and logger, as mjlab builds its runners.
+
+        Args:
+            env: The wrapped environment.
+            train_cfg: Fields of `JumpRunnerCfg`, or of mjlab's configuration; its iterations must
+                be as long as the curriculum's.
+            log_dir: Folder of the run; None writes nothing.
+            device: Device of the networks.
+
+        Raises:
+            PronkError: Iterations of another length than the curriculum's.
+        """
         StackedRewardManager.install(env.unwrapped)
         self.curriculum = curriculum(env.unwrapped)
         steps = train_cfg["num_steps_per_env"]
@@ -116,50 +79,96 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"num_steps_per_env is {steps}, but the curriculum counts "
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
-        # The environment ends the episode of a robot whose state is not finite.
-        train_cfg["check_for_nan"] = False
         super().__init__(env, train_cfg, log_dir, device)
-        self.logger = DeviceLogger(self)
+        warning = check_cuda_graphs(env.unwrapped.sim, device)
+        if warning is not None:
+            self.note(f"warning: {warning}")
         self.folder = None if log_dir is None else Path(log_dir)
-        self.provenance: dict[str, Any] = {}
-        """Further entries for the provenance in the contract of exported policies."""
         self.phases: dict[str, dict[str, Any]] = {}
         """Figures of the phases that were finished: iterations, seconds, and so on."""
-        self.show_progress = False
-        """Print a line after an iteration, at most one in ten seconds."""
         self.stop_reason = ""
         """If not empty, training ends with a checkpoint after the present iteration."""
-        self.deadline = math.inf
-        """Training stops after the iteration in which `time.monotonic` passes this [s]."""
         self._steps_per_iteration = steps * env.num_envs * self.gpu_world_size
         self._seconds = 0.0
-        self._shown = -math.inf
+        self._shown_at = -math.inf
         self._jumping = False
 
     @property
     def iteration(self) -> int:
-        """Finished iterations by the environment's step counter."""
+        """Number of finished iterations, by the environment's step counter."""
         return int(self.env.unwrapped.common_step_counter) // self.curriculum.steps_per_iteration
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train on, until all iterations are done or `stop_reason` is set."""
+        """Train on, until the last phase is over or `stop_reason` is set.
+
+        This is rsl_rl's loop, with the phase set before every iteration and the checks of
+        `_finish_iteration` behind it. The first SIGINT or SIGTERM ends training after the present
+        iteration.
+
+        Args:
+            num_learning_iterations: Iterations to train, at most.
+            init_at_random_ep_len: Whether the robots begin anywhere in their episodes.
+
+        Raises:
+            PronkError: Learning has diverged.
+        """
         self._begin_iteration()
-        try:
-            super().learn(num_learning_iterations, init_at_random_ep_len)
-        except Stopped:
-            if self.folder is not None and self.gpu_global_rank == 0:
-                self.save(str(self.folder / f"model_{self.current_learning_iteration}.pt"))
-        except (ValueError, RuntimeError) as error:
-            # torch refuses to draw with a standard deviation that is NaN.
-            self._check_finite(self.alg.save(), cause=error)
-            raise
+        if init_at_random_ep_len:
+            self.env.episode_length_buf = torch.randint_like(
+                self.env.episode_length_buf, high=int(self.env.max_episode_length)
+            )
+        obs = self.env.get_observations().to(self.device)
+        self.alg.train_mode()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        self.logger.init_logging_writer()
+        start_it = self.current_learning_iteration
+        total_it = start_it + min(num_learning_iterations, self.curriculum.total - self.iteration)
+        with stop_signals(self):
+            for it in range(start_it, total_it):
+                self.current_learning_iteration = it
+                start = time.time()
+                try:
+                    with torch.inference_mode():
+                        for _ in range(self.cfg["num_steps_per_env"]):
+                            actions = self.alg.act(obs)
+                            # The environment ends the episode of a robot whose state is not finite.
+                            obs, rewards, dones, extras = self.env.step(actions)
+                            self.alg.process_env_step(obs, rewards, dones, extras)
+                            self.logger.process_env_step(rewards, dones, extras)
+                        collect_time = time.time() - start
+                        self.alg.compute_returns(obs)
+                    losses = self.alg.update()
+                except (ValueError, RuntimeError) as error:
+                    # PyTorch refuses to draw with a standard deviation that is NaN.
+                    self._check_finite(self.alg.save(), cause=error)
+                    raise
+                learn_time = time.time() - start - collect_time
+                self.logger.log(
+                    it=it,
+                    start_it=start_it,
+                    total_it=total_it,
+                    collect_time=collect_time,
+                    learn_time=learn_time,
+                    loss_dict=losses,
+                    learning_rate=self.alg.learning_rate,
+                    action_std=self.alg.get_policy().output_std,
+                    rnd_weight=None,
+                )
+                self._finish_iteration(losses, collect_time + learn_time)
+                self._begin_iteration()
+                is_last = it == total_it - 1 or self._stops()
+                if is_last or it % self.cfg["save_interval"] == 0:
+                    self._save_numbered()
+                if is_last:
+                    break
         if hasattr(self.logger.writer, "flush"):
             self.logger.writer.flush()
+        self.logger.stop_logging_writer()
 
     def _begin_iteration(self) -> None:
         """Set the phase of the iteration that begins."""
-        env = self.env.unwrapped
-        env.curriculum_manager.compute()
+        self.env.unwrapped.curriculum_manager.compute()
         name, done = phase_at(self.curriculum.iterations, self.iteration)
         phase = PHASES[name]
         self.alg.entropy_coef = phase.entropy
@@ -169,43 +178,60 @@ class PronkRunner(MjlabOnPolicyRunner):
             self.alg.reset_jump_moments()
         self._jumping = phase.jump
 
-    def finish_iteration(self, it: int, losses: Mapping[str, float], seconds: float) -> None:
-        """Called after every iteration: checks, phase borders, progress, stop."""
+    def _finish_iteration(self, losses: Mapping[str, float], seconds: float) -> None:
+        """Check the losses, finish a phase that is over, and show the progress.
+
+        Args:
+            losses: Mean losses of the iteration by name.
+            seconds: Duration of the iteration [s].
+        """
         for name, value in losses.items():
             if not math.isfinite(value):
                 raise self._diverged(f"the loss {name} is {value}")
         self._seconds += seconds
-        before, _ = phase_at(self.curriculum.iterations, self.iteration - 1)
-        after, done = phase_at(self.curriculum.iterations, self.iteration)
-        if after != before or done == 1.0:
-            self._finish_phase(before)
-        self._begin_iteration()
-        if self.show_progress:
-            self._show_progress(before, seconds)
-        if time.monotonic() > self.deadline and not self.stop_reason:
+        phase_name, _ = phase_at(self.curriculum.iterations, self.iteration - 1)
+        next_phase_name, done = phase_at(self.curriculum.iterations, self.iteration)
+        if next_phase_name != phase_name or done == 1.0:
+            self._finish_phase(phase_name)
+        if self.cfg.get("show_progress"):
+            self._show_progress(phase_name, seconds)
+
+    def _stops(self) -> bool:
+        """Return whether training ends here; if any process stops, all do."""
+        stop_at = self.cfg.get("stop_at")
+        if stop_at is not None and time.time() > stop_at and not self.stop_reason:
             self.stop_reason = "the time given by --minutes is over"
-        stops = torch.tensor(float(bool(self.stop_reason)), device=self.device)
-        if self.is_distributed:  # if any process stops, all do
-            torch.distributed.all_reduce(stops, op=torch.distributed.ReduceOp.MAX)
-        if stops:
-            raise Stopped
+        stops = self.stop_reason != ""
+        if self.is_distributed:
+            any_stops = torch.tensor(float(stops), device=self.device)
+            torch.distributed.all_reduce(any_stops, op=torch.distributed.ReduceOp.MAX)
+            stops = bool(any_stops)
+        return stops
 
     def _show_progress(self, phase: str, seconds: float) -> None:
-        done, total, now = self.iteration, self.curriculum.total, time.monotonic()
-        if now - self._shown < 10.0 and done < total:
+        """Print a line about the progress, unless another was printed a moment ago."""
+        done = self.iteration
+        total = self.curriculum.total
+        now = time.monotonic()
+        if now - self._shown_at < PROGRESS_S and done < total:
             return
-        self._shown = now
+        self._shown_at = now
         episodes = ""
         if self.logger.rewbuffer:
-            reward, length = self.logger.rewbuffer[0], self.logger.lenbuffer[0]
+            reward = statistics.mean(self.logger.rewbuffer)
+            length = statistics.mean(self.logger.lenbuffer)
             episodes = f"reward {reward:.2f}  episode {length:.0f} steps  "
         fraction = float(motion_command(self.env.unwrapped).ranges.fraction)
-        note(
-            self.gpu_global_rank,
+        self.note(
             f"{phase} {done}/{total}  {self._steps_per_iteration / seconds:,.0f} steps/s  "
             f"{episodes}speed range {fraction:.2f}  "
-            f"{timedelta(seconds=round(seconds * (total - done)))} left",
+            f"{timedelta(seconds=round(seconds * (total - done)))} left"
         )
+
+    def note(self, text: str) -> None:
+        """Print a line of the first process on standard error."""
+        if self.gpu_global_rank == 0:
+            print(text, file=sys.stderr, flush=True)  # noqa: T201
 
     # --- Phases ----------------------------------------------------------------------------------
 
@@ -215,7 +241,9 @@ class PronkRunner(MjlabOnPolicyRunner):
             return
         iterations = self.curriculum.iterations[name]
         steps = iterations * self._steps_per_iteration
-        seconds = self._seconds - sum(phase["seconds"] for phase in self.phases.values())
+        seconds = self._seconds
+        for phase in self.phases.values():
+            seconds -= phase["seconds"]
         self.phases[name] = {
             "iterations": iterations,
             "env_steps": steps,
@@ -223,41 +251,63 @@ class PronkRunner(MjlabOnPolicyRunner):
             "steps_per_second": steps / seconds,
         }
         self.save(str(self.folder / f"{name}.pt"))
-        last = self.iteration >= self.curriculum.total
-        if last or name == "walk":
-            path = self.folder / ("policy.onnx" if last else "walk.onnx")
+        is_last = self.iteration >= self.curriculum.total
+        if is_last or name == "walk":
+            path = self.folder / ("policy.onnx" if is_last else "walk.onnx")
             self.phases[name]["onnx_difference"] = self._export(path, name)
 
     def _export(self, path: Path, phase: str) -> float:
-        """Write a policy; largest difference of its outputs from PyTorch's on the last rollout."""
+        """Write a policy.
+
+        Args:
+            path: The file to write.
+            phase: The phase that is over.
+
+        Returns:
+            Largest difference of its outputs from PyTorch's on the last rollout.
+        """
         env = self.env.unwrapped
-        contract = contract_for(
-            env.cfg,
-            jump=PHASES[phase].jump,
-            provenance={
-                "run": path.parent.resolve().name,
-                "phases": {n: p["iterations"] for n, p in self.phases.items()},
-                "envs": env.num_envs * self.gpu_world_size,
-                "seed": self.cfg["seed"],
-                "ranges_sha256": motion_command(env).cfg.gains.sha256,
-                **self.provenance,
-            },
-        )
+        iterations = {name: figures["iterations"] for name, figures in self.phases.items()}
+        provenance: dict[str, Any] = {
+            "run": path.parent.resolve().name,
+            "phases": iterations,
+            "envs": env.num_envs * self.gpu_world_size,
+            "seed": self.cfg["seed"],
+            "ranges_sha256": motion_command(env).cfg.gains.sha256,
+            "start_sha256": self.cfg.get("start_sha256", ""),
+        }
+        contract = contract_for(env.cfg, jump=PHASES[phase].jump, provenance=provenance)
         actor = self.alg.get_policy()
         export_policy(actor, contract, path)
-        observations = self.alg.storage.observations.flatten(0, 1)[:_COMPARED]
-        difference = verify(path, actor, {n: observations[n] for n in ("measured", "jump")})
+        rollout = self.alg.storage.observations.flatten(0, 1)[:COMPARED_OBSERVATIONS]
+        inputs = {"measured": rollout["measured"], "jump": rollout["jump"]}
+        difference = verify(path, actor, inputs)
         if not difference <= TOLERANCE:
-            note(
-                self.gpu_global_rank,
-                f"warning: {path} differs from PyTorch by {difference:.1e}, over {TOLERANCE:g}",
+            self.note(
+                f"warning: {path} differs from PyTorch by {difference:.1e}, over {TOLERANCE:g}"
             )
         return difference
 
     # --- Checkpoints -----------------------------------------------------------------------------
 
+    def _save_numbered(self) -> None:
+        """Write the checkpoint of the last iteration, and remove old ones."""
+        if self.folder is None or self.gpu_global_rank != 0:
+            return
+        self.save(str(self.folder / f"model_{self.current_learning_iteration}.pt"))
+        for path in checkpoint.numbered(self.folder)[:-KEPT_CHECKPOINTS]:
+            path.unlink(missing_ok=True)
+
     def save(self, path: str, infos: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, whole or not at all; weights that are not finite are refused."""
+        """Write a checkpoint, whole or not at all.
+
+        Args:
+            path: The file to write.
+            infos: Further entries beside the counters.
+
+        Raises:
+            PronkError: Weights that are not finite.
+        """
         state = self.alg.save()
         self._check_finite(state)
         env = self.env.unwrapped
@@ -268,10 +318,9 @@ class PronkRunner(MjlabOnPolicyRunner):
             "speed_ranges": float(motion_command(env).ranges.grown),
             "phases": self.phases,
             "seconds": self._seconds,
+            "stopped": self.stop_reason,
         }
         checkpoint.write(Path(path), state)
-        for old in checkpoint.numbered(Path(path).parent)[:-_KEPT]:
-            old.unlink(missing_ok=True)
         if self.cfg["upload_model"]:
             self.logger.save_model(path, self.current_learning_iteration)
 
@@ -282,9 +331,19 @@ class PronkRunner(MjlabOnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict[str, Any]:
-        """Resume from a checkpoint, or load parts of it.
+        """Resume from a checkpoint, or load parts of it; robots start anew.
 
-        Robots start anew. `load_cfg` is rsl_rl's: `actor`, `critic`, `optimizer`, `iteration`.
+        Args:
+            path: The checkpoint.
+            load_cfg: rsl_rl's `actor`, `critic`, `optimizer`, `iteration`; None for everything.
+            strict: Whether all weights must be there.
+            map_location: Device to load to; the runner's if None.
+
+        Returns:
+            The entries beside the counters.
+
+        Raises:
+            ArtefactError: No checkpoint, or one of other networks.
         """
         state = checkpoint.read(Path(path), map_location or self.device)
         try:
@@ -310,20 +369,43 @@ class PronkRunner(MjlabOnPolicyRunner):
         return infos
 
     def _check_finite(self, state: Any, cause: Exception | None = None) -> None:
-        bad = checkpoint.not_finite(state)
-        if bad is not None:
-            raise self._diverged(f"{bad} is not finite") from cause
+        """Refuse a state with a number that is not finite."""
+        tensor_path = checkpoint.not_finite(state)
+        if tensor_path is not None:
+            raise self._diverged(f"{tensor_path} is not finite") from cause
 
     def _diverged(self, reason: str) -> PronkError:
-        last = None if self.folder is None else checkpoint.latest(self.folder)
-        good = "" if last is None else f"; {last} is the last good checkpoint"
-        return PronkError(
+        """Return the error of learning that has diverged."""
+        text = (
             f"learning diverged in iteration {self.iteration}: {reason}; train with another seed "
-            f"or a smaller learning rate{good}."
+            "or a smaller learning rate"
         )
+        good_checkpoint = None if self.folder is None else checkpoint.latest(self.folder)
+        if good_checkpoint is not None:
+            text += f"; {good_checkpoint} is the last good checkpoint"
+        return PronkError(f"{text}.")
 
 
-def note(rank: int, text: str) -> None:
-    """Print a line of the first process on standard error."""
-    if rank == 0:
-        print(text, file=sys.stderr, flush=True)  # noqa: T201
+@contextmanager
+def stop_signals(runner: Any) -> Iterator[None]:
+    """Let the first SIGINT or SIGTERM inside the block set the runner's `stop_reason`.
+
+    The next one has its usual effect. Python delivers signals to the main thread alone; in another
+    thread the block changes nothing.
+    """
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handlers[number] = signal.getsignal(number)
+
+    def stop(number: int, _: FrameType | None) -> None:
+        signal.signal(number, handlers[signal.Signals(number)])
+        runner.stop_reason = signal.Signals(number).name
+
+    for number in handlers:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -32,6 +32,8 @@ from pronk.robots.robot import RobotSpec
 
 ROBOTS = ("mini_cheetah",)
 """Robots of this package with a task."""
+JUMP_TASK = "Pronk-Jump-MiniCheetah"
+"""Name of the registered task with all phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,46 +46,58 @@ class Task:
 
 
 def load_task(robot: str) -> Task:
-    """The task of a robot, by name or path; a PronkError says which robots have one."""
+    """Load the task of a robot.
+
+    Args:
+        robot: Name or robot.yaml of the robot.
+
+    Raises:
+        PronkError: The robot has no task, or a file of it cannot be used.
+    """
     spec = load_robot(robot)
     if spec.source in ROBOTS:
         return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
     folder = Path(spec.source).parent
-    path, own = folder / "env_cfgs.py", folder / "rl_cfg.py"
-    if not path.is_file():
+    env_file = folder / "env_cfgs.py"
+    rl_file = folder / "rl_cfg.py"
+    if not env_file.is_file():
         raise PronkError(
-            f"{robot} has no training task: expected {path} with a function env_cfg, or one of the "
-            f"robots {', '.join(ROBOTS)}."
+            f"{robot} has no training task: expected {env_file} with a function env_cfg, or one of "
+            f"the robots {', '.join(ROBOTS)}."
         )
-    rl_cfg = _function(own, "rl_cfg") if own.is_file() else jump_rl_cfg
-    return Task(robot=spec, env_cfg=_function(path, "env_cfg"), rl_cfg=rl_cfg)
+    env_cfg = _function(env_file, "env_cfg")
+    rl_cfg = _function(rl_file, "rl_cfg") if rl_file.is_file() else jump_rl_cfg
+    return Task(robot=spec, env_cfg=env_cfg, rl_cfg=rl_cfg)
 
 
 def _function(path: Path, name: str) -> Callable[..., Any]:
-    found = importlib.util.spec_from_file_location(path.stem, path)
-    assert found is not None
-    assert found.loader is not None
-    module: ModuleType = importlib.util.module_from_spec(found)
+    """Import a function from a file."""
+    module_spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert module_spec is not None
+    assert module_spec.loader is not None
+    module: ModuleType = importlib.util.module_from_spec(module_spec)
     try:
-        found.loader.exec_module(module)
+        module_spec.loader.exec_module(module)
     except Exception as error:
         raise PronkError(
             f"{path}: cannot be imported ({type(error).__name__}: {error})."
         ) from error
-    if not callable(function := getattr(module, name, None)):
+    function = getattr(module, name, None)
+    if not callable(function):
         raise PronkError(f"{path}: has no function {name}.")
     return function
 
 
 def _register() -> None:
+    """Register the tasks of all robots of this package with mjlab."""
     for robot in ROBOTS:
         task = load_task(robot)
         gains = training_gains(NAIVE, task.robot)
-        name = "".join(word.capitalize() for word in robot.split("_"))
-        for kind in ("Jump", "Walk"):
-            iterations = TASKS[kind.lower()]
+        robot_name = "".join(word.capitalize() for word in robot.split("_"))
+        for task_name in ("Jump", "Walk"):
+            iterations = TASKS[task_name.lower()]
             register_mjlab_task(
-                task_id=f"Pronk-{kind}-{name}",
+                task_id=f"Pronk-{task_name}-{robot_name}",
                 env_cfg=task.env_cfg(task.robot, gains, iterations=iterations),
                 play_env_cfg=play_cfg(task.env_cfg(task.robot, gains, iterations=iterations)),
                 rl_cfg=task.rl_cfg(iterations=sum(iterations.values())),
