@@ -104,8 +104,11 @@ def alone(
         rigs = stack.enter_context(joint_rigs(engine, robot, python=python))
         for goal in goals:
             joint = gains.joints[goal.joint]
-            request = SimRequest(goal, joint.stiffness, joint.damping, delay=joint.delay_s)
-            dry = None if np.isnan(joint.frictionloss) else joint.frictionloss
+            request = SimRequest(
+                goal, joint.stiffness.value, joint.damping.value, delay=joint.delay_s.value
+            )
+            friction = joint.frictionloss.value
+            dry = None if np.isnan(friction) else friction
             own = dry if "frictionloss" in rigs.parameters else None
             of = {
                 "engine": responses(rigs, [replace(request, frictionloss=own)])[0],

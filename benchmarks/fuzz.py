@@ -182,13 +182,13 @@ def _kinds() -> dict[str, _Kind]:
         return lambda path: read_log(path, **options)
 
     def gains(path: Path) -> None:
-        found = gains_file.load(path)
+        found = gains_file.load_gains(path)
         for target in get_args(Target):
             with contextlib.suppress(PronkError):
                 write_text(path.parent / "out" / "a.py", export_text(found, target, None))
 
     def match(path: Path) -> Any:
-        return match_file.load(path, gains_file.load(path.with_name("gains.yaml")))
+        return match_file.load(path, gains_file.load_gains(path.with_name("gains.yaml")))
 
     def model(path: Path) -> None:
         read_model.cache_clear()

@@ -169,7 +169,7 @@ def _torn(folder: Path) -> list[str]:
                 if path.stat().st_size > _EMPTY:
                     (read_deploy_log if is_deploy_log(path) else read_log)(path)
             elif path.name == "match.npz":
-                match_file.load(path, gains_file.load(path.with_name("gains.yaml")))
+                match_file.load(path, gains_file.load_gains(path.with_name("gains.yaml")))
             elif path.suffix == ".npz":
                 capture.load(path)
             elif path.suffix == ".yaml":

@@ -107,9 +107,9 @@ def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
     settings = MatchSettings(method="paper", zero_armature=False, threads=threads)
     found = match_logs([log], robot, settings=settings).gains.joints[JOINT]
     return Estimate(
-        stiffness=found.stiffness,
-        damping=found.damping,
-        interval=(found.stiffness_ci95, found.damping_ci95),
+        stiffness=found.stiffness.value,
+        damping=found.damping.value,
+        interval=(found.stiffness.repeat95, found.damping.repeat95),
         seconds=time.perf_counter() - before,
     )
 

@@ -23,7 +23,7 @@ from mjlab.envs import ManagerBasedRlEnv
 
 from benchmarks.runner import machine
 from pronk.cli import console
-from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.gains import FittedValue, MatchedGains
 from pronk.identify.match.translate import stated_gains, translate
 from pronk.identify.simulators.profiles import Profile, profile
 from pronk.jump.train.devices import find_devices
@@ -126,10 +126,14 @@ def translated(
     for name, one in stated.joints.items():
         dry, drive = gains.groups[robot.joint(name).group].frictionloss, robot.joint(name).drive
         dry = drive.frictionloss if np.isnan(dry) else dry
-        joints[name] = replace(one, delay_s=gains.delay_s, frictionloss=dry)
+        joints[name] = replace(
+            one,
+            delay_s=FittedValue(value=gains.delay_s),
+            frictionloss=FittedValue(value=dry),
+        )
     stated = replace(stated, joints=joints, groups=gains.groups)
     found, _ = translate(stated, robot, to)
-    delay = float(np.mean([joint.delay_s for joint in found.joints.values()]))
+    delay = float(np.mean([joint.delay_s.value for joint in found.joints.values()]))
     return replace(gains, groups=found.groups, delay_s=delay)
 
 

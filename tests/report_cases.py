@@ -151,7 +151,7 @@ def joint_prediction() -> JointPrediction:
 
 
 def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) -> Path:
-    gains_file.save(folder / "gains.yaml", result.gains)
+    gains_file.save_gains(folder / "gains.yaml", result.gains)
     match_file.save(folder / "match.npz", result)
     if prediction:
         joints, virtual = (joint_prediction(),), result.gains.virtual
@@ -268,7 +268,7 @@ def write_bodies(folder: Path) -> Bodies:
     gains, found = match(legs=1).gains, []
     for i in (1, 2):
         where = f"bodies/body_{i}"
-        gains_file.save(folder / where / "gains.yaml", gains)
+        gains_file.save_gains(folder / where / "gains.yaml", gains)
         errors = {"training gains of matched": 0.1 * i, "training gains of naive": 0.6 * i}
         errors[bodies.MATCHED] = 0.02 * i
         trial = write_trial(folder / where / "trial", cases=CASES[:2])

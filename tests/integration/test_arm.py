@@ -105,7 +105,7 @@ def test_command_that_is_logged_late_is_flagged() -> None:
     late = np.concatenate([log.command[:1], log.command[:-1]])
     joints, _ = fit_together([replace(log, command=late)], ARM, DRIVE_MODE)
     for joint in joints.values():
-        assert joint.delay_s == 0.0
+        assert joint.delay_s.value == 0.0
         assert any("delay -8.0 ms" in flag and "command later" in flag for flag in joint.flags)
 
 
@@ -173,8 +173,8 @@ def matched() -> MatchResult:
 def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
     matched: MatchResult, tmp_path: Path
 ) -> None:
-    gains_file.save(tmp_path / "gains.yaml", matched.gains)
-    gains = gains_file.load(tmp_path / "gains.yaml")
+    gains_file.save_gains(tmp_path / "gains.yaml", matched.gains)
+    gains = gains_file.load_gains(tmp_path / "gains.yaml")
     friction = matched.joints["elbow_flex"].frictionloss
     assert drives_of(ARM, gains)["elbow_flex"]["frictionloss"] == pytest.approx(friction, rel=1e-5)
     found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains, drive_gains="default")
@@ -190,14 +190,14 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 def test_recorded_sweep_is_matched_and_what_it_does_not_identify_held(matched: MatchResult) -> None:
     # Commands go out together, so no joint has a delay of its own to pass for stiffer gains: the
     # servos, all alike, come out alike, also those that gravity does not load.
-    stiffness = [joint.stiffness for joint in matched.gains.joints.values()]
+    stiffness = [joint.stiffness.value for joint in matched.gains.joints.values()]
     assert max(stiffness) < 1.25 * min(stiffness)
     for joint in matched.gains.joints.values():
-        assert joint.delay_s == 0.0
+        assert joint.delay_s.value == 0.0
         assert any("delay held at 0" in f for f in joint.flags)
     for name in ("shoulder_lift", "elbow_flex"):
-        low, high = matched.gains.joints[name].stiffness_ci95
-        assert high - low < 0.3 * matched.gains.joints[name].stiffness
+        low, high = matched.gains.joints[name].stiffness.repeat95
+        assert high - low < 0.3 * matched.gains.joints[name].stiffness.value
     assert set(matched.joints) == set(JOINTS)
     for name, fit in matched.joints.items():
         assert fit.error_db < 0.5 * fit.naive_error_db, name

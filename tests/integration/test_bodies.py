@@ -83,7 +83,7 @@ def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
     found = bodies.gains_errors(logs, ROBOT, gains, settings=QUICK)
     assert found["own"] < 0.01
     matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
-    assert found["naive"] == pytest.approx(matched.naive_error_db, rel=1e-4)
+    assert found["naive"] == pytest.approx(matched.quality.nominal_error_db, rel=1e-4)
 
 
 # --- Other runs than jumps ----------------------------------------------------------------------

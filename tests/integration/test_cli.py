@@ -112,11 +112,12 @@ def test_match_finds_table_one(matched):
     figures = json.loads((matched / "match.json").read_text())
     found = figures["gains"]["FR_knee"]
     # Two cells of the paper's grid are 0.57 N m/rad and 0.024 N m s/rad.
-    assert found["stiffness"] == pytest.approx(21.8, abs=0.57)
-    assert found["damping"] == pytest.approx(0.541, abs=0.024)
-    assert found["error_db"] < 0.5 * found["naive_error_db"]
-    assert found["zero_armature_error_db"] > 5.0 * found["error_db"]
-    assert 0.002 < found["delay_s"] < 0.01
+    assert found["stiffness"]["value"] == pytest.approx(21.8, abs=0.57)
+    assert found["damping"]["value"] == pytest.approx(0.541, abs=0.024)
+    quality = found["quality"]
+    assert quality["error_db"] < 0.5 * quality["nominal_error_db"]
+    assert found["zero_armature_error_db"] > 5.0 * quality["error_db"]
+    assert 0.002 < found["delay_s"]["value"] < 0.01
     assert (figures["matched"], figures["joints"]) == (1, 1)
     assert "virtual robot" in (matched / "match.html").read_text(encoding="utf-8")
 

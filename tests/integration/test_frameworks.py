@@ -11,7 +11,7 @@ from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import ArtefactError, PronkError
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.gains import load, save
+from pronk.identify.match.gains import load_gains, save_gains
 from pronk.identify.match.pipeline import match_frameworks
 from pronk.identify.match.predict import predict
 from pronk.identify.match.settings import MatchSettings
@@ -37,19 +37,19 @@ def test_the_gains_of_a_simulated_framework_are_found(name: str, method: str) ->
     settings = MatchSettings(method=method, zero_armature=False)  # type: ignore[arg-type]
     found = match_frameworks([recorded(name)], ROBOT, [name], settings=settings)
     joint = found[name].gains.joints["FR_knee"]
-    assert (joint.stiffness, joint.damping) == pytest.approx(GAINS, rel=0.005)
-    assert joint.delay_s == pytest.approx(0.0, abs=2e-4)
-    assert joint.error_db < 0.02
+    assert (joint.stiffness.value, joint.damping.value) == pytest.approx(GAINS, rel=0.005)
+    assert joint.delay_s.value == pytest.approx(0.0, abs=2e-4)
+    assert joint.quality.error_db < 0.02
     # The explicit law needs other gains, by far more than they are known to.
-    assert found[""].gains.joints["FR_knee"].stiffness < 0.95 * GAINS[0]
+    assert found[""].gains.joints["FR_knee"].stiffness.value < 0.95 * GAINS[0]
     assert profile_of(found[name].gains.simulator).drive_law == profile(name).drive_law
 
 
 def test_gains_of_a_framework_are_replayed_and_not_trained_with(tmp_path: Path) -> None:
     name, log = "isaaclab-implicit", recorded("isaaclab-implicit")
     gains = match_frameworks([log], ROBOT, [name])[name].gains
-    save(tmp_path / "gains.yaml", gains)
-    assert load(tmp_path / "gains.yaml").simulator == gains.simulator
+    save_gains(tmp_path / "gains.yaml", gains)
+    assert load_gains(tmp_path / "gains.yaml").simulator == gains.simulator
     [joint] = predict(log, ROBOT, gains).joints
     assert joint.rmse_matched < 3e-4
     assert joint.rmse_matched < 0.05 * joint.rmse_naive
@@ -87,10 +87,10 @@ def test_the_command_line_writes_a_folder_for_each_framework(tmp_path: Path) -> 
     words = ["match", tmp_path / "knee.mcap", "--robot", "mini_cheetah"]
     text = accepted(*words, "--for", "mjlab-builtin", "--out", tmp_path / "out" / "gains.yaml")
     assert "mjlab-builtin" in text
-    own = load(tmp_path / "out" / "gains.yaml").joints["FR_knee"]
-    other = load(tmp_path / "out" / "mjlab-builtin" / "gains.yaml").joints["FR_knee"]
-    assert other.stiffness == pytest.approx(GAINS[0], rel=0.005)
-    assert own.stiffness < 0.95 * other.stiffness
+    own = load_gains(tmp_path / "out" / "gains.yaml").joints["FR_knee"]
+    other = load_gains(tmp_path / "out" / "mjlab-builtin" / "gains.yaml").joints["FR_knee"]
+    assert other.stiffness.value == pytest.approx(GAINS[0], rel=0.005)
+    assert own.stiffness.value < 0.95 * other.stiffness.value
     assert (tmp_path / "out" / "mjlab-builtin" / "match.html").is_file()
     listed = accepted("profiles")
     assert all(name in listed for name in profiles())

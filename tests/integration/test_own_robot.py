@@ -8,7 +8,7 @@ import pytest
 
 import pronk.robots
 from command_line import accepted, refused
-from pronk.identify.match.gains import load
+from pronk.identify.match.gains import load_gains
 from pronk.robots import load_robot
 
 PENDULUM = """
@@ -62,7 +62,8 @@ def test_sweep_match_predict_export(kind: str, joint: str, tmp_path: Path) -> No
     accepted("predict", logs, *of, "--gains", gains)
     accepted("export", gains, *of, "--to", "mjcf", "--out", tmp_path / "matched.xml")
     # The virtual robot gives a tenth more torque than its drive computes.
-    share = load(gains).joints[joint].stiffness / load_robot(robot).joint(joint).stiffness
+    stiffness = load_gains(gains).joints[joint].stiffness.value
+    share = stiffness / load_robot(robot).joint(joint).stiffness
     assert 0.7 < share < 1.6
 
 

@@ -33,8 +33,8 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     exec(compile(code, "README.md", "exec"), names)
     knee = names["result"].gains.joints["FR_knee"]
     # The paper's Table I, from which the virtual robot's hidden parameters derive; two grid cells.
-    assert knee.stiffness == pytest.approx(21.8, abs=2 * 14 / 49)
-    assert knee.damping == pytest.approx(0.541, abs=2 * 0.6 / 49)
+    assert knee.stiffness.value == pytest.approx(21.8, abs=2 * 14 / 49)
+    assert knee.damping.value == pytest.approx(0.541, abs=2 * 0.6 / 49)
     (replay,) = names["replay"].joints
     assert replay.rmse_matched < 0.5 * replay.rmse_naive
 

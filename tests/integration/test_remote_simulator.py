@@ -18,7 +18,7 @@ from log_files import write_mcap
 from pronk.cli.match import WARNING_STATUS
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
-from pronk.identify.match.gains import load
+from pronk.identify.match.gains import load_gains
 from pronk.identify.simulators.engines.links import links_of
 from pronk.identify.simulators.load import joint_rigs, load_simulator
 from pronk.robots import load_robot
@@ -112,7 +112,7 @@ def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) 
     here = [tmp_path / "log.mcap", "--robot", ROBOT.name, "--simulator", EXAMPLE]
     there = [*here, "--simulator-python", python]
     assert invoke(["match", *there, "--out", gains]).exit_code in (0, WARNING_STATUS)
-    assert load(gains).joints["FR_knee"].stiffness == pytest.approx(19.3, rel=2e-3)
+    assert load_gains(gains).joints["FR_knee"].stiffness.value == pytest.approx(19.3, rel=2e-3)
     replays = []
     for words in (here, there):
         accepted("predict", *words, "--gains", gains, "--json", figures)

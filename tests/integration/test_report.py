@@ -203,7 +203,7 @@ def test_missing_artefacts_are_named(tmp_path: Path) -> None:
         match_page.write_page(tmp_path / "nowhere")
     with pytest.raises(ArtefactError, match=r"gains\.yaml"):
         match_page.write_page(tmp_path)
-    gains_file.save(tmp_path / "gains.yaml", match(legs=1).gains)
+    gains_file.save_gains(tmp_path / "gains.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match=r"match\.npz"):
         match_page.write_page(tmp_path)
     assert not (tmp_path / match_page.PAGE_NAME).exists()
@@ -214,7 +214,7 @@ def test_gains_under_another_name_are_found(tmp_path: Path) -> None:
     (tmp_path / "gains.yaml").rename(tmp_path / "tuesday.yaml")
     (tmp_path / "other.yaml").write_text("just: something\n")
     assert match_page.find_gains(tmp_path).name == "tuesday.yaml"
-    gains_file.save(tmp_path / "wednesday.yaml", match(legs=1).gains)
+    gains_file.save_gains(tmp_path / "wednesday.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match="several gains files"):
         match_page.find_gains(tmp_path)
 

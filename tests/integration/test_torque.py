@@ -121,8 +121,8 @@ def test_mode_drive_fits_torque_and_keeps_it(logs: list[JointLog], tmp_path: Pat
     with pytest.raises(LogError, match="--mode drive"):
         match_logs(still, rig())
     result = match_logs(still, rig(), mode="drive")
-    gains.save(tmp_path / "gains.yaml", result.gains)
-    kept = gains.load(tmp_path / "gains.yaml")
+    gains.save_gains(tmp_path / "gains.yaml", result.gains)
+    kept = gains.load_gains(tmp_path / "gains.yaml")
     for j, joint in enumerate(JOINTS):
         viscous = kept.joints[joint].torque["viscous"].value
         assert viscous == pytest.approx(VISCOUS[j], rel=0.15)
@@ -130,8 +130,8 @@ def test_mode_drive_fits_torque_and_keeps_it(logs: list[JointLog], tmp_path: Pat
             scale, (low, high) = found.torque["scale"].value, found.torque["scale"].ci95
             assert low < scale < high
             assert scale == pytest.approx(SCALE, rel=0.03)
-            assert found.armature == pytest.approx(ARMATURE, rel=0.1)
-            assert found.frictionloss == pytest.approx(DRY[j], rel=0.1)
+            assert found.armature.value == pytest.approx(ARMATURE, rel=0.1)
+            assert found.frictionloss.value == pytest.approx(DRY[j], rel=0.1)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.03, 1.1])
@@ -178,23 +178,27 @@ def test_recordings_of_torque_are_fitted_from_the_command_line(tmp_path: Path) -
     assert "--mode drive" in refused(*words)
     assert not out.exists()
     shown = accepted(*words, "--mode", "drive")
-    expected, found = run()["fit"].joints, gains.load(out).joints
-    assert found["elbow"].armature == pytest.approx(expected["elbow"]["armature"].value, rel=1e-4)
+    expected, found = run()["fit"].joints, gains.load_gains(out).joints
+    assert found["elbow"].armature.value == pytest.approx(
+        expected["elbow"]["armature"].value, rel=1e-4
+    )
     assert not found["shoulder"].torque["armature"].identified
     for joint in JOINTS:
-        assert found[joint].frictionloss == pytest.approx(expected[joint]["dry"].value, rel=1e-4)
+        assert found[joint].frictionloss.value == pytest.approx(
+            expected[joint]["dry"].value, rel=1e-4
+        )
         low, high = found[joint].torque["dry"].ci95
-        assert low < found[joint].frictionloss < high
+        assert low < found[joint].frictionloss.value < high
         assert "the robot's file" in " ".join(found[joint].flags)
     interval = "{:.4g} to {:.4g}".format(*found["elbow"].torque["armature"].ci95)
     page = (out.parent / "match.html").read_text()
-    for part in (f"{found['elbow'].armature:.4g}", interval, "armature [kg m^2]"):
+    for part in (f"{found['elbow'].armature.value:.4g}", interval, "armature [kg m^2]"):
         assert part in shown
         assert part in page
     # One drive for both actuators, as their builder may state.
     robot.write_text(robot.read_text().replace("drive: elbow", "drive: shoulder"))
     accepted(*words, "--mode", "drive")
-    found = gains.load(out).joints
+    found = gains.load_gains(out).joints
     assert found["shoulder"].armature == found["elbow"].armature
 
 

@@ -12,7 +12,7 @@ import pytest
 from chirp_logs import chirp_log
 from command_line import accepted, refused
 from pronk.errors import PronkError
-from pronk.identify.match.gains import load, save
+from pronk.identify.match.gains import FittedValue, load_gains, save_gains
 from pronk.identify.match.translate import stated_gains, translate
 from pronk.identify.response.estimate import estimate
 from pronk.identify.simulators.profiles import profile
@@ -47,11 +47,11 @@ def test_known_gains_of_a_pendulum(pendulum: RobotSpec, name: str) -> None:
     )
     kp, kd, before, after, delay = KNOWN[name]
     joint, change = gains.joints["swing"], changes["swing"]
-    assert (joint.stiffness, joint.damping) == pytest.approx((kp, kd), rel=0.01)
+    assert (joint.stiffness.value, joint.damping.value) == pytest.approx((kp, kd), rel=0.01)
     for found, expected, within in (
         (change.before_db, before, 0.08),
         (change.after_db, after, 0.02),
-        (1000.0 * joint.delay_s, delay, 0.15),
+        (1000.0 * joint.delay_s.value, delay, 0.15),
     ):
         assert expected is None or found == pytest.approx(expected, abs=within)
 
@@ -61,18 +61,20 @@ def test_gains_return_and_the_joints_stay(name: str) -> None:
     robot = load_robot(name)
     pairs = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints[:3]}
     first = stated_gains(robot, pairs, profile("mjlab"))
-    joints = {joint: replace(own, delay_s=0.003) for joint, own in first.joints.items()}
+    delay_s = FittedValue(value=0.003)
+    joints = {joint: replace(own, delay_s=delay_s) for joint, own in first.joints.items()}
     first = gains = replace(first, joints=joints)
     for step in ("mjlab-builtin", "isaaclab-implicit", "mjlab"):
         gains, changes = translate(gains, robot, profile(step))
         assert max(one.after_db for one in changes.values()) < 0.05
-    for stated, back in ((first.joints, gains.joints), (first.groups, gains.groups)):
-        for name, own in stated.items():
-            for field in ("stiffness", "damping"):
-                expected = pytest.approx(getattr(own, field), rel=0.005)
-                assert getattr(back[name], field) == expected
-    for name, own in first.joints.items():
-        assert gains.joints[name].delay_s == pytest.approx(own.delay_s, abs=1e-4)
+    for name, group in first.groups.items():
+        assert gains.groups[name].stiffness == pytest.approx(group.stiffness, rel=0.005)
+        assert gains.groups[name].damping == pytest.approx(group.damping, rel=0.005)
+    for name, joint in first.joints.items():
+        translated = gains.joints[name]
+        assert translated.stiffness.value == pytest.approx(joint.stiffness.value, rel=0.005)
+        assert translated.damping.value == pytest.approx(joint.damping.value, rel=0.005)
+        assert translated.delay_s.value == pytest.approx(0.003, abs=1e-4)
 
 
 def test_the_simulated_joints_respond_alike() -> None:
@@ -93,9 +95,9 @@ def test_the_simulated_joints_respond_alike() -> None:
     def apart(*values: float) -> float:
         return float(np.sqrt(np.mean((gain_db("mjlab", *values) - goal) ** 2)))
 
-    translated = apart(found.stiffness, found.damping, found.frictionloss)
+    translated = apart(found.stiffness.value, found.damping.value, found.frictionloss.value)
     assert translated < 0.1
-    assert translated < 0.5 * apart(found.stiffness, found.damping, own)
+    assert translated < 0.5 * apart(found.stiffness.value, found.damping.value, own)
     assert translated < 0.15 * apart(17.0, 0.4, own)
 
 
@@ -105,7 +107,7 @@ def test_what_another_framework_cannot_give_is_refused(pendulum: RobotSpec) -> N
         translate(stiff, pendulum, profile("mjlab,timestep_s=0.01"))
     late = stated_gains(pendulum, {"swing": (17.0, 0.4)}, profile("mjlab"))
     gains, changes = translate(late, pendulum, profile("isaaclab-implicit"))
-    assert gains.joints["swing"].delay_s == 0.0
+    assert gains.joints["swing"].delay_s.value == 0.0
     assert changes["swing"].rest_s == pytest.approx(-1.7e-3, abs=1.5e-4)
     with pytest.raises(PronkError, match="not of go2"):
         translate(late, load_robot("go2"), profile("drake"))
@@ -115,17 +117,17 @@ def test_command_line(tmp_path: Path, pendulum: RobotSpec) -> None:
     out, figures = tmp_path / "out.yaml", tmp_path / "figures.json"
     stated = ("--robot", pendulum.source, "--from", EXACT, "--drive-gains", "swing=17,.4")
     accepted("translate", *stated, "--to", "mjlab", "--out", out, "--json", figures)
-    assert load(out).joints["swing"].stiffness == pytest.approx(15.0, rel=0.01)
+    assert load_gains(out).joints["swing"].stiffness.value == pytest.approx(15.0, rel=0.01)
     assert json.loads(figures.read_text())["translated"]["mjlab"]["swing"]["after_db"] < 0.05
     robot = ("--robot", pendulum.source)
     accepted("translate", out, *robot, "--to", "genesis", "--to", "drake", "--out", out)
-    assert load(tmp_path / "genesis" / "out.yaml").simulator.profile == "genesis"
-    assert load(tmp_path / "drake" / "out.yaml").simulator.law == "implicit"
+    assert load_gains(tmp_path / "genesis" / "out.yaml").simulator.profile == "genesis"
+    assert load_gains(tmp_path / "drake" / "out.yaml").simulator.law == "implicit"
     again = tmp_path / "drake" / "out.yaml"
     assert "not for mjlab" in refused(
         "translate", again, *robot, "--from", "mjlab", "--to", "drake"
     )
     assert "--drive-gains" in refused("translate", *robot, "--to", "mjlab")
     assert "isaaclab-newton" in refused("translate", out, *robot, "--to", "isaac")
-    save(out, replace(load(out), robot="mine"))
+    save_gains(out, replace(load_gains(out), robot="mine"))
     assert "--robot" in refused("translate", out, "--to", "drake")

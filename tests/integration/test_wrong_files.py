@@ -45,9 +45,9 @@ def test_a_clock_that_runs_wrong_is_named(swept: JointLog, tmp_path: Path, facto
 def test_a_clock_that_begins_elsewhere_changes_nothing(swept: JointLog, tmp_path: Path) -> None:
     logs = [read(tmp_path, swept, offset=offset) for offset in (0.0, 12_345.0)]
     here, there = (match_logs([log], ROBOT).gains.joints[JOINT] for log in logs)
-    assert there.stiffness == pytest.approx(here.stiffness, rel=1e-3)
-    assert there.damping == pytest.approx(here.damping, rel=1e-3)
-    assert there.delay_s == pytest.approx(here.delay_s, abs=1e-4)
+    assert there.stiffness.value == pytest.approx(here.stiffness.value, rel=1e-3)
+    assert there.damping.value == pytest.approx(here.damping.value, rel=1e-3)
+    assert there.delay_s.value == pytest.approx(here.delay_s.value, abs=1e-4)
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e6, 1e-3])

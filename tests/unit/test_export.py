@@ -16,10 +16,10 @@ from pronk.cli.export import Target
 from pronk.errors import PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.export import TARGETS, Actuator, actuators, export_text, stability_share
-from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.match.gains import FittedValue, JointGains, MatchedGains
 from pronk.identify.match.parameters import GAINS
 from pronk.identify.match.predict import drives_of
-from pronk.identify.match.randomization import group_gains
+from pronk.identify.match.ranges import group_gains
 from pronk.identify.simulators.chain import ChainSimulation
 from pronk.identify.simulators.mujoco import Chain
 from pronk.identify.simulators.profiles import profile, profiles
@@ -50,10 +50,10 @@ def matched(
     for i, joint in enumerate(robot.joints):
         if joint.name.endswith(only):
             joints[joint.name] = JointGains(
-                stiffness=joint.stiffness + 0.3 * i,
-                damping=joint.damping + 0.004 * i,
-                armature=joint.drive.armature,
-                **extra,
+                stiffness=FittedValue(value=joint.stiffness + 0.3 * i),
+                damping=FittedValue(value=joint.damping + 0.004 * i),
+                armature=FittedValue(value=joint.drive.armature),
+                **{name: FittedValue(value=value) for name, value in extra.items()},
             )
     return MatchedGains(
         robot=robot.name,
@@ -155,7 +155,7 @@ def test_genesis_text_sets_every_parameter_of_every_joint() -> None:
     assert called["set_dofs_kp"][1] == list(range(6, 18))
     names = [f"{leg}_{part}" for part in robot.groups for leg in robot.legs]
     for argument, field in (("kp", "stiffness"), ("armature", "armature")):
-        expected = [getattr(gains.joints[name], field) for name in names]
+        expected = [getattr(gains.joints[name], field).value for name in names]
         assert called[f"set_dofs_{argument}"][0] == pytest.approx(expected)
     low, high, _ = called["set_dofs_force_range"]
     assert high == [-value for value in low]
@@ -178,8 +178,8 @@ def test_playground_text_gives_a_model_the_explicit_law() -> None:
     data.ctrl[:] = 0.3
     for _ in range(100):
         torque = (
-            np.clip(own.stiffness * (0.3 - angle), -26.435, 26.435)
-            - (own.damping + drive.viscous_damping) * speed
+            np.clip(own.stiffness.value * (0.3 - angle), -26.435, 26.435)
+            - (own.damping.value + drive.viscous_damping) * speed
         )
         speed += 0.004 * (torque - 0.2 * 9.81 * 0.1 * np.sin(angle)) / inertia
         angle += 0.004 * speed
@@ -306,8 +306,12 @@ def test_unmatched_joints_have_the_gains_of_their_group() -> None:
     (knee,) = actuators(gains, ROBOT)
     assert knee.unmatched == ("FL_knee", "HR_knee", "HL_knee")
     for one in actuators(gains, ROBOT, "joint"):
-        own = gains.joints["FR_knee"] if one.name == "FR_knee" else gains.groups["knee"]
-        assert (one.stiffness, one.damping) == (own.stiffness, own.damping)
+        group = gains.groups["knee"]
+        expected = (group.stiffness, group.damping)
+        if one.name == "FR_knee":
+            knee = gains.joints["FR_knee"]
+            expected = (knee.stiffness.value, knee.damping.value)
+        assert (one.stiffness, one.damping) == expected
 
 
 def test_gains_of_another_drive_law_are_refused() -> None:
@@ -352,7 +356,9 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
 
 def test_unstable_gains_are_refused() -> None:
     gains = matched("go2")
-    joints = {name: replace(one, damping=25.0) for name, one in gains.joints.items()}
+    joints = {
+        name: replace(one, damping=FittedValue(value=25.0)) for name, one in gains.joints.items()
+    }
     groups = group_gains(load_robot("go2"), joints)
     with pytest.raises(PronkError, match="times the limit of drive law E"):
         export_text(replace(gains, joints=joints, groups=groups), "mjlab")

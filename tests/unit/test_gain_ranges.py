@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import RobotError
-from pronk.identify.match.gains import JointGains
-from pronk.identify.match.randomization import enclosing, group_gains
+from pronk.identify.match.gains import FittedValue, JointGains
+from pronk.identify.match.ranges import enclosing_ellipsoid, group_gains
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
 
@@ -20,11 +20,9 @@ LEGS = ("FR", "FL", "HR", "HL")
 def joint(stiffness: float, damping: float, kp: float = 0.0, kd: float = 0.0) -> JointGains:
     """Gains with the half-widths of their intervals."""
     return JointGains(
-        stiffness=stiffness,
-        damping=damping,
-        armature=0.0026,
-        stiffness_ci95=(stiffness - kp, stiffness + kp),
-        damping_ci95=(damping - kd, damping + kd),
+        stiffness=FittedValue(value=stiffness, repeat95=(stiffness - kp, stiffness + kp)),
+        damping=FittedValue(value=damping, repeat95=(damping - kd, damping + kd)),
+        armature=FittedValue(value=0.0026),
         covariance=(((kp / 2) ** 2, 0.0), (0.0, (kd / 2) ** 2)),
     )
 
@@ -56,18 +54,18 @@ def test_every_interval_and_ellipse_is_inside(rows: list[tuple[float, ...]]) -> 
     inverse = np.linalg.inv(np.array(group.ellipsoid))
     reach = 0.0
     for gains in joints.values():
-        about = np.array([gains.stiffness, gains.damping]) - group.ellipsoid_center
+        about = np.array([gains.stiffness.value, gains.damping.value]) - group.ellipsoid_center
         assert about @ inverse @ about <= 1.0
-        low, high = gains.stiffness_ci95
+        low, high = gains.stiffness.repeat95
         reach = max(reach, high - group.stiffness, group.stiffness - low)
-        low, high = gains.damping_ci95
+        low, high = gains.damping.repeat95
         assert max(high - group.damping, group.damping - low) <= group.damping_range + 1e-6
     assert reach <= group.stiffness_range + 1e-6
     assert reach > group.stiffness_range - 0.5 or group.stiffness_range == 0.5
 
 
 def test_enclosing_ellipse_of_a_square_is_its_circumcircle() -> None:
-    centre, shape = enclosing(np.array([[1.0, 1], [1, 3], [3, 1], [3, 3]]))
+    centre, shape = enclosing_ellipsoid(np.array([[1.0, 1], [1, 3], [3, 1], [3, 3]]))
     assert centre == pytest.approx([2, 2], abs=1e-6)
     assert shape == pytest.approx(2.0 * np.eye(2), abs=1e-3)
 

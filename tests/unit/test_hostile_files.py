@@ -69,7 +69,7 @@ def test_a_hostile_yaml_file_is_refused_by_every_reader(tmp_path: Path, kind: st
     path = tmp_path / "a.yaml"
     path.write_text(YAML[kind], encoding="latin-1")
     before = resource.getrusage(resource.RUSAGE_SELF)
-    for read in (gains.load, read_robot, load_sim_params):
+    for read in (gains.load_gains, read_robot, load_sim_params):
         with pytest.raises(PronkError) as error:
             read(path)
         assert str(error.value).isprintable()
@@ -92,10 +92,10 @@ def test_anchors_and_merge_keys_are_read(tmp_path: Path) -> None:
 def test_gains_that_cannot_be_are_refused(tmp_path: Path, field: str, value: str) -> None:
     path = tmp_path / "gains.yaml"
     path.write_text(GAINS)
-    assert gains.load(path).joints["knee"].stiffness == 20.0
+    assert gains.load_gains(path).joints["knee"].stiffness.value == 20.0
     path.write_text(GAINS.replace(field, f"{field.split(':')[0]}: {value}"))
     with pytest.raises(ArtefactError):
-        gains.load(path)
+        gains.load_gains(path)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> Non
     with pytest.raises(LogError) as caught:
         read_log(tmp_path / "a.npz", unit="rad")
     with pytest.raises(ArtefactError) as other:
-        gains.load(tmp_path / "gains.yaml")
+        gains.load_gains(tmp_path / "gains.yaml")
     with pytest.raises(ArtefactError):
         response(joint=name)
     with pytest.raises(LogError):

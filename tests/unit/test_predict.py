@@ -10,7 +10,7 @@ import pytest
 from chirp_logs import chirp_log
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.match.gains import FittedValue, JointGains, MatchedGains
 from pronk.identify.match.predict import predict, r2, rmse
 from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.robots import load_robot
@@ -22,8 +22,13 @@ MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}
 def gains(*names: str, **extra: float) -> MatchedGains:
     joints = {}
     for name in names or MADE_WITH:
-        (kp, kd), armature = MADE_WITH[name], ROBOT.joint(name).drive.armature
-        joints[name] = JointGains(stiffness=kp, damping=kd, armature=armature, **extra)
+        stiffness, damping = MADE_WITH[name]
+        joints[name] = JointGains(
+            stiffness=FittedValue(value=stiffness),
+            damping=FittedValue(value=damping),
+            armature=FittedValue(value=ROBOT.joint(name).drive.armature),
+            **{parameter: FittedValue(value=value) for parameter, value in extra.items()},
+        )
     return MatchedGains(robot=ROBOT.name, simulator=SimulatorInfo(), joints=joints, groups={})
 
 

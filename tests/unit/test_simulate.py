@@ -213,8 +213,8 @@ def test_gains_matched_in_another_simulator_are_those_it_was_swept_with() -> Non
     settings = MatchSettings(simulator=EXAMPLE, grid_points=8)
     gains = match_logs([log], ROBOT, settings=settings).gains
     found = gains.joints["FR_knee"]
-    assert found.stiffness == pytest.approx(19.3, rel=2e-3)
-    assert found.damping == pytest.approx(0.41, rel=5e-3)
+    assert found.stiffness.value == pytest.approx(19.3, rel=2e-3)
+    assert found.damping.value == pytest.approx(0.41, rel=5e-3)
     assert gains.simulator == rigs.info
     replay = predict(log, ROBOT, gains, simulator=EXAMPLE).joints[0]
     assert replay.rmse_matched < 0.1 * replay.rmse_naive

@@ -11,7 +11,7 @@ import mujoco
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.identify.match.gains import GroupGains, JointGains, MatchedGains, save
+from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains, save_gains
 from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.robots import load_robot
@@ -34,16 +34,24 @@ GROUPS = {
 
 
 def written(tmp_path: Path, **changes: Any) -> Path:
-    joint = JointGains(stiffness=20.0, damping=0.5, armature=0.0026)
+    joint = JointGains(
+        stiffness=FittedValue(value=20.0),
+        damping=FittedValue(value=0.5),
+        armature=FittedValue(value=0.0026),
+    )
+    delays = {"FR_knee": 4e-3, "FL_knee": 7e-3}
+    joints = {}
+    for name, delay_s in delays.items():
+        joints[name] = replace(joint, delay_s=FittedValue(value=delay_s))
     gains = MatchedGains(
         robot="mini_cheetah",
         simulator=SIMULATOR,
-        joints={n: replace(joint, delay_s=d) for n, d in (("FR_knee", 4e-3), ("FL_knee", 7e-3))},
+        joints=joints,
         groups=GROUPS,
         virtual=True,
     )
     path = tmp_path / "gains.yaml"
-    save(path, replace(gains, **changes))
+    save_gains(path, replace(gains, **changes))
     return path
 
 

@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pronk.cli import console
 from pronk.cli.match import summary
 from pronk.cli.predict import prediction_rows
@@ -178,7 +180,7 @@ def sweep_and_match(
     fresh = record("fresh", seed + 1, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     logs = read_logs(paths, processes=cpus, robot=robot)
     result = match_logs(logs, robot, progress=report)
-    gains_file.save(out / "gains.yaml", result.gains)
+    gains_file.save_gains(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
         save_responses(out / "logs" / f"{file_name(name)}.response.npz", joint.responses)
@@ -206,8 +208,8 @@ def show_match(
         gains = (f"{one.stiffness:.2f} / {one.damping:.3f}", f"{k:g} / {d:g}")
         errors = (one.naive_error_db, one.error_db, fresh.rmse_naive, fresh.rmse_matched)
         apart = "{:.1f} / {:.1f}".format(*cells[name])
-        node = result.gains.joints[name]
-        magnitude = f"{node.grid_stiffness:.2f} / {node.grid_damping:.3f}"
+        row, column = np.unravel_index(int(np.nanargmin(one.grid_error)), one.grid_error.shape)
+        magnitude = f"{one.grid_stiffness[row]:.2f} / {one.grid_damping[column]:.3f}"
         rows.append((name, *gains, apart, magnitude, *errors))
     columns = "joint | matched | Table I | grid cells apart | best of the grid by magnitude"
     columns += " | gain error nominal [dB];2"

@@ -50,5 +50,5 @@ def export(
     from pronk.robots import load_robot
 
     known = load_robot(robot) if robot else None
-    write_text(out, export_text(gains_file.load(gains), to, known, per=per))
+    write_text(out, export_text(gains_file.load_gains(gains), to, known, per=per))
     return console.Outcome(figures={"written": out, "to": to}, wrote=[out])

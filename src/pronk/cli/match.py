@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -97,7 +98,7 @@ def match(
         result, wrote, pages = results[""], [], []
         for name, one in results.items():
             folder = out.parent / name
-            gains_file.save(folder / out.name, one.gains)
+            gains_file.save_gains(folder / out.name, one.gains)
             result_file.save(folder / "match.npz", one)
             report(f"{name} page".strip(), 0.0)
             pages.append(write_page(folder, gains=out.name))
@@ -113,8 +114,6 @@ def match(
     console.say(part.summary + errors * bool(np.isfinite(found["error_db"])))
     for name, flags in found["flags"].items():
         console.say(f"{name}: {'; '.join(flags)}")
-    for sentence in found["unchecked"]:
-        console.say(sentence)
     shown = {"gains_table": "Matched gains", "ranges_table": "Training ranges"}
     if mode == "drive":
         # By torque alone no gains are matched.
@@ -161,10 +160,17 @@ def framework_rows(results: Mapping[str, MatchResult]) -> list[dict[str, Any]]:
     for name, result in results.items():
         for group, members in group_members(result.gains).items():
             own = [result.gains.joints[member] for member in members]
-            names = ("stiffness", "damping", "frictionloss", "delay_s", "error_db")
-            means = {n: float(np.mean([getattr(one, n) for one in own])) for n in names}
-            means["flagged"] = sum(bool(one.flags) for one in own)
-            rows.append({"framework": name or "own", "group": group, **means})
+            row = {
+                "framework": name or "own",
+                "group": group,
+                "stiffness": float(np.mean([joint.stiffness.value for joint in own])),
+                "damping": float(np.mean([joint.damping.value for joint in own])),
+                "frictionloss": float(np.mean([joint.frictionloss.value for joint in own])),
+                "delay_s": float(np.mean([joint.delay_s.value for joint in own])),
+                "error_db": float(np.mean([joint.quality.error_db for joint in own])),
+                "flagged": sum(1 for joint in own if joint.flags),
+            }
+            rows.append(row)
     return rows
 
 
@@ -195,12 +201,10 @@ def summary(result: MatchResult) -> dict[str, Any]:
     zero = {name: joint.zero_armature_error_db for name, joint in result.joints.items()}
     return verdict(result) | {
         "gains": {
-            name: vars(gains)
-            | {"grid": [gains.grid_stiffness, gains.grid_damping]}
-            | {"zero_armature_error_db": zero.get(name)}
+            name: asdict(gains) | {"zero_armature_error_db": zero.get(name)}
             for name, gains in result.gains.joints.items()
         },
-        "groups": {name: vars(group) for name, group in result.gains.groups.items()},
+        "groups": {name: asdict(group) for name, group in result.gains.groups.items()},
         "seconds": dict(result.seconds),
         "grid_steps_per_second": result.grid_steps_per_second,
     }

@@ -45,7 +45,7 @@ def predict(
     from pronk.report import figures, style
     from pronk.robots import load_robot
 
-    known, matched = load_robot(robot), gains_file.load(gains)
+    known, matched = load_robot(robot), gains_file.load_gains(gains)
     given, logs = options.drive_gains(drive_gains), reading.read(paths, known)
     fitted = [log.source for log in logs if log.sha256 and log.sha256 in matched.logs.values()]
     folder = out if out is not None else gains.parent

@@ -52,7 +52,7 @@ def translate(
     else:
         if stated:
             raise PronkError("give a gains file or --drive-gains, not both.")
-        first = gains_file.load(gains)
+        first = gains_file.load_gains(gains)
         known = load_robot(robot) if robot else robot_of(first)
         if begin and profile(begin) != (held := profile_held(first)):
             raise PronkError(
@@ -67,7 +67,7 @@ def translate(
         target = profile(name)
         found, changes = translation.translate(first, known, target)
         path = out if len(names) == 1 else out.parent / name / out.name
-        gains_file.save(path, found)
+        gains_file.save_gains(path, found)
         wrote.append(path)
         figures[name] = {joint: asdict(one) for joint, one in changes.items()}
         for group in found.groups:

@@ -297,9 +297,9 @@ def _box(center: Sequence[float], half: Sequence[float], **look: Any) -> Rectang
 def _draw_gains(axes: Axes, gains: MatchedGains, joint: str) -> None:
     """Mark the gains of one joint with their intervals, and name it if it is of no leg."""
     one, leg = gains.joints[joint], style.leg_of(joint)
-    point = (one.stiffness, one.damping)
-    ends = np.array([one.stiffness_ci95, one.damping_ci95])
-    x_bar, y_bar = np.nan_to_num(np.abs(ends.T - point).T, posinf=0.0)[..., None]
+    point = (one.stiffness.value, one.damping.value)
+    ends = np.array([one.stiffness.repeat95, one.damping.repeat95])
+    x_bar, y_bar = np.nan_to_num(np.abs(ends.T - point).T, nan=0.0, posinf=0.0)[..., None]
     look: dict[str, Any] = {"color": style.MEASURED, "markersize": 5, "elinewidth": 1.0}
     axes.errorbar(*point, y_bar, x_bar, fmt=style.LEG_MARKERS.get(leg, "o"), **look)
     if not leg:

@@ -13,7 +13,7 @@ from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
 from pronk.identify.match import gains as gains_file
 from pronk.identify.match import result as result_file
-from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.gains import Interval, MatchedGains
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.predict import Prediction, load_prediction
 from pronk.identify.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
@@ -37,7 +37,7 @@ def find_gains(folder: Path) -> Path:
         )
     if (usual := folder / "gains.yaml").exists():
         return usual
-    schema, files = f"schema: {gains_file.SCHEMA}", folder.glob("*.yaml")
+    schema, files = "schema: pronk/gains/", folder.glob("*.yaml")
     found = [path for path in files if schema in path.read_text("utf-8", "replace")[:200]]
     if len(found) == 1:
         return found[0]
@@ -68,31 +68,26 @@ def group_members(gains: MatchedGains) -> dict[str, list[str]]:
 def verdict(result: MatchResult) -> dict[str, Any]:
     """Return the figures of the summary, also those of `--json`."""
     joints, all_flags = result.gains.joints, {}
-    unchecked: dict[str, list[str]] = {}
     for name, joint in joints.items():
-        if joint.unchecked:
-            unchecked.setdefault(", or ".join(joint.unchecked), []).append(name)
         fit = result.joints.get(name)
         # A zero armature that is ruled out is a result, no warning.
         found = dict.fromkeys((*joint.flags, *(fit.flags if fit else ())))
         if flags := [flag for flag in found if not flag.startswith(ZERO_ARMATURE)]:
             all_flags[name] = flags
     unmatched = [f for f in all_flags.values() if any(flag.startswith("no match") for flag in f)]
-    errors = {name: joint.error_db for name, joint in joints.items() if joint.error_db >= 0.0}
+    errors = {}
+    for name, joint in joints.items():
+        if joint.quality.error_db >= 0.0:
+            errors[name] = joint.quality.error_db
     return {
         "robot": result.gains.robot,
         "virtual": result.gains.virtual,
         "joints": len(joints),
         "matched": len(joints) - len(unmatched),
-        "naive_error_db": float(rms([one.naive_error_db for one in joints.values()])),
-        "error_db": float(rms([one.error_db for one in joints.values()])),
+        "naive_error_db": float(rms([joint.quality.nominal_error_db for joint in joints.values()])),
+        "error_db": float(rms([joint.quality.error_db for joint in joints.values()])),
         "worst": max(errors, key=lambda name: errors[name], default=""),
         "flags": all_flags,
-        "unchecked": [
-            f"{'All joints' if len(names) == len(joints) else ', '.join(names)}: these logs would "
-            f"not show if {what}."
-            for what, names in unchecked.items()
-        ],
     }
 
 
@@ -106,7 +101,7 @@ def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
 def part(path: Path, gains: str | None = None) -> Part:
     """Make the part of a `match.npz` and the gains file beside it, of this name or found."""
     gains_path = path.parent / gains if gains else find_gains(path.parent)
-    result = result_file.load(path, gains_file.load(gains_path))
+    result = result_file.load(path, gains_file.load_gains(gains_path))
     own, found, drives = result.gains, verdict(result), drives_table(result)
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}
     in_time = any(np.isfinite(fit.rmse) for fit in result.joints.values())
@@ -161,31 +156,29 @@ def part(path: Path, gains: str | None = None) -> Part:
 def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     """Return the matched gains of each joint, beside the paper's for its robot."""
     paper, joints = _comparable(gains), gains.joints.values()
-    delays = any(one.delay_s > 0.0 for one in joints)
-    total = any(np.isfinite(one.stiffness_total95).all() for one in joints)
-    searched = total and any(np.isfinite(one.grid_stiffness) for one in joints)
-    friction = any(np.isfinite(one.frictionloss) for one in joints)
-    falls = any(one.stribeck > 0.0 for one in joints)
+    delays = any(joint.delay_s.value > 0.0 for joint in joints)
+    total = any(np.isfinite(joint.stiffness.total95).all() for joint in joints)
+    friction = any(np.isfinite(joint.frictionloss.value) for joint in joints)
+    falls = any(joint.stribeck.value > 0.0 for joint in joints)
     names = (joint_words(k) + " (flagged)" * bool(v.flags) for k, v in gains.joints.items())
     published = (" / ".join(map(str, TABLE_I.get(name, ("-",)))) for name in gains.joints)
     repeats = "repeat 95 %" if total else "95 %"
-    by_grid = (f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}" for one in joints)
+    moving = [one.frictionloss.value * (1.0 - one.stribeck.value) for one in joints]
     columns: list[tuple[bool, str, Iterable[Any]]] = [
         (True, "joint", names),
-        (True, "stiffness [N m/rad];2", (one.stiffness for one in joints)),
-        (True, f"{repeats};2", (one.stiffness_ci95 for one in joints)),
-        (total, "total 95 %;2", (one.stiffness_total95 for one in joints)),
-        (True, "damping [N m s/rad]", (one.damping for one in joints)),
-        (True, repeats, (one.damping_ci95 for one in joints)),
-        (total, "total 95 %", (one.damping_total95 for one in joints)),
-        (friction, "friction [N m]", (one.frictionloss for one in joints)),
-        (falls, "in motion [N m]", (one.frictionloss * (1.0 - one.stribeck) for one in joints)),
-        (delays, "delay [ms];1", (1000.0 * one.delay_s for one in joints)),
-        (searched, "by magnitude alone", by_grid),
+        (True, "stiffness [N m/rad];2", (one.stiffness.value for one in joints)),
+        (True, f"{repeats};2", (_interval(one.stiffness.repeat95) for one in joints)),
+        (total, "total 95 %;2", (_interval(one.stiffness.total95) for one in joints)),
+        (True, "damping [N m s/rad]", (one.damping.value for one in joints)),
+        (True, repeats, (_interval(one.damping.repeat95) for one in joints)),
+        (total, "total 95 %", (_interval(one.damping.total95) for one in joints)),
+        (friction, "friction [N m]", (one.frictionloss.value for one in joints)),
+        (falls, "in motion [N m]", moving),
+        (delays, "delay [ms];1", (1000.0 * one.delay_s.value for one in joints)),
         (paper, "paper, Table I", published),
-        (True, "nominal error [dB];2", (one.naive_error_db for one in joints)),
-        (True, "error [dB];2", (one.error_db for one in joints)),
-        (True, "lowest coherence", (one.coherence_min for one in joints)),
+        (True, "nominal error [dB];2", (one.quality.nominal_error_db for one in joints)),
+        (True, "error [dB];2", (one.quality.error_db for one in joints)),
+        (True, "lowest coherence", (one.quality.coherence_min for one in joints)),
     ]
     shown = [(head, cells) for wanted, head, cells in columns if wanted]
     simulator = gains.simulator
@@ -196,7 +189,7 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     if total:
         notes.append(
             "repeat: spread of the repeats. total: also the change between amplitudes and between "
-            "parts of the excitation." + " by magnitude alone: the paper's grid." * searched
+            "parts of the excitation."
         )
     else:
         notes.append(f"95 % intervals over {'blocks of the recordings' if in_time else 'repeats'}.")
@@ -209,6 +202,11 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
         )
     rows = zip(*(cells for _, cells in shown), strict=True)
     return table(" | ".join(head for head, _ in shown), rows, *notes)
+
+
+def _interval(ends: Interval) -> Interval | str:
+    """Return an interval as the cell of a table; a value without one was held."""
+    return ends if np.isfinite(ends).all() else "held"
 
 
 def _comparable(gains: MatchedGains) -> bool:
@@ -311,7 +309,8 @@ def _scale_table(
     rows = []
     for group, names in members.items():
         if known := [name for name in names if min(drive.get(name, (0.0,))) > 0.0]:
-            own = [(gains.joints[name].stiffness, gains.joints[name].damping) for name in known]
+            joints = [gains.joints[name] for name in known]
+            own = [(joint.stiffness.value, joint.damping.value) for joint in joints]
             ratios = np.array(own) / np.array([drive[name] for name in known])
             rows.append((joint_words(group), *ratios.mean(axis=0)))
     return table(

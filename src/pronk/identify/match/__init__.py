@@ -3,7 +3,7 @@
 Start at `pipeline.match_frameworks`. In order: `measured_joint` (responses ready to be compared),
 `simulated` (the same of the simulator), `grid` (the paper's search, whole or linearized),
 `response_fit` (off the grid, and mode drive) or `arm` (joints that moved together), `result`,
-`randomization` (what training randomizes), `gains`. The one list of parameters is `parameters`;
+`ranges` (what training randomizes), `gains`. The one list of parameters is `parameters`;
 problems and solvers are in `fit`, confidence intervals in `uncertainty`.
 """
 

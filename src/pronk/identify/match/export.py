@@ -101,22 +101,27 @@ def actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list
             of_group = [gains.joints[j.name] for j in members if j.name in gains.joints]
             drive = part[0].drive
             known = matched or of_group
-            dry = [j.frictionloss for j in known if not np.isnan(j.frictionloss)]
-            centre = matched[0] if per == "joint" and matched else group
+            friction = [joint.frictionloss.value for joint in known]
+            dry = [value for value in friction if not np.isnan(value)]
+            stiffness = group.stiffness
+            damping = group.damping
+            if per == "joint" and matched:
+                stiffness = matched[0].stiffness.value
+                damping = matched[0].damping.value
             out.append(
                 Actuator(
                     name=group_name if per == "group" else part[0].name,
                     joints=tuple(j.name for j in part),
                     own_joints=tuple(j.own_name or j.name for j in part),
                     unmatched=tuple(j.name for j in part if j.name not in gains.joints),
-                    stiffness=centre.stiffness,
-                    damping=centre.damping,
-                    stiffness_range=_about(centre.stiffness, group.stiffness_range),
-                    damping_range=_about(centre.damping, group.damping_range),
-                    armature=_mean([j.armature for j in known], drive.armature),
+                    stiffness=stiffness,
+                    damping=damping,
+                    stiffness_range=_about(stiffness, group.stiffness_range),
+                    damping_range=_about(damping, group.damping_range),
+                    armature=_mean([joint.armature.value for joint in known], drive.armature),
                     frictionloss=_mean(dry, drive.frictionloss),
-                    stribeck=_mean([j.stribeck for j in known], 0.0),
-                    delay_s=_mean([j.delay_s for j in known], 0.0),
+                    stribeck=_mean([joint.stribeck.value for joint in known], 0.0),
+                    delay_s=_mean([joint.delay_s.value for joint in known], 0.0),
                     drive=drive,
                 )
             )

@@ -1,16 +1,17 @@
-"""MatchedGains: the gains that make the simulated joint respond like the real one.
+"""Matched gains: the file `gains.yaml`, which training, export and prediction read.
 
-`gains.yaml` has the simulator that the gains hold for, a line per joint, a line per joint group.
+The file holds the simulator that the gains hold for, the drive of each joint with the intervals of
+its parameters, the training gains and ranges of each joint group, and the hashes of the logs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from pronk.errors import ArtefactError
@@ -18,93 +19,131 @@ from pronk.files import converted, read_yaml, write_text
 from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.names import check_names
 
-SCHEMA = "pronk/gains/1"
+SCHEMA = "pronk/gains/2"
+FIRST_SCHEMA = "pronk/gains/1"
+"""Schema whose joints had one flat list of numbers. It is still read: the contract of a policy
+holds the SHA-256 of the file that it was trained with, so those files cannot be written anew."""
+
 NAN = float("nan")
-_BOUNDS = {
-    **dict.fromkeys(("stiffness", "damping", "armature", "frictionloss"), (0.0, 1e6)),
-    **dict.fromkeys(("stiffness_range", "damping_range"), (0.0, 1e6)),
-    "stribeck": (0.0, 1.0),
-    "delay_s": (0.0, 1.0),
-}
-"""Smallest and largest value that is read, in units of the fields; 1e6 is beyond any joint."""
+Interval = tuple[float, float]
+"""Lower and upper end."""
+UNKNOWN: Interval = (NAN, NAN)
+"""Interval of a value that was held, or of which nothing is known."""
+
+LARGEST = 1e6
+"""Largest stiffness, damping, armature, friction or range that is read, in SI units. The stiffest
+joints of small robots have 1e3 N m/rad; a larger number is a wrong unit or a damaged file."""
+LONGEST_DELAY_S = 1.0
+"""Longest command delay that is read [s]; drives of robots have a few milliseconds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedValue:
+    """A parameter of a joint's drive with its two 95 % intervals, in the unit of the parameter.
+
+    Intervals are NaN where the value was held, or where nothing is known about its uncertainty.
+    """
+
+    value: float
+    repeat95: Interval = UNKNOWN
+    """95 % interval by the spread of the repeats alone."""
+    total95: Interval = UNKNOWN
+    """95 % interval with the change between amplitudes and between parts of the recording, which
+    the model does not explain."""
+
+    def scaled(self, factor: float) -> FittedValue:
+        """Return the value and its intervals times a factor that is not negative."""
+        return FittedValue(
+            value=factor * self.value,
+            repeat95=(factor * self.repeat95[0], factor * self.repeat95[1]),
+            total95=(factor * self.total95[0], factor * self.total95[1]),
+        )
+
+
+ZERO = FittedValue(value=0.0)
+"""Parameter that a drive does not have."""
+NOT_STATED = FittedValue(value=NAN)
+"""Parameter for which the robot's own figure holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueParameter:
-    """One parameter of a joint's drive, by a torque channel."""
+    """A parameter of a joint's drive, identified by a torque channel."""
 
     value: float
-    """NaN if the recordings leave it open."""
-    ci95: tuple[float, float]
+    """Value in the unit of `match.torque.UNITS`; NaN if the recordings leave it open."""
+    ci95: Interval
     """95 % interval by blocks of the recordings; NaN where they leave it open."""
     reason: str = ""
-    """Why it is not identified; empty if it is."""
+    """Why the parameter is not identified; empty if it is."""
 
     @property
     def identified(self) -> bool:
-        """True if the recordings identify it."""
+        """True if the recordings identify the parameter."""
         return not self.reason
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointGains:
-    """Matched gains of one joint."""
+class MatchQuality:
+    """How well the simulated response of a joint agrees with the measured one."""
 
-    stiffness: float
-    """[N m/rad]"""
-    damping: float
-    """[N m s/rad]"""
-    grid_stiffness: float = NAN
-    """The paper's grid optimum [N m/rad]; NaN without a grid."""
-    grid_damping: float = NAN
-    """The paper's grid optimum [N m s/rad]; NaN without a grid."""
-    stiffness_ci95: tuple[float, float] = (NAN, NAN)
-    """95 % interval by the repeats alone."""
-    damping_ci95: tuple[float, float] = (NAN, NAN)
-    stiffness_total95: tuple[float, float] = (NAN, NAN)
-    """95 % interval with the change between amplitudes and parts of the log; NaN if not known."""
-    damping_total95: tuple[float, float] = (NAN, NAN)
-    covariance: tuple[tuple[float, float], tuple[float, float]] = ((NAN, NAN), (NAN, NAN))
-    """Of (stiffness, damping), repeats as the unit."""
-    band_hz: tuple[float, float] = (NAN, NAN)
+    band_hz: Interval = UNKNOWN
+    """Lowest and highest frequency that was compared [Hz]."""
     error_db: float = NAN
-    """Root mean square of the gain error in the band at the optimum [dB]."""
-    naive_error_db: float = NAN
-    """The same with the gains of the real drive put into the simulator."""
+    """Root mean square of the gain error in the band with the matched gains [dB]."""
+    nominal_error_db: float = NAN
+    """Root mean square of the gain error in the band with the gains of the real drive [dB]."""
     coherence_min: float = NAN
-    armature: float
-    """[kg m^2]"""
+    """Lowest coherence of the measured response in the band, 0 to 1."""
     amplitude_spread: float = NAN
-    """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
-    frictionloss: float = NAN
-    """Dry friction that goes with the gains [N m]; NaN: that of the robot's drive."""
-    stribeck: float = 0.0
-    """Share of it that motion takes away, at the Stribeck speed of the robot's drive."""
-    delay_s: float = 0.0
-    """Command delay that goes with the gains [s]."""
+    """Largest relative change of the stiffness between amplitudes; NaN with one amplitude."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointGains:
+    """Parameters of the simulated drive with which a joint responds like the real one."""
+
+    stiffness: FittedValue
+    """Stiffness of the drive [N m/rad]."""
+    damping: FittedValue
+    """Damping of the drive [N m s/rad]."""
+    armature: FittedValue
+    """Rotor inertia at the joint, through the gear [kg m^2]."""
+    frictionloss: FittedValue = NOT_STATED
+    """Dry friction at rest that goes with the gains [N m]; NaN for that of the robot's drive."""
+    stribeck: FittedValue = ZERO
+    """Share of the dry friction that motion takes away, 0 to 1."""
+    delay_s: FittedValue = ZERO
+    """Delay of the command that goes with the gains [s]."""
+    covariance: tuple[Interval, Interval] = (UNKNOWN, UNKNOWN)
+    """Covariance of (stiffness, damping), with the repeats as the unit of uncertainty."""
+    quality: MatchQuality = MatchQuality()
+    """Agreement of the simulated with the measured response."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
-    """The drive by a torque channel (mode drive): names of `match.torque.UNITS`."""
+    """The drive by a torque channel (mode `drive`), by the names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
-    """Warnings, for instance `at the edge of the grid` or `no match`."""
-    unchecked: tuple[str, ...] = ()
-    """Errors that would leave no trace in the logs, for instance wrongly stated drive gains."""
+    """Warnings about this match, one sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupGains:
-    """What training uses for one joint group."""
+    """Gains and ranges of one joint group, from which training draws."""
 
     stiffness: float
+    """Middle of the range of the stiffness [N m/rad]."""
     damping: float
+    """Middle of the range of the damping [N m s/rad]."""
     stiffness_range: float
-    """Half-width of the uniform randomization about `stiffness` [N m/rad]."""
+    """Half-width of the uniform distribution of the stiffness [N m/rad]."""
     damping_range: float
-    """Half-width of the uniform randomization about `damping` [N m s/rad]."""
+    """Half-width of the uniform distribution of the damping [N m s/rad]."""
     frictionloss: float = NAN
-    """Mean dry friction that goes with the gains [N m]; NaN: that of the robot's drives."""
-    ellipsoid: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
-    """Shape matrix E of the joint ellipsoid: {x : (x - c)^T E^-1 (x - c) <= 1} covers the data."""
+    """Mean dry friction that goes with the gains [N m]; NaN for that of the robot's drives."""
+    ellipsoid: tuple[Interval, Interval] = ((0.0, 0.0), (0.0, 0.0))
+    """Shape matrix E of the ellipsoid `{x : (x - c)^T E^-1 (x - c) <= 1}` of (stiffness, damping)
+    that covers the joints and their intervals."""
     ellipsoid_center: tuple[float, float] = (0.0, 0.0)
+    """Centre c of the ellipsoid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,87 +151,272 @@ class MatchedGains:
     """Matched gains of a robot, and what they rest on."""
 
     robot: str
+    """Name of the robot."""
     simulator: SimulatorInfo
+    """Simulator that the gains hold for."""
     joints: Mapping[str, JointGains]
+    """Matched joints, in the robot's order."""
     groups: Mapping[str, GroupGains]
+    """Joint groups with a matched joint, in the robot's order."""
     logs: Mapping[str, str] = field(default_factory=dict)
-    """File name to SHA-256 of every log that went in."""
+    """SHA-256 of every log that went in, by its file name."""
     virtual: bool = False
     """True if any log came from pronk's virtual robot."""
 
-
-class _Flow(dict[str, Any]):
-    """A mapping written on one line."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """SafeDumper for `_Flow`."""
+    def __repr__(self) -> str:
+        """Name the robot, the simulator and the number of matched joints."""
+        where = self.simulator.profile or self.simulator.engine
+        return f"<MatchedGains of {self.robot} for {where}: {len(self.joints)} joints>"
 
 
-_Dumper.add_representer(
-    _Flow, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data, True)
-)
+def save_gains(path: Path, gains: MatchedGains) -> None:
+    """Write `gains.yaml`, whole or not at all.
 
+    Args:
+        path: File to write; missing folders are made.
+        gains: Matched gains.
 
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.6g}")
-    if isinstance(value, (tuple, list)):
-        return [_rounded(v) for v in value]
-    if isinstance(value, Mapping):
-        return {name: _line(one) for name, one in value.items()}
-    return value
-
-
-def _omitted(name: str, value: Any) -> bool:
-    """True for empty text and tuples, and for optional parameters that are not used."""
-    if value in ((), "", {}):
-        return True
-    if name in ("frictionloss", "stiffness_total95", "damping_total95"):
-        return bool(np.isnan(value).any())
-    return bool(name in ("delay_s", "stribeck") and value == 0.0)
-
-
-def _line(data: object) -> _Flow:
-    return _Flow({k: _rounded(v) for k, v in vars(data).items() if not _omitted(k, v)})
-
-
-def save(path: Path, gains: MatchedGains) -> None:
-    """Write `gains.yaml`, whole or not at all."""
-    body: dict[str, Any] = {
+    Raises:
+        PronkError: The file cannot be written.
+    """
+    joints = {}
+    for name, joint in gains.joints.items():
+        joints[name] = _joint_entry(joint)
+    groups = {}
+    for name, group in gains.groups.items():
+        groups[name] = _group_entry(group)
+    body = {
         "schema": SCHEMA,
         "robot": gains.robot,
         "virtual": gains.virtual,
-        "simulator": _line(gains.simulator),
-        "joints": {name: _line(joint) for name, joint in gains.joints.items()},
-        "groups": {name: _line(group) for name, group in gains.groups.items()},
+        "simulator": _simulator_entry(gains.simulator),
+        "joints": joints,
+        "groups": groups,
         "logs": dict(gains.logs),
     }
     write_text(path, yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=10_000))
 
 
-def load(path: Path) -> MatchedGains:
+def load_gains(path: Path) -> MatchedGains:
     """Read `gains.yaml`.
 
+    Args:
+        path: File that `pronk match` or `pronk translate` wrote.
+
+    Returns:
+        The matched gains.
+
     Raises:
-        ArtefactError: Missing, not YAML, of another schema, with fields missing or misspelled, or
-            with a name or a value that cannot be.
+        ArtefactError: The file is missing, is not YAML, is of another schema, has a field that is
+            missing or misspelled, or has a name or a value that cannot be.
     """
     body = read_yaml(path, missing="`pronk match` writes one")
-    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
-        got = body.get("schema") if isinstance(body, dict) else type(body).__name__
-        raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")
-    del body["schema"]
+    schema = body.pop("schema", None) if isinstance(body, dict) else type(body).__name__
+    if schema not in (SCHEMA, FIRST_SCHEMA):
+        raise ArtefactError(
+            f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r} and {FIRST_SCHEMA!r}. "
+            "Match the logs again with `pronk match`."
+        )
+    if schema == FIRST_SCHEMA and isinstance(body.get("joints"), dict):
+        joints = {}
+        for name, entry in body["joints"].items():
+            joints[name] = _joint_of_first_schema(entry)
+        body["joints"] = joints
     gains = converted(body, MatchedGains, path)
     check_names((gains.robot, *gains.joints, *gains.groups), str(path), ArtefactError)
-    for kind, entries in (("joints", gains.joints), ("groups", gains.groups)):
-        for name, entry in entries.items():
-            for key, (low, high) in _BOUNDS.items():
-                value = getattr(entry, key, NAN)
-                optional = key == "frictionloss" and np.isnan(value)
-                if hasattr(entry, key) and not (optional or low <= value <= high):
-                    raise ArtefactError(
-                        f"{path}: {key} of {kind}.{name} is {value:g}; expected {low:g} to "
-                        f"{high:g}."
-                    )
+    for name, joint in gains.joints.items():
+        _check_joint(joint, f"{path}: joints.{name}")
+    for name, group in gains.groups.items():
+        _check_group(group, f"{path}: groups.{name}")
     return gains
+
+
+# ---- what the file must hold ----
+
+
+def _check_joint(joint: JointGains, place: str) -> None:
+    """Refuse values of a joint that no drive has; errors begin with `place`."""
+    _check_value(joint.stiffness.value, LARGEST, f"{place}.stiffness")
+    _check_value(joint.damping.value, LARGEST, f"{place}.damping")
+    _check_value(joint.armature.value, LARGEST, f"{place}.armature")
+    if not math.isnan(joint.frictionloss.value):
+        _check_value(joint.frictionloss.value, LARGEST, f"{place}.frictionloss")
+    _check_value(joint.stribeck.value, 1.0, f"{place}.stribeck")
+    _check_value(joint.delay_s.value, LONGEST_DELAY_S, f"{place}.delay_s")
+
+
+def _check_group(group: GroupGains, place: str) -> None:
+    """Refuse values of a group that no drive has; errors begin with `place`."""
+    _check_value(group.stiffness, LARGEST, f"{place}.stiffness")
+    _check_value(group.damping, LARGEST, f"{place}.damping")
+    _check_value(group.stiffness_range, LARGEST, f"{place}.stiffness_range")
+    _check_value(group.damping_range, LARGEST, f"{place}.damping_range")
+    if not math.isnan(group.frictionloss):
+        _check_value(group.frictionloss, LARGEST, f"{place}.frictionloss")
+
+
+def _check_value(value: float, largest: float, place: str) -> None:
+    """Refuse a value that is not between 0 and the largest."""
+    if not 0.0 <= value <= largest:
+        raise ArtefactError(f"{place} is {value:g}; expected 0 to {largest:g}.")
+
+
+# ---- entries of the file ----
+
+
+class _OneLine(dict[str, Any]):
+    """A mapping that is written on one line."""
+
+
+class _OneLineList(list[Any]):
+    """A list that is written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that writes `_OneLine` and `_OneLineList`."""
+
+
+def _represent_mapping(dumper: yaml.SafeDumper, entry: _OneLine) -> yaml.Node:
+    return dumper.represent_mapping("tag:yaml.org,2002:map", entry, flow_style=True)
+
+
+def _represent_list(dumper: yaml.SafeDumper, entry: _OneLineList) -> yaml.Node:
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", entry, flow_style=True)
+
+
+_Dumper.add_representer(_OneLine, _represent_mapping)
+_Dumper.add_representer(_OneLineList, _represent_list)
+
+
+def _simulator_entry(simulator: SimulatorInfo) -> _OneLine:
+    """Return the entry of the simulator on one line; an empty name is left out."""
+    entry = _OneLine()
+    if simulator.profile:
+        entry["profile"] = simulator.profile
+    entry["engine"] = simulator.engine
+    if simulator.version:
+        entry["version"] = simulator.version
+    entry["timestep_s"] = _rounded(simulator.timestep_s)
+    entry["decimation"] = simulator.decimation
+    entry["integrator"] = simulator.integrator
+    entry["actuator"] = simulator.actuator
+    entry["law"] = simulator.law
+    entry["iterations"] = simulator.iterations
+    return entry
+
+
+def _joint_entry(joint: JointGains) -> dict[str, Any]:
+    """Return the entry of a joint: a line for each parameter; what is not known is left out."""
+    entry: dict[str, Any] = {
+        "stiffness": _value_entry(joint.stiffness),
+        "damping": _value_entry(joint.damping),
+        "armature": _value_entry(joint.armature),
+    }
+    if not math.isnan(joint.frictionloss.value):
+        entry["frictionloss"] = _value_entry(joint.frictionloss)
+    if joint.stribeck.value != 0.0:
+        entry["stribeck"] = _value_entry(joint.stribeck)
+    if joint.delay_s.value != 0.0:
+        entry["delay_s"] = _value_entry(joint.delay_s)
+    if math.isfinite(joint.covariance[0][0]):
+        entry["covariance"] = _matrix_entry(joint.covariance)
+    entry["quality"] = _quality_entry(joint.quality)
+    if joint.torque:
+        entry["torque"] = {}
+        for name, parameter in joint.torque.items():
+            entry["torque"][name] = _torque_entry(parameter)
+    if joint.flags:
+        entry["flags"] = list(joint.flags)
+    return entry
+
+
+def _value_entry(fitted: FittedValue) -> _OneLine:
+    entry = _OneLine(value=_rounded(fitted.value))
+    if math.isfinite(fitted.repeat95[0]):
+        entry["repeat95"] = _interval_entry(fitted.repeat95)
+    if math.isfinite(fitted.total95[0]):
+        entry["total95"] = _interval_entry(fitted.total95)
+    return entry
+
+
+def _quality_entry(quality: MatchQuality) -> _OneLine:
+    entry = _OneLine()
+    if math.isfinite(quality.band_hz[0]):
+        entry["band_hz"] = _interval_entry(quality.band_hz)
+    numbers = {
+        "error_db": quality.error_db,
+        "nominal_error_db": quality.nominal_error_db,
+        "coherence_min": quality.coherence_min,
+        "amplitude_spread": quality.amplitude_spread,
+    }
+    for name, value in numbers.items():
+        if math.isfinite(value):
+            entry[name] = _rounded(value)
+    return entry
+
+
+def _torque_entry(parameter: TorqueParameter) -> _OneLine:
+    entry = _OneLine(value=_rounded(parameter.value), ci95=_interval_entry(parameter.ci95))
+    if parameter.reason:
+        entry["reason"] = parameter.reason
+    return entry
+
+
+def _group_entry(group: GroupGains) -> _OneLine:
+    entry = _OneLine(
+        stiffness=_rounded(group.stiffness),
+        damping=_rounded(group.damping),
+        stiffness_range=_rounded(group.stiffness_range),
+        damping_range=_rounded(group.damping_range),
+    )
+    if not math.isnan(group.frictionloss):
+        entry["frictionloss"] = _rounded(group.frictionloss)
+    entry["ellipsoid"] = _matrix_entry(group.ellipsoid)
+    entry["ellipsoid_center"] = _interval_entry(group.ellipsoid_center)
+    return entry
+
+
+def _interval_entry(interval: Sequence[float]) -> _OneLineList:
+    return _OneLineList(_rounded(end) for end in interval)
+
+
+def _matrix_entry(matrix: Sequence[Sequence[float]]) -> _OneLineList:
+    return _OneLineList(_interval_entry(row) for row in matrix)
+
+
+def _rounded(value: float) -> float:
+    """Round to six significant digits, a tenth of what any of these numbers is known to."""
+    return float(f"{value:.6g}")
+
+
+# ---- the first schema ----
+
+
+def _joint_of_first_schema(entry: Any) -> Any:
+    """Return a joint's entry of the first schema as one of the present schema.
+
+    Fields that the first schema did not have stay in the entry, so that they are refused by name.
+    """
+    if not isinstance(entry, dict):
+        return entry
+    flat = dict(entry)
+    joint: dict[str, Any] = {}
+    for name in ("stiffness", "damping", "armature", "frictionloss", "stribeck", "delay_s"):
+        if name in flat:
+            joint[name] = {"value": flat.pop(name)}
+    for name in ("stiffness", "damping"):
+        for interval, first_name in (("repeat95", "ci95"), ("total95", "total95")):
+            if f"{name}_{first_name}" in flat and name in joint:
+                joint[name][interval] = flat.pop(f"{name}_{first_name}")
+    quality: dict[str, Any] = {}
+    for name in ("band_hz", "error_db", "coherence_min", "amplitude_spread"):
+        if name in flat:
+            quality[name] = flat.pop(name)
+    if "naive_error_db" in flat:
+        quality["nominal_error_db"] = flat.pop("naive_error_db")
+    joint["quality"] = quality
+    for name in ("grid_stiffness", "grid_damping", "unchecked"):
+        # The optimum on the grid is in match.npz.
+        flat.pop(name, None)
+    joint.update(flat)
+    return joint

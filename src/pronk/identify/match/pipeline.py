@@ -44,7 +44,7 @@ from pronk.identify.match.parameters import (
     checked_names,
 )
 from pronk.identify.match.plausibility import CAUSES, findings, require_plausible
-from pronk.identify.match.randomization import matched_gains
+from pronk.identify.match.ranges import matched_gains
 from pronk.identify.match.response_fit import Fit, refine, require_sweeps, response_fit
 from pronk.identify.match.result import (
     ZERO_ARMATURE,

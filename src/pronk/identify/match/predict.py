@@ -143,12 +143,22 @@ def predict(
 
 
 def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, dict[str, float]]:
-    """Parameters of the drives of the matched joints, as `published`."""
-    out = {}
+    """Return the parameters of the drive of each matched joint, named as by `published`.
+
+    Dry friction that the gains do not state is the robot's own.
+    """
+    drives = {}
     for name, joint in gains.joints.items():
-        found, drive = vars(joint) | {"delay": joint.delay_s}, published(robot, name)
-        out[name] = drive | {n: found[n] for n in drive if not np.isnan(found.get(n, np.nan))}
-    return out
+        drive = published(robot, name)
+        drive["stiffness"] = joint.stiffness.value
+        drive["damping"] = joint.damping.value
+        drive["armature"] = joint.armature.value
+        drive["stribeck"] = joint.stribeck.value
+        drive["delay"] = joint.delay_s.value
+        if not np.isnan(joint.frictionloss.value):
+            drive["frictionloss"] = joint.frictionloss.value
+        drives[name] = drive
+    return drives
 
 
 def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:

@@ -14,7 +14,15 @@ import numpy as np
 
 from pronk.arrays import Array, ComplexArray
 from pronk.files import load_artefact, save_artefact
-from pronk.identify.match.gains import NAN, JointGains, MatchedGains, TorqueParameter
+from pronk.identify.match.gains import (
+    NAN,
+    UNKNOWN,
+    FittedValue,
+    JointGains,
+    MatchedGains,
+    MatchQuality,
+    TorqueParameter,
+)
 from pronk.identify.match.uncertainty import Estimate
 from pronk.identify.response.response import FrequencyResponse
 
@@ -121,24 +129,35 @@ class JointFit:
         )
 
     def gains(self) -> JointGains:
-        """The part of the fit that training needs."""
-        best = NAN, NAN
-        if self.grid_error.size:
-            i, j = np.unravel_index(int(np.nanargmin(self.grid_error)), self.grid_error.shape)
-            best = (float(self.grid_stiffness[i]), float(self.grid_damping[j]))
-        (a, b), (c, d) = self.covariance.tolist()
-        shared = {f.name for f in fields(JointGains)} & vars(self).keys()
-        own = {
-            "grid_stiffness": best[0],
-            "grid_damping": best[1],
-            "covariance": ((a, b), (c, d)),
-            "amplitude_spread": amplitude_spread(self.amplitude_gains),
-            "flags": tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),
-        }
-        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
-            own[f"{name}_ci95"] = self.ci95.get(name, (value, value))
-            own[f"{name}_total95"] = self.total95.get(name, (NAN, NAN))
-        return JointGains(**{name: getattr(self, name) for name in shared} | own)
+        """Return the part of the fit that training needs."""
+        stiffness_row, damping_row = self.covariance.tolist()
+        flags = [flag for flag in self.flags if not flag.startswith(ZERO_ARMATURE)]
+        return JointGains(
+            stiffness=self._fitted("stiffness", self.stiffness),
+            damping=self._fitted("damping", self.damping),
+            armature=self._fitted("armature", self.armature),
+            frictionloss=self._fitted("frictionloss", self.frictionloss),
+            stribeck=self._fitted("stribeck", self.stribeck),
+            delay_s=self._fitted("delay", self.delay_s),
+            covariance=(tuple(stiffness_row), tuple(damping_row)),
+            quality=MatchQuality(
+                band_hz=self.band_hz,
+                error_db=self.error_db,
+                nominal_error_db=self.naive_error_db,
+                coherence_min=self.coherence_min,
+                amplitude_spread=amplitude_spread(self.amplitude_gains),
+            ),
+            torque=self.torque,
+            flags=tuple(flags),
+        )
+
+    def _fitted(self, name: str, value: float) -> FittedValue:
+        """Return a parameter with its intervals."""
+        return FittedValue(
+            value=value,
+            repeat95=self.ci95.get(name, UNKNOWN),
+            total95=self.total95.get(name, UNKNOWN),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +181,7 @@ class MatchResult(MatchDetails):
 
 
 def save(path: Path, result: MatchResult) -> None:
-    """Write `match.npz`; the gains themselves are written by `pronk.identify.match.gains.save`."""
+    """Write `match.npz`; `pronk.identify.match.gains.save_gains` writes the gains."""
     details = {f.name: getattr(result, f.name) for f in fields(MatchDetails)}
     save_artefact(path, MatchDetails(**details), SCHEMA)
 

@@ -1,16 +1,17 @@
-"""Gains of one framework as gains of another in which the joint responds alike, without a log.
+"""Translation of gains from one framework to another in which the joint responds alike.
 
-Both responses are closed forms of the robot's own model (`pronk.identify.simulators.linear`).
-Stiffness and damping give the magnitude in the band; the phase that is left is a delay. Dry
-friction has to be a torque in both frameworks. It goes with the stiffness: where friction stops a
-joint, and how it damps a motion of given amplitude, depend on the ratio of both.
+No log is needed: both responses are closed forms of the robot's own model
+(`pronk.identify.simulators.linear`). Stiffness and damping give the magnitude in the band; the
+phase that remains is a delay. Dry friction has to be a torque in both frameworks. It goes with the
+stiffness: where friction stops a joint, and how it damps a motion of given amplitude, depend on the
+ratio of both.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,170 +19,242 @@ from scipy.optimize import least_squares
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.identify.match.export import actuators, profile_held, require_stable
-from pronk.identify.match.gains import NAN, GroupGains, JointGains, MatchedGains
+from pronk.identify.match.gains import (
+    ZERO,
+    FittedValue,
+    GroupGains,
+    Interval,
+    JointGains,
+    MatchedGains,
+)
 from pronk.identify.match.measured_joint import DB, Pair, rms
 from pronk.identify.simulators.linear import Plant, plant
 from pronk.identify.simulators.mujoco import JointTestRig
 from pronk.identify.simulators.profiles import Profile
 from pronk.robots.robot import RobotSpec
 
-T = TypeVar("T", JointGains, GroupGains)
-
 LOW_HZ = 1.0
-"""Lowest frequency compared: below it a joint follows its command in every drive law."""
+"""Lowest frequency compared [Hz]: below it a joint follows its command in every drive law."""
 POINTS = 60
 """Frequencies compared, evenly spaced."""
 NOT_ALIKE_DB = 0.5
-"""Error above which the joints are not alike: what a match should reach (`NO_MATCH_DB` / 2)."""
+"""Error above which the joints are not alike [dB]: what a match of a good log stays below."""
 NOT_ALIKE = "not alike"
 """Beginning of the flag of a joint that the other framework cannot give."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointTranslation:
-    """One joint in both frameworks."""
+    """Gains of one joint in both frameworks, and how alike the responses are."""
 
     before: Pair
     """Stiffness [N m/rad] and damping [N m s/rad] in the first framework."""
     after: Pair
-    """The same in the other one."""
+    """Stiffness [N m/rad] and damping [N m s/rad] in the other framework."""
     before_db: float
     """Magnitude of the other joint over the first with the same gains, root mean square [dB]."""
     after_db: float
-    """The same with the translated gains."""
+    """Magnitude of the other joint over the first with the translated gains, root mean square
+    [dB]."""
     lead_s: float
-    """How much earlier the other joint responds with the translated gains [s]."""
+    """Time by which the other joint responds earlier with the translated gains [s]."""
     rest_s: float
-    """What is left of it because a delay cannot be negative [s]; below 0."""
+    """Part of the lead that remains because a delay cannot be negative [s]; 0 or less."""
 
 
 def translate(
     gains: MatchedGains, robot: RobotSpec, to: Profile
 ) -> tuple[MatchedGains, dict[str, JointTranslation]]:
-    """Translate gains for another framework, and what changed by joint.
+    """Translate gains for another framework.
+
+    Args:
+        gains: Matched gains, which hold for a framework with a profile.
+        robot: The robot that they were matched for.
+        to: Profile of the other framework.
+
+    Returns:
+        The gains for the other framework, and what changed by joint.
 
     Raises:
-        PronkError: The gains hold for no profile, are of another robot or not stable there, or the
-            robot cannot be commanded at the profile's step.
+        PronkError: The gains hold for no profile, are of another robot or not stable in the other
+            framework, or the robot cannot be commanded at the profile's step.
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
     begin = profile_held(gains)
-    source, target = begin.robot(robot), to.robot(robot)
-    dry = begin.friction == to.friction == "N m"
-    joints, found = {}, {}
+    source = begin.robot(robot)
+    target = to.robot(robot)
+    keeps_friction = begin.friction == "N m" and to.friction == "N m"
+
+    joints: dict[str, JointGains] = {}
+    translations: dict[str, JointTranslation] = {}
     for name, joint in gains.joints.items():
-        first, other = (_plant(one, name, joint) for one in (source, target))
-        pair = joint.stiffness, joint.damping
-        found[name] = one = translated(first, other, pair, joint.delay_s)
-        flags = tuple(flag for flag in joint.flags if not flag.startswith(NOT_ALIKE))
-        if one.after_db > NOT_ALIKE_DB:
-            flags += (f"{NOT_ALIKE}: {one.after_db:.2f} dB from {begin.name}",)
-        friction = joint.frictionloss
-        if np.isnan(friction):
-            friction = source.joint(name).drive.frictionloss
-        scale = one.after[0] / pair[0], one.after[1] / pair[1]
-        joints[name] = replace(
-            _scaled(joint, *scale),
-            stiffness=one.after[0],
-            damping=one.after[1],
-            grid_stiffness=NAN,
-            grid_damping=NAN,
-            frictionloss=scale[0] * friction if dry else 0.0,
-            stribeck=joint.stribeck if dry else 0.0,
-            delay_s=max(joint.delay_s + one.lead_s, 0.0),
-            flags=flags,
+        translation = translated(
+            _linear_joint(source, name, joint),
+            _linear_joint(target, name, joint),
+            (joint.stiffness.value, joint.damping.value),
+            joint.delay_s.value,
         )
-    info = replace(to.info, decimation=target.decimation)
-    groups = {}
+        if not keeps_friction:
+            joint = replace(joint, frictionloss=ZERO, stribeck=ZERO)
+        elif math.isnan(joint.frictionloss.value):
+            published = source.joint(name).drive.frictionloss
+            joint = replace(joint, frictionloss=FittedValue(value=published))
+        translations[name] = translation
+        joints[name] = _translated_joint(joint, translation, begin.name)
+
+    groups: dict[str, GroupGains] = {}
     for name, group in gains.groups.items():
-        members = [joint.name for joint in robot.group(name) if joint.name in found]
-        scales = [np.divide(found[one].after, found[one].before) for one in members]
-        friction = float(np.mean([joints[one].frictionloss for one in members]))
-        scaled = _scaled(group, *np.mean(scales, axis=0).tolist())
-        groups[name] = replace(scaled, frictionloss=friction)
-    out = replace(gains, simulator=info, joints=joints, groups=groups)
-    require_stable(to, target, actuators(out, target, "joint"))
-    return out, found
+        members = [joint.name for joint in robot.group(name) if joint.name in joints]
+        groups[name] = _translated_group(
+            group,
+            [translations[member] for member in members],
+            [joints[member].frictionloss.value for member in members],
+        )
+
+    simulator = replace(to.info, decimation=target.decimation)
+    translated_gains = replace(gains, simulator=simulator, joints=joints, groups=groups)
+    require_stable(to, target, actuators(translated_gains, target, "joint"))
+    return translated_gains, translations
 
 
 def translated(first: Plant, other: Plant, gains: Pair, delay_s: float = 0.0) -> JointTranslation:
-    """Find the gains with which one plant responds like another, at the same frequencies."""
+    """Find the gains with which one linear joint responds like another.
+
+    Args:
+        first: The joint in the first framework.
+        other: The joint in the other framework, at the same frequencies.
+        gains: Stiffness [N m/rad] and damping [N m s/rad] in the first framework.
+        delay_s: Delay of the command that goes with them [s].
+
+    Returns:
+        Gains in both frameworks, errors and lead.
+    """
     goal = first.response(*gains)[0]
 
-    def error(x: Array) -> Array:
+    def error_db(log_gains: Array) -> Array:
         with np.errstate(over="ignore"):
-            return np.asarray(DB * np.log(np.abs(other.response(*np.exp(x))[0] / goal)))
+            stiffness, damping = np.exp(log_gains)
+            response = other.response(stiffness, damping)[0]
+            return np.asarray(DB * np.log(np.abs(response / goal)))
 
     start = np.log(np.maximum(gains, 1e-6))
-    best = least_squares(error, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
-    after = float(np.exp(best.x[0])), float(np.exp(best.x[1]))
-    phase = np.unwrap(np.angle(other.response(*after)[0] / goal))
-    lead = float(phase @ first.omega / (first.omega @ first.omega))
+    solution = least_squares(error_db, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
+    stiffness = float(np.exp(solution.x[0]))
+    damping = float(np.exp(solution.x[1]))
+    phase = np.unwrap(np.angle(other.response(stiffness, damping)[0] / goal))
+    # Slope of a straight line through zero by least squares.
+    lead_s = float(phase @ first.omega / (first.omega @ first.omega))
     return JointTranslation(
         before=gains,
-        after=after,
-        before_db=rms(error(start)),
-        after_db=rms(best.fun),
-        lead_s=lead,
-        rest_s=min(delay_s + lead, 0.0),
+        after=(stiffness, damping),
+        before_db=rms(error_db(start)),
+        after_db=rms(solution.fun),
+        lead_s=lead_s,
+        rest_s=min(delay_s + lead_s, 0.0),
     )
 
 
 def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile) -> MatchedGains:
-    """Gains of a framework that no log was matched with, by joint; they are taken for exact."""
-    known = begin.robot(robot)
-    joints = {
-        name: JointGains(
-            stiffness=kp,
-            damping=kd,
-            armature=robot.joint(name).drive.armature,
-            band_hz=robot.joint(name).band_hz,
+    """Make gains of a framework that no log was matched with; they are taken for exact.
+
+    Args:
+        robot: The robot.
+        by_joint: Stiffness [N m/rad] and damping [N m s/rad] by joint.
+        begin: Profile of the framework that they hold for.
+
+    Returns:
+        Gains whose groups have the mean of their joints.
+    """
+    joints = {}
+    for name, (stiffness, damping) in by_joint.items():
+        joints[name] = JointGains(
+            stiffness=FittedValue(value=stiffness),
+            damping=FittedValue(value=damping),
+            armature=FittedValue(value=robot.joint(name).drive.armature),
         )
-        for name, (kp, kd) in by_joint.items()
-    }
     groups = {}
     for group in robot.groups:
-        if pairs := [by_joint[one.name] for one in robot.group(group) if one.name in by_joint]:
+        pairs = [by_joint[joint.name] for joint in robot.group(group) if joint.name in by_joint]
+        if pairs:
             stiffness, damping = np.mean(pairs, axis=0).tolist()
-            spread = (np.ptp(pairs, axis=0) / 2.0).tolist()
+            stiffness_range, damping_range = (np.ptp(pairs, axis=0) / 2.0).tolist()
             groups[group] = GroupGains(
                 stiffness=stiffness,
                 damping=damping,
-                stiffness_range=spread[0],
-                damping_range=spread[1],
+                stiffness_range=stiffness_range,
+                damping_range=damping_range,
             )
-    info = replace(begin.info, decimation=known.decimation)
-    return MatchedGains(robot=robot.name, simulator=info, joints=joints, groups=groups)
+    simulator = replace(begin.info, decimation=begin.robot(robot).decimation)
+    return MatchedGains(robot=robot.name, simulator=simulator, joints=joints, groups=groups)
 
 
-def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
-    """Linearize a joint about the default pose, with its matched armature."""
-    first = robot.joint(robot.joint(name).original[0])
-    drive = replace(
-        first.drive, rotor_inertia=gains.armature / first.drive.gear_ratio**2, frictionloss=0.0
-    )
-    changed = {first.name: replace(first, drive=drive)}
-    own = replace(robot, joints=tuple(changed.get(one.name, one) for one in robot.joints))
-    low, high = gains.band_hz if np.isfinite(gains.band_hz).all() else first.band_hz
+def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
+    """Linearize a joint about the default pose, with its matched armature and no dry friction."""
+    original = robot.joint(robot.joint(name).original[0])
+    rotor_inertia = gains.armature.value / original.drive.gear_ratio**2
+    drive = replace(original.drive, rotor_inertia=rotor_inertia, frictionloss=0.0)
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, drive=drive) if joint.name == original.name else joint)
+    changed = replace(robot, joints=tuple(joints))
+
+    low, high = gains.quality.band_hz
+    if not (math.isfinite(low) and math.isfinite(high)):
+        low, high = robot.joint(name).band_hz
     hz = np.linspace(max(low, min(LOW_HZ, 0.5 * high)), high, POINTS)
-    pose = np.array([robot.joint(joint).default_position for joint in first.chain])
-    with JointTestRig(own, first.name, threads=1) as rig:
-        order = [first.chain.index(joint) for joint in rig.joints]
+    pose = np.array([robot.joint(joint).default_position for joint in original.chain])
+    with JointTestRig(changed, original.name, threads=1) as rig:
+        order = [original.chain.index(joint) for joint in rig.joints]
         return plant(rig, pose[order], 2.0 * np.pi * hz)
 
 
-def _scaled(gains: T, kp: float, kd: float) -> T:
-    """Gains of a joint or a group with the fields of stiffness and damping times two factors."""
-    out: dict[str, Any] = {}
-    for name, value in vars(gains).items():
-        if name.startswith(("stiffness", "damping")):
-            factor = kp if name.startswith("stiffness") else kd
-            scaled = (factor * np.array(value)).tolist()
-            out[name] = tuple(scaled) if isinstance(value, tuple) else scaled
-        elif name in ("covariance", "ellipsoid"):
-            (kk, kv), (vk, vv) = value
-            out[name] = (kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)
-        elif name == "ellipsoid_center":
-            out[name] = kp * value[0], kd * value[1]
-    return replace(gains, **out)
+def _translated_joint(joint: JointGains, translation: JointTranslation, begin: str) -> JointGains:
+    """Return the gains of a joint in the other framework; `begin` names the first one.
+
+    Intervals are scaled as their gain is, the dry friction as the stiffness is.
+    """
+    stiffness_scale = translation.after[0] / translation.before[0]
+    damping_scale = translation.after[1] / translation.before[1]
+    flags = [flag for flag in joint.flags if not flag.startswith(NOT_ALIKE)]
+    if translation.after_db > NOT_ALIKE_DB:
+        flags.append(f"{NOT_ALIKE}: {translation.after_db:.2f} dB from {begin}")
+    stiffness = replace(joint.stiffness.scaled(stiffness_scale), value=translation.after[0])
+    damping = replace(joint.damping.scaled(damping_scale), value=translation.after[1])
+    return replace(
+        joint,
+        stiffness=stiffness,
+        damping=damping,
+        frictionloss=joint.frictionloss.scaled(stiffness_scale),
+        delay_s=FittedValue(value=max(joint.delay_s.value + translation.lead_s, 0.0)),
+        covariance=_scaled_matrix(joint.covariance, stiffness_scale, damping_scale),
+        flags=tuple(flags),
+    )
+
+
+def _translated_group(
+    group: GroupGains, translations: list[JointTranslation], frictions: list[float]
+) -> GroupGains:
+    """Return the training gains of a group, scaled by the mean of its joints."""
+    scales = [np.divide(joint.after, joint.before) for joint in translations]
+    stiffness_scale, damping_scale = np.mean(scales, axis=0).tolist()
+    center = group.ellipsoid_center
+    return GroupGains(
+        stiffness=stiffness_scale * group.stiffness,
+        damping=damping_scale * group.damping,
+        stiffness_range=stiffness_scale * group.stiffness_range,
+        damping_range=damping_scale * group.damping_range,
+        frictionloss=float(np.mean(frictions)),
+        ellipsoid=_scaled_matrix(group.ellipsoid, stiffness_scale, damping_scale),
+        ellipsoid_center=(stiffness_scale * center[0], damping_scale * center[1]),
+    )
+
+
+def _scaled_matrix(
+    matrix: tuple[Interval, Interval], stiffness_scale: float, damping_scale: float
+) -> tuple[Interval, Interval]:
+    """Return a covariance or shape matrix of (stiffness, damping) of scaled gains."""
+    mixed_scale = stiffness_scale * damping_scale
+    stiffness_row = (stiffness_scale**2 * matrix[0][0], mixed_scale * matrix[0][1])
+    damping_row = (mixed_scale * matrix[1][0], damping_scale**2 * matrix[1][1])
+    return stiffness_row, damping_row

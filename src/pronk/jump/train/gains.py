@@ -14,7 +14,7 @@ from typing import Literal
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
-from pronk.identify.match.gains import GroupGains, MatchedGains, load
+from pronk.identify.match.gains import GroupGains, MatchedGains, load_gains
 from pronk.identify.simulators.mujoco import mujoco_info
 from pronk.robots.robot import RobotSpec
 
@@ -80,11 +80,12 @@ def training_gains(
     for group in robot.groups:
         own = matched.groups[group]
         groups[group] = _about(groups[group], own) if naive else own
+    delays = [joint.delay_s.value for joint in matched.joints.values()]
     return TrainingGains(
         name="naive" if naive else "matched",
         robot=robot.name,
         groups=groups,
-        delay_s=math.fsum(joint.delay_s for joint in matched.joints.values()) / len(matched.joints),
+        delay_s=math.fsum(delays) / len(delays),
         sha256=sha256(path),
         virtual=matched.virtual,
     )
@@ -123,7 +124,7 @@ def _about(nominal: GroupGains, ranges: GroupGains) -> GroupGains:
 
 
 def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
-    gains = load(path)
+    gains = load_gains(path)
     if gains.robot != robot.name:
         raise ArtefactError(
             f"{path}: gains of {gains.robot}; training {robot.name} needs gains of {robot.name}, "

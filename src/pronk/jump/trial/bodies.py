@@ -301,9 +301,9 @@ def match_body(
         logs = read_logs(files, processes=processes, robot=robot)
         found = match_logs(logs, robot, settings=SETTINGS)
         result_file.save(folder / MATCH, found)
-        gains_file.save(folder / GAINS, found.gains)
+        gains_file.save_gains(folder / GAINS, found.gains)
         stages(f"{name}: match", 1.0)
-    return gains_file.load(folder / GAINS), read_logs(files, processes=processes, robot=robot)
+    return gains_file.load_gains(folder / GAINS), read_logs(files, processes=processes, robot=robot)
 
 
 # ---- error of gains ----
@@ -346,7 +346,9 @@ def _errors(
         both = zip(*own, strict=True)
         pairs[f"training gains of {subject.name}"] = dict(zip(names, both, strict=True))
     pairs[NAIVE] = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
-    pairs[MATCHED] = {name: (one.stiffness, one.damping) for name, one in matched.joints.items()}
+    pairs[MATCHED] = {
+        name: (joint.stiffness.value, joint.damping.value) for name, joint in matched.joints.items()
+    }
     groups = {name: (one.stiffness, one.damping) for name, one in matched.groups.items()}
     pairs[TRAINABLE] = {joint.name: groups[joint.group] for joint in robot.joints}
     return gains_errors(logs, robot, pairs)
