@@ -1,7 +1,7 @@
-"""JointLog in MCAP: written as it is recorded, and read up to wherever the file was cut.
+"""JointLog in MCAP: written as it is recorded, and read up to where the file was cut.
 
 - `/sweep/header`, once, first: robot, joints, gains, pose, units, whether the robot is virtual;
-- `/sweep/segment`, before its samples, so that a cut log has it;
+- `/sweep/segment`, before its samples, so that a log that was cut has it;
 - `/sweep/sample`, one per measured state: command in force, response, instantaneous frequency;
 - `/sweep/end`, last: whether the sweep is complete, and if not, why.
 
@@ -11,10 +11,10 @@ Chunks are short and flushed as they fill, so that a power cut costs half a seco
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -35,39 +35,73 @@ from pronk.identify.logs.mcap import (
 )
 from pronk.identify.logs.segment import Segment
 
-Floats = Sequence[float] | Array
-
 SCHEMA = "pronk/sweep/1"
-HEADER, SEGMENT, SAMPLE, END = "/sweep/header", "/sweep/segment", "/sweep/sample", "/sweep/end"
+HEADER = "/sweep/header"
+SEGMENT = "/sweep/segment"
+SAMPLE = "/sweep/sample"
+END = "/sweep/end"
 TOPICS: dict[str, dict[str, Any]] = {
-    HEADER: {"schema": STRING, "robot": STRING, "joints": STRINGS}
-    | {"stiffness": NUMBERS, "damping": NUMBERS, "pose": NUMBERS, "units": STRINGS}
-    | {"virtual": BOOLEAN, "metadata": {"type": "object"}},
-    SEGMENT: {"kind": STRING, "joints": STRINGS, "start": NUMBER, "stop": NUMBER}
-    | {"amplitude": NUMBER, "repeat": INTEGER, "band_hz": NUMBERS, "period_s": NUMBER}
-    | {"clamped": STRINGS},
-    SAMPLE: {"t": NUMBER, "command": NUMBERS, "position": NUMBERS, "velocity": NUMBERS}
-    | {"torque": NUMBERS, "frequency": NUMBER, "segment": INTEGER},
+    HEADER: {
+        "schema": STRING,
+        "robot": STRING,
+        "joints": STRINGS,
+        "stiffness": NUMBERS,
+        "damping": NUMBERS,
+        "pose": NUMBERS,
+        "units": STRINGS,
+        "virtual": BOOLEAN,
+        "metadata": {"type": "object"},
+    },
+    SEGMENT: {
+        "kind": STRING,
+        "joints": STRINGS,
+        "start": NUMBER,
+        "stop": NUMBER,
+        "amplitude": NUMBER,
+        "repeat": INTEGER,
+        "band_hz": NUMBERS,
+        "period_s": NUMBER,
+        "clamped": STRINGS,
+    },
+    SAMPLE: {
+        "t": NUMBER,
+        "command": NUMBERS,
+        "position": NUMBERS,
+        "velocity": NUMBERS,
+        "torque": NUMBERS,
+        "frequency": NUMBER,
+        "segment": INTEGER,
+    },
     END: {"complete": BOOLEAN, "reason": STRING},
 }
+"""Properties of the messages of each topic, as JSON Schema has them."""
 _FLUSH_SAMPLES = 256
 """Samples in a chunk: half a second at 500 Hz."""
 _BLOCK = 128
-"""Samples that are parsed together; their lists are too few to start Python's garbage collector."""
+"""Samples that are parsed together; their lists are too few to start Python's garbage collector,
+which would take as long as the parsing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogHeader:
-    """What is known of a log before its first sample. Fields as in JointLog."""
+    """What is known of a log before its first sample, as in `JointLog`."""
 
     robot: str
+    """Name of the robot."""
     joints: tuple[str, ...]
+    """Names of the columns."""
     stiffness: Sequence[float] | None = None
+    """Stiffness on the drives [N m/rad], one number a joint; None if unknown."""
     damping: Sequence[float] | None = None
+    """Damping on the drives [N m s/rad], one number a joint; None if unknown."""
     pose: Sequence[float] | None = None
+    """Position that the signals are centred on [rad], one number a joint."""
     units: tuple[str, ...] | None = None
+    """Unit of each column's position; all `rad` if None."""
     virtual: bool = False
+    """True if the machine was the virtual robot."""
     metadata: dict[str, str] = field(default_factory=dict)
+    """Named remarks on the recording."""
 
 
 class McapLogWriter:
@@ -76,67 +110,176 @@ class McapLogWriter:
     def __init__(self, path: Path, header: LogHeader) -> None:
         """Open `path`, which is replaced, and write the header."""
         self._file = McapWriter(path, TOPICS)
-        self._pending, self._last = 0, 0.0
-        self._file.put(HEADER, 0.0, {"schema": SCHEMA, **vars(header)})
+        self._samples_in_chunk = 0
+        self._last_time = 0.0
+        self._file.put(
+            HEADER,
+            0.0,
+            {
+                "schema": SCHEMA,
+                "robot": header.robot,
+                "joints": header.joints,
+                "stiffness": header.stiffness,
+                "damping": header.damping,
+                "pose": header.pose,
+                "units": header.units,
+                "virtual": header.virtual,
+                "metadata": header.metadata,
+            },
+        )
         self.flush()
 
     def segment(self, segment: Segment) -> None:
         """Write a segment, before its samples."""
-        self._file.put(SEGMENT, segment.start, vars(segment))
+        self._file.put(SEGMENT, segment.start, asdict(segment))
         self.flush()
 
     def sample(
         self,
         time: float,
-        command: Floats,
-        position: Floats,
-        velocity: Floats | None = None,
-        torque: Floats | None = None,
+        command: Sequence[float] | Array,
+        position: Sequence[float] | Array,
+        velocity: Sequence[float] | Array | None = None,
+        torque: Sequence[float] | Array | None = None,
         frequency: float = math.nan,
         segment: int = -1,
     ) -> None:
         """Write one measured state.
 
-        One number a joint [rad, rad/s, N m]; `frequency` is NaN and `segment` -1 between segments.
+        Args:
+            time: Measured timestamp, on the clock of the log [s].
+            command: Position command in force [rad], one number a joint.
+            position: Measured position [rad], one number a joint.
+            velocity: Measured velocity [rad/s], one number a joint, if there is any.
+            torque: Measured torque [N m], one number a joint, if there is any.
+            frequency: Instantaneous frequency of the signal [Hz]; NaN between segments.
+            segment: Number of the segment, in the order written; -1 between segments.
         """
         body: dict[str, Any] = {"t": time, "command": command, "position": position}
-        optional = {"velocity": velocity, "torque": torque}
-        body |= {name: values for name, values in optional.items() if values is not None}
-        self._file.put(SAMPLE, time, body | {"frequency": frequency, "segment": segment})
-        self._last = time
-        self._pending += 1
-        if self._pending >= _FLUSH_SAMPLES:
+        if velocity is not None:
+            body["velocity"] = velocity
+        if torque is not None:
+            body["torque"] = torque
+        body["frequency"] = frequency
+        body["segment"] = segment
+        self._file.put(SAMPLE, time, body)
+        self._last_time = time
+        self._samples_in_chunk += 1
+        if self._samples_in_chunk >= _FLUSH_SAMPLES:
             self.flush()
 
     def flush(self) -> None:
         """Finish the chunk and pass everything to the operating system."""
         self._file.flush()
-        self._pending = 0
+        self._samples_in_chunk = 0
 
     def end(self, *, complete: bool = True, reason: str = "") -> None:
-        """Write the end and close the file."""
-        self._file.put(END, self._last, {"complete": complete, "reason": reason})
+        """Write the end and close the file; `reason` says why the log is not complete."""
+        self._file.put(END, self._last_time, {"complete": complete, "reason": reason})
         self._file.close()
 
 
 def reason_of(error: BaseException | None) -> str:
-    """Why a log ends, in words; empty without an error."""
-    return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")
+    """Return why a log ends, in words; empty without an error."""
+    if error is None:
+        return ""
+    return f"{type(error).__name__}: {error}".rstrip(": ")
 
 
-def read_sweep(path: Path, found: Iterable[Record], damage: str) -> JointLog:
-    """Make the log of the messages of a file, with `complete` False if it was cut anywhere.
+def read_sweep(path: Path, messages: Iterable[Record], damage: str) -> JointLog:
+    """Make a log of the messages of a file.
 
-    `damage` says why reading ended early, or is "".
+    Args:
+        path: The file, for messages and its hash.
+        messages: Its messages, in the order written.
+        damage: Why reading the file ended early, or "".
+
+    Returns:
+        The log, with `complete` False if the recording or the file was cut.
+
+    Raises:
+        LogError: The messages are not those of `SCHEMA`, or too few.
     """
+    data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
+    for message in messages:
+        if message.topic in data:
+            data[message.topic].append(message.data)
     try:
-        return _read_sweep(path, found, damage)
+        return _joint_log(path, data, damage)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise LogError(f"{path}: its messages are not those of {SCHEMA} ({reason}).") from None
 
 
+def _joint_log(path: Path, data: Mapping[str, Sequence[bytes]], damage: str) -> JointLog:
+    """Make a log of the encoded messages of each topic."""
+    if not data[HEADER]:
+        raise LogError(f"{path}: schema None; this pronk reads {SCHEMA!r}.")
+    schema = msgspec.json.decode(data[HEADER][-1], type=dict[str, Any]).get("schema")
+    if schema != SCHEMA:
+        raise LogError(f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r}.")
+    if len(data[SAMPLE]) < 2:
+        raise LogError(
+            f"{path}: cut after {len(data[SAMPLE])} samples; nothing to read, record again."
+        )
+    header = msgspec.json.decode(data[HEADER][-1], type=LogHeader)
+    samples = _read_samples(data[SAMPLE])
+    last = float(samples.time[-1])
+    complete = False
+    notes = []
+    if damage or not data[END]:
+        notes.append(
+            f"the file is cut short after {last:.3f} s ({damage or 'no end was written'}); "
+            "what was recorded before is whole"
+        )
+    else:
+        end = msgspec.json.decode(data[END][-1], type=dict[str, Any])
+        complete = bool(end.get("complete", False))
+        if not complete:
+            notes.append(f"the recording was cut short ({end.get('reason') or 'no reason given'})")
+    segments = [_read_segment(message) for message in data[SEGMENT]]
+    if len(set(segments)) < len(segments):
+        raise LogError(f"{path}: damaged: it has the same segment twice; record again.")
+    # A segment that was cut ends with the last sample.
+    begun = [segment for segment in segments if segment.start < last]
+    recorded = [replace(segment, stop=min(segment.stop, last)) for segment in begun]
+    return JointLog(
+        robot=header.robot,
+        joints=header.joints,
+        time=samples.time,
+        command=samples.command,
+        position=samples.position,
+        velocity=samples.velocity,
+        torque=samples.torque,
+        frequency=None if np.isnan(samples.frequency).all() else samples.frequency,
+        segments=tuple(recorded),
+        stiffness=_array(header.stiffness),
+        damping=_array(header.damping),
+        pose=_array(header.pose),
+        units=header.units,
+        virtual=header.virtual,
+        source=str(path),
+        sha256=sha256(path),
+        complete=complete,
+        notes=tuple(notes),
+        metadata=header.metadata,
+    )
+
+
+def _array(numbers: Sequence[float] | None) -> Array | None:
+    return None if numbers is None else np.array(numbers, dtype=np.float64)
+
+
+def _read_segment(message: bytes) -> Segment:
+    body = msgspec.json.decode(message, type=dict[str, Any])
+    if body.get("amplitude") is None:
+        body["amplitude"] = math.nan
+    return msgspec.convert(body, Segment)
+
+
 class _Sample(msgspec.Struct, gc=False):
+    """The fields of a message on `/sweep/sample` that a log holds."""
+
     t: float
     command: list[float]
     position: list[float]
@@ -145,85 +288,61 @@ class _Sample(msgspec.Struct, gc=False):
     frequency: float | None = None
 
 
-def _columns(samples: Sequence[bytes]) -> dict[str, Any]:
-    """Fields of samples, a row for each; None for velocity or torque if the first has none."""
-    rows = msgspec.json.decode(b"[" + b",".join(samples) + b"]", type=list[_Sample])
-    found: dict[str, Any] = {}
-    for name in _Sample.__struct_fields__:
-        values = [getattr(row, name) for row in rows]
-        lacking = values[0] is None and name != "frequency"  # Frequencies of None become NaN.
-        found[name] = None if lacking else np.array(values, dtype=np.float64)
-    return found
+class _Samples(NamedTuple):
+    """Samples as arrays, a row each; None for velocity or torque if the first sample has none."""
+
+    time: Array
+    command: Array
+    position: Array
+    velocity: Array | None
+    torque: Array | None
+    frequency: Array
 
 
-def _read_samples(samples: Sequence[bytes]) -> dict[str, Any]:
-    """Same as `_columns`, by blocks: their many lists are gone before they cost time and memory."""
-    parts: dict[str, list[Any]] = {name: [] for name in _Sample.__struct_fields__}
-    try:
-        for first in range(0, len(samples), _BLOCK):
-            block = samples[first : first + _BLOCK]
-            for name, values in _columns(block).items():
-                parts[name].append(values)
-            if len(parts["t"][-1]) != len(block):
-                return _columns(samples)
-        return {n: None if v[0] is None else np.concatenate(v) for n, v in parts.items()}
-    except (msgspec.MsgspecError, ValueError, TypeError, IndexError):
-        return _columns(samples)  # It names the place in the file.
-
-
-def _read_sweep(path: Path, found: Iterable[Record], damage: str) -> JointLog:
-    by_topic: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
-    for record in found:
-        by_topic.setdefault(record.topic, []).append(record.data)
-    header, ends = (by_topic[topic][-1:] or [b"{}"] for topic in (HEADER, END))
-    schema = msgspec.json.decode(header[0], type=dict[str, Any]).get("schema")
-    if schema != SCHEMA:
-        raise LogError(f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r}.")
-    if (count := len(by_topic[SAMPLE])) < 2:
-        raise LogError(f"{path}: cut after {count} samples; nothing to read, record again.")
-    columns = _read_samples(by_topic[SAMPLE])
-    time, frequency = columns.pop("t"), columns.pop("frequency")
-    last = float(time[-1])
-    end = msgspec.json.decode(ends[0], type=dict[str, Any])
-    complete = bool(end.get("complete", False)) and not damage
-    notes = []
-    if damage or not end:
-        notes.append(
-            f"the file is cut short after {last:.3f} s ({damage or 'no end was written'}); "
-            "what was recorded before is whole"
-        )
-    elif not complete:
-        notes.append(f"the recording was cut short ({end.get('reason') or 'no reason given'})")
-
-    # Not vars: it lacks the defaults of what the file leaves out.
-    known = msgspec.json.decode(header[0], type=LogHeader)
-    about = {entry.name: getattr(known, entry.name) for entry in fields(LogHeader)}
-    arrays = {name: about.pop(name) for name in ("stiffness", "damping", "pose")}
-    arrays = {n: None if v is None else np.array(v, dtype=np.float64) for n, v in arrays.items()}
-    segments = [_segment(data) for data in by_topic[SEGMENT]]
-    if len(set(segments)) < len(segments):
-        raise LogError(f"{path}: damaged: it has the same segment twice; record again.")
-    return JointLog(
-        **about,
-        **arrays,
-        **columns,
-        time=time,
-        frequency=None if np.isnan(frequency).all() else frequency,
-        # Segments that had begun by the last sample, ended there if they were cut.
-        segments=tuple(
-            replace(segment, stop=min(segment.stop, last))
-            for segment in segments
-            if segment.start < last
-        ),
-        source=str(path),
-        sha256=sha256(path),
-        complete=complete,
-        notes=tuple(notes),
+def _read_samples(messages: Sequence[bytes]) -> _Samples:
+    """Parse samples block by block, so that their many lists live only for a moment."""
+    blocks = []
+    for first in range(0, len(messages), _BLOCK):
+        block = messages[first : first + _BLOCK]
+        try:
+            blocks.append(_read_block(block))
+        except (msgspec.MsgspecError, ValueError, TypeError) as error:
+            raise ValueError(f"samples {first} to {first + len(block) - 1}: {error}") from None
+    return _Samples(
+        time=np.concatenate([block.time for block in blocks]),
+        command=np.concatenate([block.command for block in blocks]),
+        position=np.concatenate([block.position for block in blocks]),
+        velocity=_joined([block.velocity for block in blocks]),
+        torque=_joined([block.torque for block in blocks]),
+        frequency=np.concatenate([block.frequency for block in blocks]),
     )
 
 
-def _segment(data: bytes) -> Segment:
-    body = msgspec.json.decode(data, type=dict[str, Any])
-    if body.get("amplitude") is None:
-        body["amplitude"] = math.nan
-    return msgspec.convert(body, Segment)
+def _read_block(messages: Sequence[bytes]) -> _Samples:
+    samples = msgspec.json.decode(b"[" + b",".join(messages) + b"]", type=list[_Sample])
+    if len(samples) != len(messages):
+        raise ValueError(f"{len(samples)} samples in {len(messages)} messages")
+    return _Samples(
+        time=np.array([sample.t for sample in samples], dtype=np.float64),
+        command=np.array([sample.command for sample in samples], dtype=np.float64),
+        position=np.array([sample.position for sample in samples], dtype=np.float64),
+        velocity=_optional([sample.velocity for sample in samples]),
+        torque=_optional([sample.torque for sample in samples]),
+        # A frequency of None becomes NaN.
+        frequency=np.array([sample.frequency for sample in samples], dtype=np.float64),
+    )
+
+
+def _optional(rows: Sequence[Sequence[float] | None]) -> Array | None:
+    """Rows of a quantity as an array; None if the first sample has none of it."""
+    return None if rows[0] is None else np.array(rows, dtype=np.float64)
+
+
+def _joined(blocks: Sequence[Array | None]) -> Array | None:
+    """Blocks of a quantity one after another; None if the first block has none of it."""
+    arrays = [block for block in blocks if block is not None]
+    if blocks[0] is None:
+        return None
+    if len(arrays) < len(blocks):
+        raise ValueError("some samples lack the velocity or the torque that others have")
+    return np.concatenate(arrays)
