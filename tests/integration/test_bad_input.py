@@ -43,14 +43,7 @@ COMMANDS = [
     ("mach", "mach"),
     ("match . --robot mini_cheetah --grids 3", "--grids"),
     ("match bench --robot go2 --grids 3", "--grids"),  # A former command as a value.
-    ("twin", "pronk simulate"),
-    ("bench", "python -m benchmarks"),
     (f"{SWEEP} --link twin", "sim, lcm, dds"),
-    (f"{SWEEP} --truth y", "--sim-params"),
-    (f"{SWEEP} --release", "--disable-onboard-controller"),
-    ("match a.mcap --robot go2 --free armature", "--fit"),
-    ("deploy a.onnx --any-delay", "--ignore-latency-check"),
-    ("deploy a.onnx --blend=0.1", "--blend-time-s"),
     ("sweep mini_cheeta --out x", "mini_cheetah"),
     (f"{SWEEP} --joints FR_ankle", "FR_knee"),
     (f"{SWEEP} --joints FR_knee --amplitude 1.4", "amplitude"),
@@ -228,29 +221,36 @@ def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "named"),
+    "program",
     [
-        (b"cos\nsystem\n(S'true'\ntR.", "os.system"),
-        (b"cbuiltins\neval\n(S'1'\ntR.", "builtins.eval"),
-        (b"cnumpy.core.multiarray\n_reconstruct\n.", "numpy.core.multiarray"),
-        (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "os.system"),
-        (b"(ios\nsystem\n.", "INST"),
-        (b"ccollections\nOrderedDict\n}b.", "BUILD"),
-        (b"\x80\x02ccollections\nOrderedDict\n)\x81.", "NEWOBJ"),
-        (b"N.", "NoneType"),
-        (b"}.", "dof_pos"),
-        (b"r\xff\xff\xff\x7f.", "a.pt"),
-        (b"", "a.pt"),
+        b"cos\nsystem\n(S'true'\ntR.",
+        b"cbuiltins\neval\n(S'1'\ntR.",
+        b"\x80\x04\x8c\x02os\x8c\x06system\x93.",
+        b"(ios\nsystem\n.",
+        b"N.",
+        b"\x80\x02}.",
+        b"r\xff\xff\xff\x7f.",
+        b"",
         # Sixty nested pairs of one tuple: 2^60 steps to hash, 200 bytes to write.
-        (b"\x80\x02})" + b"2\x86" * 60 + b"Ns.", "a.pt"),
+        b"\x80\x02})" + b"2\x86" * 60 + b"Ns.",
     ],
 )
-def test_programs_that_are_no_tensors(tmp_path: Path, program: bytes, named: str) -> None:
+def test_programs_that_are_no_tensors_are_refused(tmp_path: Path, program: bytes) -> None:
     path = tmp_path / "a.pt"
     path.write_bytes(archive(program))
-    with pytest.raises(LogError, match=named) as caught:
+    with pytest.raises(LogError, match=r"a\.pt") as caught:
         read_log(path, robot=ROBOT)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+def test_a_file_of_pytorch_without_the_tensors_is_refused(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    torch.save({"time": torch.zeros(3)}, tmp_path / "few.pt")
+    torch.save(torch.zeros(3), tmp_path / "tensor.pt")
+    with pytest.raises(LogError, match="no tensor dof_pos, des_dof_pos; it holds time"):
+        read_log(tmp_path / "few.pt", robot=ROBOT)
+    with pytest.raises(LogError, match="it holds a Tensor"):
+        read_log(tmp_path / "tensor.pt", robot=ROBOT)
 
 
 def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
