@@ -36,7 +36,6 @@ def match(
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
     frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
-    device: str = "cpu",
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Find the gains with which the simulator responds like the robot.
@@ -58,8 +57,6 @@ def match(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
             repeat it. A name of `pronk profiles`, or NAME,timestep_s=S,iterations=N,friction=none.
-        device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
-            pronk[train]).
         reading: How logs are read.
     """
     from pronk.identify.match import gains as gains_file
@@ -80,7 +77,6 @@ def match(
         method=method,
         exhaustive=exhaustive,
         zero_armature=zero_armature,
-        device=device,
         simulator=simulator,
         simulator_python=simulator_python,
     )

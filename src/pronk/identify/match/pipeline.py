@@ -126,7 +126,7 @@ def match_frameworks(
         LogError: No joint of the robot was excited, or a log cannot be used.
         IdentifiabilityError: A joint's band is mostly incoherent or too short, or a parameter
             cannot be identified.
-        PronkError: The device or simulator of the settings cannot be used here.
+        PronkError: The simulator of the settings cannot be used here.
     """
     chosen, clock = settings or MatchSettings(), _Clock(progress)
     frameworks = {name: profile(name) for name in names}
@@ -329,12 +329,11 @@ class _Match:
                     progress=self.clock.report,
                 )
             return self
-        # The simulator first: a device that is missing must not cost the user an estimate.
+        # The simulator first: an engine that is missing must not cost the user an estimate.
         with joint_rigs(
             settings.simulator,
             self.robot,
             threads=settings.threads,
-            device=settings.device,
             python=settings.simulator_python,
         ) as rigs:
             if self.work.mode == "gains" and "frictionloss" not in self.fitted:

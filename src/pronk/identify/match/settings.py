@@ -8,7 +8,6 @@ from typing import Literal
 
 from pronk.errors import PronkError
 from pronk.identify.response.response import Estimator
-from pronk.identify.simulators.mujoco import DEVICES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +28,6 @@ class MatchSettings:
     """Frequencies below are left out of the fit; a joint with most of its band below is refused."""
     threads: int = 2
     """Threads of the simulator."""
-    device: str = "cpu"
-    """Where the grid is simulated: `cpu` (all of it in double precision), `cuda` (MuJoCo Warp on a
-    GPU; needs `pronk[train]`), or `warp-cpu` (the same arithmetic on the processor, slow)."""
     simulator: str = "mujoco"
     """`mujoco`, `FILE.py:NAME` or an entry point in `pronk.simulators` (see `load_simulator`)."""
     simulator_python: Path | None = None
@@ -49,7 +45,6 @@ class MatchSettings:
             ("method", self.method in ("time", "paper"), "time or paper"),
             ("grid_points", self.grid_points >= 3, "3 or more"),
             ("coherence_min", 0.0 <= self.coherence_min < 1.0, "0 to below 1"),
-            ("device", self.device in DEVICES, f"one of {', '.join(DEVICES)}"),
             ("threads", self.threads >= 1, "1 or more"),
         ):
             if not good:
