@@ -11,7 +11,7 @@ amplitude, those that moved together in time.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -45,10 +45,8 @@ from pronk.identify.simulators.chain import (
     StribeckChain,
     branches,
     moves_together,
-    published,
 )
 from pronk.identify.simulators.load import joint_rigs, load_simulator
-from pronk.identify.simulators.mujoco import Drives
 from pronk.identify.simulators.profiles import profile
 from pronk.identify.simulators.simulator import Closing, Simulator
 from pronk.jump.trial.tables import table
@@ -57,16 +55,16 @@ from pronk.robots.robot import RobotSpec
 
 ENGINES = {
     "mjlab": "mujoco",
-    "isaaclab-explicit,friction=none": "sapien-explicit",
-    "isaaclab-implicit,friction=none": "isaaclab-physx",
-    "isaaclab-newton": "newton",
-    "genesis": "genesis",
-    "playground": "mjx",
-    "maniskill": "sapien",
-    "drake": "drake",
-    "newton-featherstone": "newton-featherstone",
+    "isaaclab-explicit,friction=none": "examples/engines/sapien.py:torque",
+    "isaaclab-implicit,friction=none": "examples/engines/sapien.py:isaaclab",
+    "isaaclab-newton": "examples/engines/newton.py:drive",
+    "genesis": "examples/engines/genesis.py:drive",
+    "playground": "examples/engines/mjx.py:Mjx",
+    "maniskill": "examples/engines/sapien.py:drive",
+    "drake": "examples/engines/drake.py:drive",
+    "newton-featherstone": "examples/engines/newton.py:featherstone",
 }
-"""Framework, and the simulator of pronk that runs its engine."""
+"""Framework, and the value of `--simulator` that runs its engine."""
 SETTINGS = MatchSettings(method="paper", zero_armature=False)
 
 
@@ -125,20 +123,20 @@ class EngineChain(Closing):
     def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str, *, threads: int) -> None:
         self.joints, self.robot, self.simulator = robot.joint(joint).chain, robot, simulator
 
-    def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
+    def rollout(self, command: Array, values: Mapping[str, Array], start: Array) -> Array:
         """See `pronk.identify.simulators.mujoco.Chain.rollout`; delays are in the command."""
         names = self.simulator.joints
         columns = [names.index(name) for name in self.joints]
-        full = np.empty((len(sets), command.shape[1] + 1, len(names)))
+        full = np.empty((len(command), command.shape[1] + 1, len(names)))
         full[:] = [self.robot.joint(name).default_position for name in names]
         full[..., columns] = np.concatenate([command, command[:, -1:]], axis=1)
-        drives = [[published(self.robot, n) | dict(one.get(n, {})) for n in names] for one in sets]
-        values: dict[str, Array] = {
-            key: np.array([[joint[key] for joint in one] for one in drives])
-            for key in self.simulator.parameters - {"delay"}
-        }
+        all_values = {}
+        for key in self.simulator.parameters - {"delay"}:
+            robot_values = [self.robot.joint(name).parameters[key] for name in names]
+            all_values[key] = np.tile(robot_values, (len(command), 1))
+            all_values[key][:, columns] = values[key]
         locked = [name for name in names if name not in self.joints]
-        return np.asarray(self.simulator.rollout(full, values, locked=locked)[..., columns])
+        return np.asarray(self.simulator.rollout(full, all_values, locked=locked)[..., columns])
 
 
 def together(

@@ -50,9 +50,8 @@ from pronk.identify.logs.readers import read_log
 from pronk.identify.match.pipeline import match_logs
 from pronk.identify.match.predict import drives_of
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.simulators.chain import ChainSimulation
+from pronk.identify.simulators.chain import ChainSimulation, DriveValues
 from pronk.identify.simulators.load import joint_rigs
-from pronk.identify.simulators.mujoco import Drives
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots import load_robot
 
@@ -194,22 +193,22 @@ def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> li
         ChainSimulation(robot, held_out, joints=arm.joints, threads=1) as judge,
     ):
         nominal = {name: start_values(robot, name) for name in arm.joints}
-        found: Drives = {}
+        found: DriveValues = {}
 
-        def pronk(_: Drives) -> Drives:
+        def pronk(_: DriveValues) -> DriveValues:
             result = match_logs(
                 logs, robot, settings=MatchSettings(threads=1), drive_gains="default"
             )
             return drives_of(robot, result.gains)
 
-        def given(pronks: Drives) -> Drives:
+        def given(pronks: DriveValues) -> DriveValues:
             return {
                 name: drive | {"frictionloss": pronks[name]["frictionloss"]}
                 for name, drive in nominal.items()
             }
 
         dry = ("stiffness", "damping", "frictionloss", "delay")
-        chosen: dict[str, Callable[[Drives], Drives]] = {
+        chosen: dict[str, Callable[[DriveValues], DriveValues]] = {
             PRONK: pronk,
             NOMINAL: lambda _: fit_arm(arm, ("delay",), nominal),
             PLAIN: lambda pronks: fit_arm(arm, FREE, given(pronks)),

@@ -23,7 +23,7 @@ from pronk.identify.logs.readers import read_logs
 from pronk.identify.match.pipeline import match_frameworks
 from pronk.identify.match.result import MatchResult
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.simulators.profiles import profiles as known_profiles
+from pronk.identify.simulators.profiles import load_profiles
 from pronk.jump.trial.tables import table
 from pronk.robots import load_robot
 
@@ -62,7 +62,7 @@ def profiles(
     """
     if repeats < 1:
         raise PronkError(f"--repeats {repeats}; expected 1 or more.")
-    known, names = load_robot(robot), list(known_profiles())
+    known, names = load_robot(robot), list(load_profiles())
     begin = time.perf_counter()
     logs = read_logs(paths, robot=known)
     console.say(f"{len(logs)} logs read in {time.perf_counter() - begin:.1f} s")

@@ -33,7 +33,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.linear_policy import stiff_go2, write_swaying
 from benchmarks.runner import Progress, Row, finish, rows_in, rows_of
 from pronk.cli import console
 from pronk.cli.simulate import _PRIORITY, _SERVERS
@@ -53,6 +52,7 @@ from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Velocity
 from pronk.processes import die_with_parent
 from pronk.robots import load_robot
+from tests.linear_policy import stiff_go2, write_swaying
 
 ROBOT = "mini_cheetah"
 PROCESSES = {

@@ -22,9 +22,8 @@ from pronk.identify.logs.segment import Segment
 from pronk.identify.match.arm import ArmProblem, trusted
 from pronk.identify.match.fit import solve
 from pronk.identify.match.parameters import PARAMETERS
-from pronk.identify.simulators.chain import ChainSimulation, published
+from pronk.identify.simulators.chain import ChainSimulation, DriveValues, published
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
-from pronk.identify.simulators.mujoco import Drives
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
 
@@ -143,19 +142,21 @@ def fit_plain(
     return problem.values(found.x)
 
 
-def arm_problem(arm: ChainSimulation, free: Sequence[str], start: Drives) -> ArmProblem:
+def arm_problem(arm: ChainSimulation, free: Sequence[str], start: DriveValues) -> ArmProblem:
     """Residuals of a whole arm in time, over the samples that pronk uses."""
     fitted = dict.fromkeys(arm.joints, tuple(free))
     return ArmProblem(arm, trusted(arm)[0], fitted, start, start, lambda _: None)
 
 
-def fit_arm(arm: ChainSimulation, free: Sequence[str], start: Drives) -> Drives:
+def fit_arm(arm: ChainSimulation, free: Sequence[str], start: DriveValues) -> DriveValues:
     """Nonlinear least squares over parameters of all joints of an arm."""
     problem = arm_problem(arm, free, start)
     return problem.values(solve(problem, tolerance=1e-4, rounds=30).x)
 
 
-def search_cma_arm(arm: ChainSimulation, free: Sequence[str], start: Drives, seed: int) -> Drives:
+def search_cma_arm(
+    arm: ChainSimulation, free: Sequence[str], start: DriveValues, seed: int
+) -> DriveValues:
     """CMA-ES of each joint of an arm with its own residuals, all joints changed at once."""
     _, cma = import_peers()
     problem, kinds = arm_problem(arm, free, start), [PARAMETERS[name] for name in free]

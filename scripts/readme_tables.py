@@ -15,7 +15,7 @@ import yaml
 import pronk
 from pronk.identify.logs.readers import readers
 from pronk.identify.match.translate import stated_gains, translate
-from pronk.identify.simulators.profiles import profile, profiles
+from pronk.identify.simulators.profiles import load_profiles, profile
 from pronk.robots import ROBOT_NAMES, load_robot
 
 ROBOTS = Path(pronk.__file__).parent / "robots"
@@ -50,7 +50,7 @@ def joint() -> str:
         "| responds earlier |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for name, one in profiles().items():
+    for name, one in load_profiles().items():
         changes = translate(drive, robot, one)[1]["swing"]
         cells = [f"`{name}`", one.drive_law.label, f"{1000.0 * one.timestep_s:g} ms"]
         cells += [f"{changes.before_db:.2f} dB", "{:.2f} / {:.3f}".format(*changes.after)]

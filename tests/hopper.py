@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.linear_policy import write_linear
+from linear_policy import write_linear
 from pronk.policy.contract import Contract, measured_layout
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.robots import load_robot

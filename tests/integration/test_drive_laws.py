@@ -11,7 +11,7 @@ import pytest
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.identify.simulators.command_trace import CommandTrace
-from pronk.identify.simulators.linear import plant
+from pronk.identify.simulators.linear import linearize
 from pronk.identify.simulators.mujoco import Chain, JointTestRig
 from pronk.robots import load_robot
 from pronk.robots.drive_law import DriveLaw
@@ -73,7 +73,7 @@ def test_a_leg_follows_the_equations(name: str, law: DriveLaw) -> None:
         command = np.tile(rest, (400, 1))
         wave = 0.2 * np.sin(2.0 * np.pi * (1.0 + 4.0 * time) * time)
         command[:, chain.joints.index(joint.name)] += wave
-        got = chain.rollout(command[None], [{}], rest[None])[0, :-1]
+        got = chain.rollout(command[None], start=rest[None])[0, :-1]
     expected = integrated(robot, joint.name, command, rest)
     assert np.ptp(got, axis=0).min() > 1e-3
     assert np.abs(got - expected).max() < 1e-9
@@ -92,7 +92,7 @@ def test_the_linearized_response_is_that_of_a_sine(law: DriveLaw) -> None:
     trace = CommandTrace(joint="FR_knee", start=0.0, timestep=STEP, command=command, pose=pose)
     with JointTestRig(robot, "FR_knee", threads=1) as rig:
         [(_, position)] = list(rig.run([trace], gains, count))
-        linear = plant(rig, trace.excitation(robot)[0], np.array([omega]))
+        linear = linearize(rig, trace.excitation(robot)[0], np.array([omega]))
         expected = linear.response(17.0, 0.4)[0, 0]
     tail = slice(count // 2, count)  # 10 whole periods, after the transient
     spin, half = np.exp(-1j * omega * time[tail]), omega * STEP / 2.0

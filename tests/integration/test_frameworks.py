@@ -15,7 +15,7 @@ from pronk.identify.match.gains import load_gains, save_gains
 from pronk.identify.match.pipeline import match_frameworks
 from pronk.identify.match.predict import predict
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.simulators.profiles import profile, profile_of, profiles
+from pronk.identify.simulators.profiles import load_profiles, profile, profile_of
 from pronk.jump.train.gains import training_gains
 from pronk.robots import load_robot
 
@@ -93,6 +93,6 @@ def test_the_command_line_writes_a_folder_for_each_framework(tmp_path: Path) -> 
     assert own.stiffness.value < 0.95 * other.stiffness.value
     assert (tmp_path / "out" / "mjlab-builtin" / "match.html").is_file()
     listed = accepted("profiles")
-    assert all(name in listed for name in profiles())
+    assert all(name in listed for name in load_profiles())
     assert "isaaclab-implicit" in refused(*words, "--for", "isaac")
     assert "mode" in refused(*words, "--for", "genesis", "--mode", "drive")

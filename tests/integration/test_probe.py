@@ -6,29 +6,37 @@ import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.probe import ENGINES, ROBOTS, Drawn, Truth, drawn, score
 from command_line import accepted, refused
+from drawn_simulator import ENGINES, ROBOTS, DrawnSimulator, Truth, draw_truth, score
 from pronk.errors import PronkError
-from pronk.identify.simulators.probe import probe
+from pronk.identify.simulators.probe import Probe, probe_joint
 from pronk.robots import load_robot
 from pronk.robots.drive_law import DriveLaw
 
-PENDULUM, SWING = ROBOTS[0]
+PENDULUM = ROBOTS[0][0]
+FAULTLESS = Truth(
+    kind="numpy",
+    robot=load_robot(PENDULUM),
+    joint="swing",
+    law=DriveLaw(),
+    stated=DriveLaw(),
+    armature=load_robot(PENDULUM).joint("swing").drive.armature,
+    frictionloss=0.1,
+    delay_s=0.0032,
+    hold=1,
+    scale=1.0,
+    fault="",
+)
+"""A pendulum in NumPy without faults."""
 
 
-def truth(**changes: object) -> Truth:
-    """A pendulum in NumPy without faults, with changes."""
-    robot = load_robot(PENDULUM)
-    values = {
-        **{"kind": "numpy", "robot": robot, "joint": SWING, "law": DriveLaw()},
-        **{"armature": robot.joint(SWING).drive.armature, "frictionloss": 0.1},
-        **{"delay_s": 0.0032, "hold": 1, "scale": 1.0, "fault": "", **changes},
-    }
-    return Truth(**{"stated": values["law"], **values})  # type: ignore[arg-type]
+def probed(truth: Truth) -> Probe:
+    return probe_joint(DrawnSimulator(truth), truth.robot, truth.joint)
 
 
 @pytest.mark.parametrize(
@@ -40,21 +48,23 @@ def truth(**changes: object) -> Truth:
     ],
 )
 def test_law_and_parameters(kind: str, law: DriveLaw) -> None:
-    known = truth(law=law, kind=kind)
-    found = probe(Drawn(known), known.robot)
-    assert (found.law, found.beside_explicit, found.hold) == (law, False, 1)
-    assert found.armature == pytest.approx(known.armature, rel=1e-3)
-    assert found.frictionloss == pytest.approx(0.1, rel=1e-2)
-    assert found.delay_s == pytest.approx(0.0032, abs=1e-5)
-    assert found.soft_friction == (kind == "mujoco")
-    assert not found.wrong
+    truth = replace(FAULTLESS, law=law, stated=law, kind=kind)
+    probe = probed(truth)
+    assert (probe.law, probe.beside_explicit, probe.hold) == (law, False, 1)
+    assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
+    assert probe.frictionloss == pytest.approx(0.1, rel=1e-2)
+    assert probe.delay_s == pytest.approx(0.0032, abs=1e-5)
+    assert probe.soft_friction == (kind == "mujoco")
+    assert not probe.faults
 
 
-def named_as_drawn(known: Truth) -> None:
-    found = score(known, probe(Drawn(known), known.robot, known.joint))
-    assert all(found[right] for right in ("law_right", "hold_right", "fault_right")), found
-    assert found["armature_error"] < 0.02
-    assert found["delay_error_s"] < 5e-4
+def assert_named_as_drawn(truth: Truth) -> None:
+    scores = score(truth, probed(truth))
+    assert scores["law_right"], scores
+    assert scores["hold_right"], scores
+    assert scores["fault_right"], scores
+    assert scores["armature_error"] < 0.02  # type: ignore[operator]
+    assert scores["delay_error_s"] < 5e-4  # type: ignore[operator]
 
 
 @pytest.mark.parametrize(
@@ -65,44 +75,54 @@ def named_as_drawn(known: Truth) -> None:
         ("twice", {"scale": 2.0}),
         ("degrees", {"scale": np.pi / 180.0, "frictionloss": 0.0}),
         ("law", {"stated": DriveLaw(kind="implicit_damping")}),
-        ("beside", {"law": DriveLaw(kind="implicit_damping"), "stated": DriveLaw()}),
+        ("beside", {"law": DriveLaw(kind="implicit_damping")}),
         ("hold", {"hold": 4}),
     ],
 )
-def test_what_is_wrong_is_named(fault: str, changes: dict[str, object]) -> None:
-    named_as_drawn(truth(fault=fault, **changes))
+def test_what_acts_otherwise_than_it_is_set_is_named(fault: str, changes: dict[str, Any]) -> None:
+    assert_named_as_drawn(replace(FAULTLESS, fault=fault, **changes))
 
 
 def test_a_joint_that_does_not_move_is_refused() -> None:
-    known = truth(frictionloss=1e3)
     with pytest.raises(PronkError, match="does not move"):
-        probe(Drawn(known), known.robot)
+        probed(replace(FAULTLESS, frictionloss=1e3))
+    without_joints = replace(FAULTLESS, robot=replace(FAULTLESS.robot, joints=()))
     with pytest.raises(PronkError, match="no joint"):
-        probe(Drawn(replace(known, robot=replace(known.robot, joints=()))), known.robot)
+        probe_joint(DrawnSimulator(without_joints), FAULTLESS.robot)
 
 
 @pytest.mark.slow
 def test_random_simulators_are_named() -> None:
-    installed = [one for one in ENGINES if importlib.util.find_spec(one.module.split(".")[0])]
+    kinds = ["numpy", "mujoco"]
+    for name, engine in ENGINES.items():
+        if importlib.util.find_spec(engine.module):
+            kinds.append(name)
     generator = np.random.default_rng(7)
-    for kind in ("numpy", "mujoco", *(one.__name__ for one in installed)):
-        named_as_drawn(drawn(generator, kind, ""))
+    for kind in kinds:
+        assert_named_as_drawn(draw_truth(generator, kind, ""))
 
 
 def test_the_command_names_law_and_faults(tmp_path: Path) -> None:
-    out, words = tmp_path / "probe.json", ["probe", "mujoco", "--robot", PENDULUM]
+    out = tmp_path / "probe.json"
+    words = ["probe", "mujoco", "--robot", PENDULUM]
     accepted(*words, "--json", out)
-    found = json.loads(out.read_text())["probe"]
-    assert found["law"] == {"kind": "explicit", "iterations": 1, "passive_damping": "implicit"}
-    assert found["wrong"] == {}
+    probe = json.loads(out.read_text())["probe"]
+    assert probe["law"] == {"kind": "explicit", "iterations": 1, "passive_damping": "implicit"}
+    assert probe["faults"] == {}
     assert "swing" in refused(*words, "--joint", "knee")
 
 
 def test_one_scale_of_gains_inertia_and_gravity_is_not_taken_for_another() -> None:
     robot = replace(load_robot("mini_cheetah"), timestep_s=0.002, decimation=10)
-    armature = robot.joint("FR_knee").drive.armature
-    known = truth(robot=robot, joint="FR_knee", armature=armature, frictionloss=0.0, delay_s=0.0)
-    found = probe(Drawn(known), robot, "FR_knee")
-    assert found.law == DriveLaw()
-    assert found.stiffness_factor == pytest.approx(1.0, rel=1e-3)
-    assert not found.wrong
+    truth = replace(
+        FAULTLESS,
+        robot=robot,
+        joint="FR_knee",
+        armature=robot.joint("FR_knee").drive.armature,
+        frictionloss=0.0,
+        delay_s=0.0,
+    )
+    probe = probed(truth)
+    assert probe.law == DriveLaw()
+    assert probe.stiffness_factor == pytest.approx(1.0, rel=1e-3)
+    assert not probe.faults

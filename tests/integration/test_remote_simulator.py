@@ -19,7 +19,7 @@ from pronk.cli.match import WARNING_STATUS
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.gains import load_gains
-from pronk.identify.simulators.engines.links import links_of
+from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.load import joint_rigs, load_simulator
 from pronk.robots import load_robot
 from pronk.testing import check_simulator
@@ -30,7 +30,7 @@ ADAPTERS = '''
 import os, time
 import numpy as np
 from pronk.errors import PronkError
-from pronk.identify.simulators.engines.links import links_of
+from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.simulator import SimulatorInfo
 
 class Resting:

@@ -1,4 +1,4 @@
-"""Chains as numbers, and delays, beside what MuJoCo and the match compute."""
+"""Chains as numbers, delays, and engines of files, beside what MuJoCo and the match compute."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ import pytest
 
 from pronk.errors import PronkError, RobotError
 from pronk.identify.response.grid import held_mean
-from pronk.identify.simulators.engines.engine import delayed
-from pronk.identify.simulators.engines.links import (
-    along_x,
-    links_of,
-    principal,
-    quaternion,
-    rotation,
-)
-from pronk.identify.simulators.engines.sapien import Sapien
+from pronk.identify.simulators.engine import delayed
+from pronk.identify.simulators.factory import simulator_factory
+from pronk.identify.simulators.links import along_x, links_of, principal, quaternion, rotation
 from pronk.identify.simulators.mujoco import Chain
 from pronk.robots import load_robot
 
@@ -37,7 +31,8 @@ def test_gravity_and_rest_are_those_of_the_bench_model(name: str, joint: str) ->
             mujoco.mj_forward(chain.model, data)
             assert np.ptp(data.qfrc_bias) > 1e-3
             np.testing.assert_allclose(links.gravity_torque(position), -data.qfrc_bias, atol=1e-12)
-        target, stiffness = np.full(chain.model.nq, 0.3), np.full(chain.model.nq, 20.0)
+        target = np.full(chain.model.nq, 0.3)
+        stiffness = np.full(chain.model.nq, 20.0)
         expected = chain.rest_position(target, stiffness)
         np.testing.assert_allclose(links.rest(target, stiffness), expected, atol=1e-12)
 
@@ -55,12 +50,14 @@ def test_two_hinges_on_a_body_are_refused(tmp_path: Path) -> None:
 
 def test_delays_of_any_length_are_those_of_the_match() -> None:
     generator = np.random.default_rng(1)
-    command, steps = generator.normal(size=(3, 40, 2)), generator.uniform(0.0, 5.0, (3, 2))
-    edges, got = 0.005 * np.arange(41), delayed(command, steps)
+    command = generator.normal(size=(3, 40, 2))
+    steps = generator.uniform(0.0, 5.0, (3, 2))
+    edges = 0.005 * np.arange(41)
+    delayed_command = delayed(command, steps)
     for run, joint in np.ndindex(steps.shape):
         late = edges - 0.005 * steps[run, joint]
         expected = held_mean(edges[:-1], command[run, :, joint], late)
-        np.testing.assert_allclose(got[run, :, joint], expected, atol=1e-12)
+        np.testing.assert_allclose(delayed_command[run, :, joint], expected, atol=1e-12)
 
 
 def test_rotations() -> None:
@@ -69,9 +66,9 @@ def test_rotations() -> None:
         axis = generator.normal(size=3)
         axis /= np.linalg.norm(axis)
         turn = rotation(axis, generator.uniform(-3.0, 3.0))
-        again = np.empty(9)
-        mujoco.mju_quat2Mat(again, quaternion(turn))
-        np.testing.assert_allclose(again.reshape(3, 3), turn, atol=1e-12)
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, quaternion(turn))
+        np.testing.assert_allclose(matrix.reshape(3, 3), turn, atol=1e-12)
         np.testing.assert_allclose(along_x(axis) @ [1.0, 0.0, 0.0], axis, atol=1e-12)
         assert np.linalg.det(along_x(axis)) == pytest.approx(1.0)
         moments, axes = principal(turn @ np.diag([1.0, 2.0, 2.5]) @ turn.T)
@@ -79,7 +76,8 @@ def test_rotations() -> None:
         assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-def test_an_engine_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Sapien, "module", "an_engine_that_is_missing")
-    with pytest.raises(PronkError, match=r"pronk\[physx\]"):
-        Sapien(load_robot("mini_cheetah"))
+def test_a_file_whose_engine_is_missing_names_the_module_and_the_way_out(tmp_path: Path) -> None:
+    file = tmp_path / "adapter.py"
+    file.write_text("import an_engine_that_is_missing\n")
+    with pytest.raises(PronkError, match=r"an_engine_that_is_missing.*--simulator-python"):
+        simulator_factory(f"{file}:Adapter")

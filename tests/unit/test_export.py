@@ -15,14 +15,15 @@ from pronk.arrays import Array
 from pronk.cli.export import Target
 from pronk.errors import PronkError
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.export import TARGETS, Actuator, actuators, export_text, stability_share
+from pronk.identify.match.export import TARGETS, Actuator, actuators, export_text
 from pronk.identify.match.gains import FittedValue, JointGains, MatchedGains
 from pronk.identify.match.parameters import GAINS
 from pronk.identify.match.predict import drives_of
 from pronk.identify.match.ranges import group_gains
 from pronk.identify.simulators.chain import ChainSimulation
 from pronk.identify.simulators.mujoco import Chain
-from pronk.identify.simulators.profiles import profile, profiles
+from pronk.identify.simulators.profiles import load_profiles, profile
+from pronk.identify.simulators.stability import stability_share
 from pronk.robots import load_robot
 from pronk.robots.model import free_spec
 from pronk.robots.robot import RobotSpec
@@ -252,7 +253,7 @@ def assert_moves(
         mujoco.mj_step(model, data, steps)
 
 
-@pytest.mark.parametrize("name", list(profiles()))
+@pytest.mark.parametrize("name", list(load_profiles()))
 def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     holds, arm = profile(name), smooth_arm()
     # A history of parts of a step is interpolated between the parts.
@@ -342,14 +343,16 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     rest = {joint.name: joint.default_position for joint in joints}
     with Chain(robot, "gripper", threads=1) as chain:
         pose = np.array([rest[joint] for joint in chain.joints])
-        sets, start = [], []
-        for share in (0.97, 1.03):
+        values = {name: np.empty((2, len(pose))) for name in GAINS}
+        start = []
+        for run, share in enumerate((0.97, 1.03)):
             by_name = {one.name: one for one in scaled(share * low)}
-            sets.append({n: {k: getattr(v, k) for k in GAINS} for n, v in by_name.items()})
-            stiffness = np.array([by_name[joint].stiffness for joint in chain.joints])
-            start.append(chain.rest_position(pose, stiffness))
+            for column, joint in enumerate(chain.joints):
+                values["stiffness"][run, column] = by_name[joint].stiffness
+                values["damping"][run, column] = by_name[joint].damping
+            start.append(chain.rest_position(pose, values["stiffness"][run]))
         command = np.broadcast_to(pose, (2, 400, len(pose)))
-        moved = chain.rollout(command, sets, np.array(start) + 1e-7) - np.array(start)[:, None]
+        moved = chain.rollout(command, values, np.array(start) + 1e-7) - np.array(start)[:, None]
     assert np.abs(moved[0, -1]).max() < 1e-6
     assert not np.abs(moved[1, -1]).max() < 1e-5
 

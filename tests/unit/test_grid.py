@@ -28,7 +28,7 @@ from pronk.identify.match.response_fit import refine
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulated import SimRequest, responses
 from pronk.identify.response.response import Estimator
-from pronk.identify.simulators.linear import plant
+from pronk.identify.simulators.linear import linearize
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
@@ -150,7 +150,7 @@ def test_at_a_fine_step_the_closed_form_is_the_second_order_joint() -> None:
     omega = 2 * np.pi * np.array([0.5, 2.0, 5.0, 10.0, 20.0])
     with MujocoSimulator(replace(ROBOT, timestep_s=1e-5, decimation=2000)) as simulator:
         rig = simulator.rig("FR_knee")
-        found = plant(rig, np.array([1.6]), omega).response(17.0, 0.4)[0]
+        found = linearize(rig, np.array([1.6]), omega).response(17.0, 0.4)[0]
         data, bias, inertia = mujoco.MjData(rig.model), [], np.zeros(1)
         for angle in (1.6 - 1e-4, 1.6 + 1e-4):
             data.qpos[:] = angle

@@ -174,7 +174,7 @@ def profiles() -> console.Outcome:
     """List the frameworks that gains can be matched for."""
     from pronk.identify.simulators import profiles as known
 
-    found = known.profiles().values()
+    found = known.load_profiles().values()
     fields = ("decimation", "delay", "friction", "source")
     rows = [
         [p.name, p.framework, p.drive_law.label, 1e3 * p.timestep_s]

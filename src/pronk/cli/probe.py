@@ -26,12 +26,12 @@ def probe(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
     """
     from pronk.identify.simulators.load import load_simulator
-    from pronk.identify.simulators.probe import probe as look
+    from pronk.identify.simulators.probe import probe_joint
     from pronk.robots import load_robot
 
     known = load_robot(robot)
     made = load_simulator(simulator, known, threads=1, python=simulator_python)
-    found = look(made, known, joint)
+    found = probe_joint(made, known, joint)
     info, one = made.info, known.joint(found.joint)
     beside = "E, beside it " if found.beside_explicit else ""
     # Adding 0 makes -0 a 0.
@@ -50,9 +50,10 @@ def probe(
     console.show_table(
         "of the joint | set;4 | acts;4",
         rows,
-        f"Steps of {1e3 * info.timestep_s:g} ms. Left: {100.0 * found.left:.2g} % of the motion.",
+        f"Steps of {1e3 * info.timestep_s:g} ms. {100.0 * found.residual:.2g} % of the motion is "
+        "not explained.",
         title=f"{found.joint} in {info.engine} {info.version}",
     )
-    for sentence in found.wrong.values():
+    for sentence in found.faults.values():
         console.warn(f"{found.joint}: {sentence}.")
     return console.Outcome(figures={"probe": asdict(found)})

@@ -37,7 +37,7 @@ def translate(
     from pronk.identify.match import translate as translation
     from pronk.identify.match.export import profile_held, robot_of
     from pronk.identify.match.measured_joint import gains_by_joint
-    from pronk.identify.simulators.profiles import profile, profiles
+    from pronk.identify.simulators.profiles import load_profiles, profile
     from pronk.robots import load_robot
 
     stated = options.drive_gains(drive_gains)
@@ -60,7 +60,7 @@ def translate(
                 f"{1000.0 * first.simulator.timestep_s:g} ms, not for {begin}; leave --from out."
             )
     origin = profile_held(first)
-    names = [name for one in to for name in (profiles() if one == "all" else [one])]
+    names = [name for one in to for name in (load_profiles() if one == "all" else [one])]
     rows: list[list[Any]] = []
     wrote, figures = [], {}
     for name in dict.fromkeys(names):

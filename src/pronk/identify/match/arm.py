@@ -33,8 +33,13 @@ from pronk.identify.match.result import HELD_OUT, JointFit, held_out_flags
 from pronk.identify.match.uncertainty import Estimate, block_moves, estimate, jackknife, time_blocks
 from pronk.identify.response.estimate import estimate as estimate_response
 from pronk.identify.response.response import FrequencyResponse
-from pronk.identify.simulators.chain import ChainSimulation, branches, has_stribeck, published
-from pronk.identify.simulators.mujoco import Drives
+from pronk.identify.simulators.chain import (
+    ChainSimulation,
+    DriveValues,
+    branches,
+    has_stribeck,
+    published,
+)
 from pronk.robots.robot import RobotSpec
 
 BLOCKS_S = (2.5, 20.0)
@@ -71,8 +76,8 @@ class ArmProblem(Problem):
         arm: ChainSimulation,
         used: Mask,
         fitted: Mapping[str, Sequence[str]],
-        nominal: Drives,
-        found: Drives,
+        nominal: DriveValues,
+        found: DriveValues,
         progress: Callable[[int], None],
     ) -> None:
         """Take the recordings and which of their samples to use, shape (rows, joints).
@@ -125,7 +130,7 @@ class ArmProblem(Problem):
         wrong = np.clip(np.nan_to_num(wrong, nan=np.pi), -np.pi, np.pi)
         return np.asarray(np.where(self.used, wrong, 0.0).T.ravel())
 
-    def _simulated(self, sets: Sequence[Drives]) -> list[Array]:
+    def _simulated(self, sets: Sequence[DriveValues]) -> list[Array]:
         out = [self.residuals(positions) for positions in self.arm.run(sets)]
         self._progress(len(sets))
         return out
@@ -201,7 +206,7 @@ def _fit_chain(
     kept, left = used & ~aside[:, None], used & aside[:, None]
 
     def fit(
-        names: Mapping[str, Sequence[str]], begin: Drives, used: Mask
+        names: Mapping[str, Sequence[str]], begin: DriveValues, used: Mask
     ) -> tuple[ArmProblem, Solution]:
         problem = ArmProblem(arm, used, names, nominal, begin, count_runs)
         return problem, solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
@@ -220,7 +225,7 @@ def _fit_chain(
         for joint, name in lost:
             held[joint] = (*held[joint], name)
             found[joint][name] = nominal[joint][name]
-    drives: list[Drives] = [nominal]
+    drives: list[DriveValues] = [nominal]
     for few in (("delay",), _PLAIN, tuple(PARAMETERS)):
         some = {j: [n for n in fitted[j] if n in few] for j in arm.joints}
         begin = {j: nominal[j] | {n: found[j][n] for n in some[j]} for j in arm.joints}

@@ -25,13 +25,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import mujoco
 import numpy as np
-import scipy.linalg
 
 from pronk.errors import PronkError, RobotError
 from pronk.identify.match.gains import MatchedGains
-from pronk.identify.simulators.profiles import Profile, profile, profile_of, profiles
+from pronk.identify.simulators.profiles import Profile, load_profiles, profile, profile_of
+from pronk.identify.simulators.stability import require_stable
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec, set_law
 from pronk.robots.robot import Drive, RobotSpec
@@ -126,49 +125,6 @@ def actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list
                 )
             )
     return out
-
-
-def stability_share(robot: RobotSpec, drives: Sequence[Actuator]) -> float:
-    """How much of the drive law's stability limit the drives use, all joints together; 1 is it.
-
-    With mass matrix M, damping D and stiffness K, and the step h of `DriveLaw`, a pole reaches -1
-    where the largest eigenvalue of (2 h D + h^2 K) x = l B x is 4; B is M, and M + h D where
-    damping is implicit. For one joint of law E this is 2 h kd / J + h^2 kp / J < 4. Law I has no
-    limit. The robot floats in its default pose, where its joints feel the least inertia.
-    """
-    model, law = free_spec(robot).compile(), robot.law
-    step = law.substep(robot.timestep_s)
-    stiffness, damping = np.zeros((2, model.nv))
-    for one in drives:
-        for name in one.joints:
-            dof = model.joint(name).dofadr[0]
-            model.dof_armature[dof] = one.armature
-            stiffness[dof] = one.stiffness
-            damping[dof] = law.damping(one.stiffness, one.damping, step)
-    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, mass)
-    implicit = np.zeros(model.nv) if law.kind == "explicit" else damping.copy()
-    (damping if law.passive_damping == "explicit" else implicit)[:] += model.dof_damping
-    largest = scipy.linalg.eigh(
-        np.diag(2.0 * step * damping + step**2 * stiffness),
-        mass + step * np.diag(implicit),
-        eigvals_only=True,
-    )[-1]
-    return float(largest / 4.0)
-
-
-def require_stable(holds: Profile, robot: RobotSpec, drives: Sequence[Actuator]) -> float:
-    """`stability_share` of drives in a framework; PronkError if it is 1 or more."""
-    if (share := stability_share(robot, drives)) >= 1.0:
-        step = holds.timestep_s
-        raise PronkError(
-            f"the gains of {robot.name} are not stable in {holds.name}: at {1000.0 * step:g} ms "
-            f"they are {share:.2f} times the limit of drive law {holds.drive_law.label}; take a "
-            f"smaller step, as {holds.name},timestep_s={step / 2.0:g}."
-        )
-    return share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -547,7 +503,7 @@ def profile_held(gains: MatchedGains) -> Profile:
     except PronkError:
         raise PronkError(
             f"the gains hold for simulator {gains.simulator.engine}, whose drive law pronk does "
-            f"not know; match with --for NAME, one of {', '.join(profiles())}."
+            f"not know; match with --for NAME, one of {', '.join(load_profiles())}."
         ) from None
 
 

@@ -20,7 +20,7 @@ from pronk.errors import PronkError
 from pronk.identify.match.measured_joint import DB, MeasuredJoint
 from pronk.identify.match.response_fit import Fit, refine
 from pronk.identify.match.simulated import SimRequest, grouped, responses
-from pronk.identify.simulators.linear import Plant, plant
+from pronk.identify.simulators.linear import LinearJoint, linearize
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
@@ -304,9 +304,9 @@ def quick_search(
     return grids, fits
 
 
-def linearized(rigs: MujocoSimulator, goal: MeasuredJoint) -> Plant:
+def linearized(rigs: MujocoSimulator, goal: MeasuredJoint) -> LinearJoint:
     """The joint of a measured response in closed form, at the frequencies of the fit."""
-    return plant(rigs.rig(goal.joint), goal.trace.excitation(rigs.robot)[0], goal.omega)
+    return linearize(rigs.rig(goal.joint), goal.trace.excitation(rigs.robot)[0], goal.omega)
 
 
 def _map(goal: MeasuredJoint, log: Array) -> Array:
@@ -314,7 +314,7 @@ def _map(goal: MeasuredJoint, log: Array) -> Array:
     return mean_square(DB * (log - np.log(np.abs(goal.measured.response[goal.fit_mask]))))
 
 
-def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:
+def _correction(linear: LinearJoint, fit: Fit, stiffness: Array, damping: Array) -> Array:
     """Log gain of the simulator over that of the closed form, to first order, shape (b, f)."""
     goal = fit.target
     amplitude = goal.trace.amplitude

@@ -15,7 +15,7 @@ from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.arm import fit_together
-from pronk.identify.match.export import actuators, require_stable
+from pronk.identify.match.export import actuators
 from pronk.identify.match.grid import (
     GridSearch,
     alike,
@@ -61,11 +61,12 @@ from pronk.identify.match.translate import translated
 from pronk.identify.match.uncertainty import gain_interval
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.chain import moves_together, published
-from pronk.identify.simulators.linear import Plant
+from pronk.identify.simulators.linear import LinearJoint
 from pronk.identify.simulators.load import joint_rigs
 from pronk.identify.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.identify.simulators.profiles import profile
 from pronk.identify.simulators.simulator import JointRigs, SimulatorInfo
+from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
 
 Progress = Callable[[str, float], None]
@@ -301,7 +302,7 @@ class _Match:
     excluded: Mapping[str, str] = field(default_factory=dict)
     rate: float = float("nan")
     """Physics steps per second of the grid search; NaN where it was not searched whole."""
-    plants: Mapping[str, Plant] = field(default_factory=dict)
+    plants: Mapping[str, LinearJoint] = field(default_factory=dict)
     """Linearized joints."""
     gains: dict[str, Pair] = field(default_factory=dict)
     matched: Mapping[str, ComplexArray] = field(default_factory=dict)

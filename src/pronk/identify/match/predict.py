@@ -25,10 +25,15 @@ from pronk.identify.match.gains import MatchedGains
 from pronk.identify.match.measured_joint import DriveGains, gains_on_drive, rms, with_drive_gains
 from pronk.identify.match.parameters import GAINS
 from pronk.identify.response.grid import held_mean
-from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together, published
+from pronk.identify.simulators.chain import (
+    ChainSimulation,
+    DriveValues,
+    branches,
+    moves_together,
+    published,
+)
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.load import joint_rigs
-from pronk.identify.simulators.mujoco import Drives
 from pronk.identify.simulators.profiles import profile_of
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
@@ -168,7 +173,7 @@ def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:
 
 
 def _together(
-    log: JointLog, robot: RobotSpec, matched: Drives, threads: int
+    log: JointLog, robot: RobotSpec, matched: DriveValues, threads: int
 ) -> tuple[list[JointPrediction], dict[str, str]]:
     """Chain by chain; joints, and why others are left out."""
     joints: list[JointPrediction] = []
@@ -203,7 +208,7 @@ def _together(
 
 
 def _joint_by_joint(
-    log: JointLog, rigs: JointRigs, matched: Drives
+    log: JointLog, rigs: JointRigs, matched: DriveValues
 ) -> tuple[list[JointPrediction], dict[str, str]]:
     """One joint after the other, segment by segment; returns as `_together`."""
     joints, left_out = [], {}

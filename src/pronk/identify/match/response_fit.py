@@ -20,7 +20,7 @@ from pronk.identify.match.parameters import GAINS, PARAMETERS
 from pronk.identify.match.result import JointFit
 from pronk.identify.match.simulated import SimRequest, responses
 from pronk.identify.match.uncertainty import Estimate
-from pronk.identify.simulators.linear import Plant
+from pronk.identify.simulators.linear import LinearJoint
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
 
@@ -36,7 +36,7 @@ class ResponseProblem(CachedProblem):
         rigs: JointRigs,
         goal: MeasuredJoint,
         start: Pair,
-        linear: Plant | None = None,
+        linear: LinearJoint | None = None,
         correction: Array | None = None,
     ) -> None:
         """Begin at some stiffness and damping.
@@ -113,7 +113,7 @@ def refine(
     rigs: JointRigs,
     targets: Sequence[MeasuredJoint],
     start: Sequence[Pair],
-    linear: Sequence[Plant] = (),
+    linear: Sequence[LinearJoint] = (),
     corrections: Sequence[Array] = (),
 ) -> list[Fit]:
     """Find the gains that minimize the weighted squared gain error, from a `start` each.

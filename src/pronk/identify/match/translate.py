@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from pronk.arrays import Array
 from pronk.errors import PronkError
-from pronk.identify.match.export import actuators, profile_held, require_stable
+from pronk.identify.match.export import actuators, profile_held
 from pronk.identify.match.gains import (
     ZERO,
     FittedValue,
@@ -28,9 +28,10 @@ from pronk.identify.match.gains import (
     MatchedGains,
 )
 from pronk.identify.match.measured_joint import DB, Pair, rms
-from pronk.identify.simulators.linear import Plant, plant
+from pronk.identify.simulators.linear import LinearJoint, linearize
 from pronk.identify.simulators.mujoco import JointTestRig
 from pronk.identify.simulators.profiles import Profile
+from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
 
 LOW_HZ = 1.0
@@ -118,7 +119,7 @@ def translate(
     return translated_gains, translations
 
 
-def translated(first: Plant, other: Plant, gains: Pair, delay_s: float = 0.0) -> JointTranslation:
+def translated(first: LinearJoint, other: LinearJoint, gains: Pair, delay_s: float = 0.0) -> JointTranslation:
     """Find the gains with which one linear joint responds like another.
 
     Args:
@@ -189,7 +190,7 @@ def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile)
     return MatchedGains(robot=robot.name, simulator=simulator, joints=joints, groups=groups)
 
 
-def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
+def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> LinearJoint:
     """Linearize a joint about the default pose, with its matched armature and no dry friction."""
     original = robot.joint(robot.joint(name).original[0])
     rotor_inertia = gains.armature.value / original.drive.gear_ratio**2
@@ -206,7 +207,7 @@ def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
     pose = np.array([robot.joint(joint).default_position for joint in original.chain])
     with JointTestRig(changed, original.name, threads=1) as rig:
         order = [original.chain.index(joint) for joint in rig.joints]
-        return plant(rig, pose[order], 2.0 * np.pi * hz)
+        return linearize(rig, pose[order], 2.0 * np.pi * hz)
 
 
 def _translated_joint(joint: JointGains, translation: JointTranslation, begin: str) -> JointGains:

@@ -7,6 +7,7 @@ changes are fitted by the clock of the policy, and the command is read in the mi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,7 @@ class CommandTrace:
     """One command to one joint, at every physics step of the training simulator."""
 
     joint: str
+    """Name of the joint that is commanded."""
     start: float
     """Instant of the first step, on the clock of the log [s]."""
     timestep: float
@@ -50,42 +52,61 @@ class CommandTrace:
         return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
 
     def excitation(self, robot: RobotSpec, steps: int | None = None) -> tuple[Array, Array]:
-        """What the original joint is simulated with, mirrored from this one.
+        """Mirror the command to the original joint, which is simulated in this one's place.
 
-        Returns the pose of the original joint's chain [rad], shape (chain,), and the command about
-        it at each of `steps` [rad] (all if None); a shorter command stays where it ends.
+        Args:
+            robot: The robot.
+            steps: Physics steps; those of the command if None. A shorter command stays where it
+                ends.
+
+        Returns:
+            The pose of the original joint's chain [rad], shape (chain,), and the command about it
+            at each step [rad], shape (steps,).
         """
-        excited = robot.joint(self.joint)
-        first, sign = excited.original
-        # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
-        pairs = zip(excited.chain, robot.joint(first).chain, strict=True)
-        signs = [robot.joint(own).original[1] * robot.joint(one).original[1] for own, one in pairs]
+        joint = robot.joint(self.joint)
+        original_name, sign = joint.original
+        original = robot.joint(original_name)
         names = robot.joint_names
-        pose = np.array(signs) * self.pose[[names.index(own) for own in excited.chain]]
+        pose = []
+        # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
+        for name, original_link in zip(joint.chain, original.chain, strict=True):
+            link_sign = robot.joint(name).original[1] * robot.joint(original_link).original[1]
+            pose.append(link_sign * self.pose[names.index(name)])
         command = sign * (self.command[:steps] - self.pose[names.index(self.joint)])
-        spare = 0 if steps is None else steps - len(command)
-        return pose, np.pad(command, (0, spare), mode="edge")
+        if steps is not None:
+            command = np.pad(command, (0, steps - len(command)), mode="edge")
+        return np.array(pose), command
 
     def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
-        """True if both lead to the same simulation of the same original joint.
+        """Tell whether both lead to the same simulation of the same original joint.
 
-        One may rest longer at the end. With `sign` -1 the commands have opposite signs.
+        Args:
+            other: Another command, which may rest longer or shorter at its end.
+            robot: The robot.
+            sign: 1, or -1 for commands of opposite signs.
         """
         if robot.joint(self.joint).original[0] != robot.joint(other.joint).original[0]:
             return False
-        (pose, mine), (other_pose, theirs) = self.excitation(robot), other.excitation(robot)
-        short, long = sorted((mine, sign * theirs), key=len)
-        short = np.pad(short, (0, len(long) - len(short)), mode="edge")
-        same = bool(np.abs(long - short).max() < _SAME)
-        return same and np.allclose(pose, other_pose, atol=1e-3)
+        steps = max(len(self.command), len(other.command))
+        pose, command = self.excitation(robot, steps)
+        other_pose, other_command = other.excitation(robot, steps)
+        if np.abs(command - sign * other_command).max() >= _SAME:
+            return False
+        return bool(np.allclose(pose, other_pose, atol=1e-3))
 
 
 def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:
-    """Phase of the clock of period `tick` [s] on which a held command changes.
+    """Find the phase of the clock on which a held command changes.
 
-    Returns an instant at which a tick begins [s], and the median distance of the changes from the
-    ticks as a share of `tick` (0.25 is what changes at random instants give). A command that never
-    changes begins at the first timestamp, at distance 0.
+    Args:
+        time: Timestamps [s], shape (n,).
+        command: Command at the timestamps, shape (n,).
+        tick: Period of the clock [s].
+
+    Returns:
+        An instant at which a tick begins [s], and the median distance of the changes from the
+        ticks as a share of `tick` (0.25 is what changes at random instants give). A command that
+        never changes begins at the first timestamp, at distance 0.
     """
     changes = time[1:][np.diff(command) != 0.0]
     if len(changes) == 0:
@@ -100,10 +121,15 @@ def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float
 
 
 def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
-    """Command of one excitation at every physics step of the robot.
+    """Read the command of one excitation at every physics step of the robot.
 
-    A LogError says that the unit of the joint is unknown, or that a joint that is clamped in the
-    bench model stood elsewhere.
+    Args:
+        excitation: One excitation of one joint in a log.
+        robot: The robot with the timestep and decimation of its simulator.
+
+    Raises:
+        LogError: The unit of the joint is not radians, or a joint that is clamped in the bench
+            model stood elsewhere.
     """
     joint = excitation.joint
     unit = excitation.log.unit(joint)
@@ -117,10 +143,12 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
     tick = robot.timestep_s * robot.decimation
     clock, distance = policy_clock(time, command, tick)
     on_clock = distance <= _OFF_CLOCK * 0.6
-    start, period = time[0], robot.timestep_s
+    start = time[0]
+    period = robot.timestep_s
     if on_clock:
         # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
-        start, period = clock + np.floor((start - clock) / tick + 0.5) * tick, tick
+        start = clock + np.floor((start - clock) / tick + 0.5) * tick
+        period = tick
     count = int(np.ceil((time[-1] - start) / period))
     middle = start + (np.arange(count) + 0.5) * period
     steps = command[np.maximum(in_force(time, middle), 0)]
@@ -140,32 +168,37 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
 
 
 def _early_ticks(values: Array) -> int:
-    """Ticks to begin before the log, so that repeats begin alike.
+    """Count the ticks to begin before the log, so that repeats begin alike.
 
     Whether the log caught the tick it began in is chance; a rest before the first change is
-    therefore lengthened to a multiple of five ticks. A log that begins in motion is left alone.
+    therefore lengthened to a multiple of five ticks. A log that begins in motion is not lengthened.
     """
     changes = np.nonzero(np.diff(values) != 0.0)[0]
-    rest = int(changes[0]) + 1 if len(changes) else len(values)
+    resting_ticks = len(values)
+    if len(changes) > 0:
+        resting_ticks = int(changes[0]) + 1
+    if resting_ticks < 2:
+        return 0
     # Plans rest for multiples of five ticks (0.1 s) give or take one: keep clear of those.
-    return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
+    lengthened = math.ceil((resting_ticks + 2) / 5) * 5
+    return lengthened - resting_ticks
 
 
 def _pose(excitation: Excitation, robot: RobotSpec) -> Array:
-    """Pose of every joint of the robot; the default position of joints that the log lacks."""
+    """Return the pose of every joint; the default position of joints that the log lacks."""
     log = excitation.log
     joint = excitation.joint
-    pose = np.array([j.default_position for j in robot.joints])
+    pose = np.array([robot_joint.default_position for robot_joint in robot.joints])
     logged = excitation.pose
-    for i, name in enumerate(robot.joint_names):
+    for index, name in enumerate(robot.joint_names):
         if name in log.joints and log.unit(name) == "rad":
-            pose[i] = logged[log.column(name)]
+            pose[index] = logged[log.column(name)]
     for name in robot.joint(joint).clamped:
         default = robot.joint(name).default_position
-        stood = pose[robot.joint_names.index(name)]
-        if abs(stood - default) > _POSE_SLACK:
+        position = pose[robot.joint_names.index(name)]
+        if abs(position - default) > _POSE_SLACK:
             raise LogError(
-                f"{log.source or 'log'}: {name} was clamped at {stood:.3f} rad while {joint} was "
-                f"excited; the bench model of {robot.name} clamps it at {default:.3f} rad."
+                f"{log.source or 'log'}: {name} was clamped at {position:.3f} rad while {joint} "
+                f"was excited; the bench model of {robot.name} clamps it at {default:.3f} rad."
             )
     return pose

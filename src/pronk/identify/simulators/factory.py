@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import PronkError
-from pronk.plugins import load
+from pronk.plugins import load_entry_point
 from pronk.robots.robot import RobotSpec
 
 ENTRY_POINTS = "pronk.simulators"
@@ -38,7 +38,7 @@ def simulator_factory(choice: str) -> Callable[[RobotSpec], Any]:
             f"simulator {choice!r}; expected FILE.py:NAME, as in "
             f"examples/my_simulator.py:Pendulum, or one of {', '.join(names)}."
         )
-    make: Callable[[RobotSpec], Any] = load(installed[choice])
+    make: Callable[[RobotSpec], Any] = load_entry_point(installed[choice])
     return make
 
 

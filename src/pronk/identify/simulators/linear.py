@@ -28,87 +28,115 @@ from pronk.arrays import Array, ComplexArray
 from pronk.identify.simulators.mujoco import JointTestRig
 from pronk.robots.drive_law import DriveLaw
 
-_EPS = 1e-6
+_PERTURBATION = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
-_STEP = 1e-3  # step of `Plant.slope` in the logarithm of a gain
+_LOG_STEP = 1e-3
+"""Step of `LinearJoint.slope` in the logarithm of a gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plant:
-    """Torque at the excited joint to its position and speed, at some frequencies."""
+class LinearJoint:
+    """Responses of an excited joint without its drive, at f frequencies."""
 
     omega: Array
-    """[rad/s], shape (f,)."""
+    """Frequencies [rad/s], shape (f,)."""
     position: ComplexArray
-    """P_q [rad/(N m)], shape (f,)."""
+    """P_q, from torque at the joint to its position [rad/(N m)], shape (f,)."""
     speed: ComplexArray
-    """P_v [rad/s/(N m)], shape (f,)."""
+    """P_v, from torque at the joint to its speed [rad/s/(N m)], shape (f,)."""
     timestep: float
-    """Of the integration [s]."""
+    """Step of the integration [s]."""
     frictionloss: float
-    """Dry friction of the excited joint [N m]."""
+    """Dry friction of the joint [N m]."""
     law: DriveLaw
+    """Law of the drive that closes the loop."""
 
     def response(
         self, stiffness: ArrayLike, damping: ArrayLike, *, amplitude: float = float("nan")
     ) -> ComplexArray:
-        """Response from the held command to position, as in FrequencyResponse, shape (b, f).
+        """Compute the response from the held command to position, as in FrequencyResponse.
 
-        Gains [N m/rad, N m s/rad] are scalars or of shape (b,); without the amplitude of the
-        command [rad] friction is left out.
+        Args:
+            stiffness: Stiffness of the drive [N m/rad], a number or of shape (b,).
+            damping: Damping of the drive [N m s/rad], a number or of shape (b,).
+            amplitude: Amplitude of the command [rad]; without it friction is left out.
+
+        Returns:
+            The response, shape (b, f).
         """
-        kp, kd = (
-            np.array(gain, dtype=np.float64, ndmin=1)[:, None] for gain in (stiffness, damping)
-        )
+        kp = np.array(stiffness, dtype=np.float64, ndmin=1)[:, None]
+        kd = np.array(damping, dtype=np.float64, ndmin=1)[:, None]
         # The sampled command is a staircase of physics steps; take that hold out.
-        half = self.omega * self.timestep / 2.0
-        hold = np.exp(-1j * half) * np.sinc(half / np.pi)
-        after = self.speed * np.exp(1j * self.omega * self.timestep)
+        half_turn = self.omega * self.timestep / 2.0
+        hold = np.exp(-1j * half_turn) * np.sinc(half_turn / np.pi)
+        next_speed = self.speed * np.exp(1j * self.omega * self.timestep)
         kd = self.law.damping(kp, kd, self.timestep)
         direct = kp * self.position
-        open_loop = 1.0 + direct + kd * (self.speed if self.law.kind == "explicit" else after)
+        damped_speed = self.speed if self.law.kind == "explicit" else next_speed
+        open_loop = 1.0 + direct + kd * damped_speed
         closed = direct / open_loop
         if self.frictionloss > 0.0 and np.isfinite(amplitude):
             # MuJoCo's dry friction is implicit: it opposes the speed at the end of the step. The
-            # amplitude `x` of that speed solves `|x open_loop + relay after| = forced`.
+            # amplitude `x` of that speed solves `|x open_loop + relay next_speed| = forced`.
             relay = 4.0 * self.frictionloss / np.pi
             forced = amplitude * self.omega * np.abs(direct)
             square = open_loop.real**2 + open_loop.imag**2
-            half = relay * (open_loop.real * after.real + open_loop.imag * after.imag)
-            rest = square * ((relay * np.abs(after)) ** 2 - forced**2)
-            speed = (np.sqrt(np.maximum(half**2 - rest, 0.0)) - half) / square
-            closed = direct / (open_loop + relay / np.maximum(speed, 1e-9) * after)
+            half = relay * (open_loop.real * next_speed.real + open_loop.imag * next_speed.imag)
+            constant = square * ((relay * np.abs(next_speed)) ** 2 - forced**2)
+            speed = (np.sqrt(np.maximum(half**2 - constant, 0.0)) - half) / square
+            closed = direct / (open_loop + relay / np.maximum(speed, 1e-9) * next_speed)
         return np.asarray(closed / hold)
 
     def slope(self, stiffness: float, damping: float, *, amplitude: float) -> Array:
-        """Derivative of the log gain by the log of stiffness and of damping, shape (f, 2)."""
-        near = np.exp(np.log([stiffness, damping]) + _STEP * np.array([[0, 0], [1, 0], [0, 1]]))
-        logs = np.log(np.abs(self.response(near[:, 0], near[:, 1], amplitude=amplitude)))
-        return np.asarray((logs[1:] - logs[0]).T / _STEP)
+        """Differentiate the log magnitude by the log of stiffness and of damping.
+
+        Args:
+            stiffness: Stiffness of the drive [N m/rad].
+            damping: Damping of the drive [N m s/rad].
+            amplitude: Amplitude of the command [rad].
+
+        Returns:
+            Derivatives, shape (f, 2).
+        """
+        log_gains = np.log([stiffness, damping]) + _LOG_STEP * np.array([[0, 0], [1, 0], [0, 1]])
+        gains = np.exp(log_gains)
+        responses = self.response(gains[:, 0], gains[:, 1], amplitude=amplitude)
+        log_magnitude = np.log(np.abs(responses))
+        return np.asarray((log_magnitude[1:] - log_magnitude[0]).T / _LOG_STEP)
 
 
-def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
-    """Linearize a rig about the pose of its chain [rad], at frequencies `omega` [rad/s]."""
+def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
+    """Linearize the joint of a rig.
+
+    Args:
+        rig: The rig.
+        pose: Pose of its chain [rad], shape (n,).
+        omega: Frequencies [rad/s], shape (f,).
+    """
     # The excited joint takes a torque in place of its drive, and has no dry friction.
-    model, i = copy.copy(rig.model), rig.actuator
-    model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
-    model.actuator_biastype[i] = mujoco.mjtBias.mjBIAS_NONE
-    model.actuator_dyntype[i] = mujoco.mjtDyn.mjDYN_NONE
-    model.actuator_gainprm[i] = np.eye(model.actuator_gainprm.shape[1])[0]
-    model.actuator_ctrllimited[i] = model.actuator_forcelimited[i] = False
+    model = copy.copy(rig.model)
+    actuator = rig.actuator
+    model.actuator_gaintype[actuator] = mujoco.mjtGain.mjGAIN_FIXED
+    model.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_NONE
+    model.actuator_dyntype[actuator] = mujoco.mjtDyn.mjDYN_NONE
+    model.actuator_gainprm[actuator] = 0.0
+    model.actuator_gainprm[actuator, 0] = 1.0
+    model.actuator_ctrllimited[actuator] = False
+    model.actuator_forcelimited[actuator] = False
     model.dof_frictionloss[rig.index] = 0.0
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     data.ctrl[:] = rig.control(pose)
     mujoco.mj_forward(model, data)
     # Hold the joint against gravity, so that the linearization is about rest.
-    data.ctrl[i] = data.qfrc_bias[rig.index]
-    nx = 2 * model.nv + model.na
-    a, b = np.zeros((nx, nx)), np.zeros((nx, model.nu))
-    mujoco.mjd_transitionFD(model, data, _EPS, True, a, b, None, None)
+    data.ctrl[actuator] = data.qfrc_bias[rig.index]
+    size = 2 * model.nv + model.na
+    a = np.zeros((size, size))
+    b = np.zeros((size, model.nu))
+    mujoco.mjd_transitionFD(model, data, _PERTURBATION, True, a, b, None, None)
     z = np.exp(1j * omega * model.opt.timestep)[:, None, None]
-    states = np.linalg.solve(z * np.eye(nx) - a, b[:, i, None])[..., 0]
-    return Plant(
+    states = np.linalg.solve(z * np.eye(size) - a, b[:, actuator, None])[..., 0]
+    return LinearJoint(
         omega=omega,
         position=states[:, rig.index],
         speed=states[:, model.nv + rig.index],

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from pronk.errors import PronkError
+from pronk.identify.simulators.factory import simulator_factory
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.identify.simulators.remote import RemoteSimulator
-from pronk.identify.simulators.simulator import JointRigs, RolloutRigs, Simulator, factory
+from pronk.identify.simulators.simulator import JointRigs, RolloutRigs, Simulator
 from pronk.robots.robot import RobotSpec
 
 
 def load_simulator(
-    choice: str,
-    robot: RobotSpec,
-    *,
-    threads: int = 2,
-    device: str = "cpu",
-    python: Path | None = None,
+    choice: str, robot: RobotSpec, *, threads: int = 2, python: Path | None = None
 ) -> Simulator:
     """Make a simulator of a robot.
 
-    The choice is `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`; what it names
-    is called with the robot and returns a `Simulator`. Threads are those of MuJoCo; its large runs
-    are simulated on `device`, one of `pronk.identify.simulators.mujoco.DEVICES`. With `python`, the
-    path of an interpreter, the simulator is made there (`pronk.identify.simulators.remote`). A
-    PronkError says that there is no such simulator, or that it lacks what the protocol needs.
+    Args:
+        choice: `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`. What it names is
+            called with the robot and returns a `Simulator`.
+        robot: The robot.
+        threads: Simulations of MuJoCo at the same time.
+        python: Interpreter in which the simulator is made (`pronk.identify.simulators.remote`);
+            this one if None.
+
+    Raises:
+        PronkError: There is no such simulator, or it lacks what the protocol needs.
     """
     if choice == "mujoco":
         if python is not None:
@@ -34,14 +34,15 @@ def load_simulator(
                 "simulator mujoco runs in this Python only; leave --simulator-python out, or name "
                 "another with --simulator."
             )
-        return MujocoSimulator(robot, threads=threads, device=device)
-    if device != "cpu":
-        raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
-    simulator: Simulator = (
-        RemoteSimulator(choice, robot, python) if python else factory(choice)(robot)
-    )
+        return MujocoSimulator(robot, threads=threads)
+    simulator: Simulator
+    if python is not None:
+        simulator = RemoteSimulator(choice, robot, python)
+    else:
+        simulator = simulator_factory(choice)(robot)
     members = ("info", "joints", "parameters", "rollout")
-    if lacking := [name for name in members if not hasattr(simulator, name)]:
+    lacking = [name for name in members if not hasattr(simulator, name)]
+    if lacking:
         raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
     if not {"stiffness", "damping"} <= set(simulator.parameters):
         raise PronkError(
@@ -51,7 +52,11 @@ def load_simulator(
     return simulator
 
 
-def joint_rigs(choice: str, robot: RobotSpec, **options: Any) -> JointRigs:
-    """Rigs of a robot's joints in a simulator; options and errors are `load_simulator`'s."""
-    simulator = load_simulator(choice, robot, **options)
-    return simulator if isinstance(simulator, MujocoSimulator) else RolloutRigs(simulator, robot)
+def joint_rigs(
+    choice: str, robot: RobotSpec, *, threads: int = 2, python: Path | None = None
+) -> JointRigs:
+    """Make the rigs of a robot's joints in a simulator; see `load_simulator`."""
+    simulator = load_simulator(choice, robot, threads=threads, python=python)
+    if isinstance(simulator, MujocoSimulator):
+        return simulator
+    return RolloutRigs(simulator, robot)

@@ -23,9 +23,9 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import PronkError
-from pronk.identify.simulators.engines.engine import delayed
-from pronk.identify.simulators.engines.links import links_of
-from pronk.identify.simulators.simulator import Simulator, excited
+from pronk.identify.simulators.engine import delayed
+from pronk.identify.simulators.links import links_of
+from pronk.identify.simulators.simulator import Simulator, rollout_joint
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
 
@@ -81,9 +81,9 @@ class Probe:
     """Steps that a command is held for."""
     stable_share: float
     """Share of the gains at which the simulator is stable: 1, or less."""
-    left: float
-    """RMS of the motion that the answer leaves, as a share of the motion."""
-    wrong: Mapping[str, str] = field(default_factory=dict)
+    residual: float
+    """RMS of the motion that the answer does not explain, as a share of the motion."""
+    faults: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word, and a sentence (see `_wrong`)."""
 
 
@@ -132,7 +132,7 @@ class _Fit:
     law: _Law
 
 
-def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
+def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
     """Name the drive law and the parameters that act at one joint, whose gains are the robot's.
 
     It is the first joint that moves no other if None. A PronkError says that there is no such
@@ -199,9 +199,9 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
         delay_s=delay * runs.timestep,
         hold=hold,
         stable_share=stable,
-        left=left,
+        residual=left,
     )
-    return replace(found, wrong=_wrong(found, simulator, runs))
+    return replace(found, faults=_wrong(found, simulator, runs))
 
 
 class _Bench:
@@ -220,7 +220,7 @@ class _Bench:
         full = np.tile(pose, (*command.shape, 1))
         full[..., names.index(self.joint.name)] += command
         with np.errstate(all="ignore"):
-            return excited(self.simulator, self.robot, self.joint.name, full, values)
+            return rollout_joint(self.simulator, self.robot, self.joint.name, full, values)
 
     def gains(self, share: Array) -> dict[str, Array]:
         """Both gains, shares of the robot's, shape (B,)."""
@@ -510,9 +510,9 @@ def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> dict[str, str]:
     if found.stable_share < 1.0:
         share = found.stable_share
         out["unstable"] = f"the joint diverges with its gains; it was probed with {share:g} of them"
-    if found.left > _LEFT:
+    if found.residual > _LEFT:
         out["left"] = (
-            f"{100.0 * found.left:.1f} % of the motion is left: the joint follows none of the "
+            f"{100.0 * found.residual:.1f} % of the motion is left: the joint follows none of the "
             "laws, or others move with it"
         )
     return out

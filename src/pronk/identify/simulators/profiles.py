@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, cast, get_args
 
 from pronk.errors import PronkError
 from pronk.files import converted, read_yaml
@@ -32,14 +32,21 @@ class Profile:
     framework: str
     """Framework, and the actuator of it that the profile holds for."""
     engine: str
+    """Physics engine of the framework."""
     integrator: str
+    """Integrator of the engine, in its own words."""
     actuator: str
+    """The framework's drive, by its own name."""
     law: Literal["explicit", "implicit_damping", "implicit"]
+    """`DriveLaw.kind` of the drive."""
     iterations: int = 1
+    """`DriveLaw.iterations` of the drive."""
     passive_damping: Literal["implicit", "explicit"] = "implicit"
+    """`DriveLaw.passive_damping` of the joints."""
     timestep_s: float
+    """Physics step [s]."""
     decimation: int
-    """Steps of a command as the framework's tasks have it; a match takes the robot's."""
+    """Physics steps a command as the framework's tasks have it; a match takes the robot's."""
     delay: Literal["steps", "none"]
     """Delay of a command that can be set: whole physics steps, or none."""
     friction: Friction
@@ -50,6 +57,7 @@ class Profile:
     source: str
     """Where timestep, decimation and iterations come from."""
     name: str = ""
+    """Name of the profile in its file."""
 
     def __post_init__(self) -> None:
         """Refuse an impossible step or law, and friction of an unknown kind."""
@@ -62,7 +70,8 @@ class Profile:
                 f"profile {self.name}: friction {self.friction!r}; expected "
                 f"{', '.join(get_args(Friction))}."
             )
-        _ = self.drive_law
+        # An impossible law is refused where it is made.
+        DriveLaw(kind=self.law, iterations=self.iterations, passive_damping=self.passive_damping)
 
     @property
     def drive_law(self) -> DriveLaw:
@@ -73,13 +82,20 @@ class Profile:
 
     @property
     def info(self) -> SimulatorInfo:
-        """What gains that are matched for the profile hold for."""
-        names = ("engine", "timestep_s", "decimation", "integrator", "actuator")
-        own = {name: getattr(self, name) for name in (*names, "law", "iterations")}
-        return SimulatorInfo(profile=self.name, **own)
+        """The simulator that gains hold for which are matched for the profile."""
+        return SimulatorInfo(
+            profile=self.name,
+            engine=self.engine,
+            timestep_s=self.timestep_s,
+            decimation=self.decimation,
+            integrator=self.integrator,
+            actuator=self.actuator,
+            law=self.law,
+            iterations=self.iterations,
+        )
 
     def joint(self, joint: Joint) -> Joint:
-        """A joint with the limits and the friction that the framework has."""
+        """Return a joint with the limits and the friction that the framework has."""
         drive = joint.drive
         if not self.speed_curve:
             drive = replace(drive, stall_torque=drive.effort_limit, no_load_speed=_NO_CURVE)
@@ -88,9 +104,10 @@ class Profile:
         return replace(joint, drive=drive)
 
     def robot(self, robot: RobotSpec) -> RobotSpec:
-        """A robot as the framework simulates it, commanded at the robot's own rate.
+        """Return a robot as the framework simulates it, commanded at the robot's own rate.
 
-        A PronkError says that the period of its commands is no multiple of the timestep.
+        Raises:
+            PronkError: The period of the robot's commands is no multiple of the timestep.
         """
         ticks = 1.0 / (robot.policy_rate_hz * self.timestep_s)
         if round(ticks) < 1 or abs(ticks - round(ticks)) > 1e-6:
@@ -109,35 +126,53 @@ class Profile:
 
 
 @cache
-def profiles() -> Mapping[str, Profile]:
-    """All profiles by name, in the order of their file."""
-    data = read_yaml(FILE)
-    return {n: converted({**one, "name": n}, Profile, FILE) for n, one in data.items()}
+def load_profiles() -> Mapping[str, Profile]:
+    """Read all profiles by name, in the order of their file."""
+    profiles = {}
+    for name, fields in read_yaml(FILE).items():
+        profiles[name] = converted({**fields, "name": name}, Profile, FILE)
+    return profiles
 
 
 def profile(text: str) -> Profile:
-    """One of `profiles`: NAME, or NAME,timestep_s=S,iterations=N,friction=none with other values.
+    """Return a profile by its name, with some settings changed.
 
-    A PronkError names an unknown name or setting, or a value out of range.
+    Args:
+        text: NAME, or NAME,timestep_s=S,iterations=N,friction=none with any of these settings.
+
+    Raises:
+        PronkError: The name or a setting is unknown, or a value is out of range.
     """
     name, *settings = text.split(",")
-    if name not in profiles():
-        raise PronkError(f"profile {name!r}; expected one of {', '.join(profiles())}.")
-    found = profiles()[name]
-    kinds: dict[str, Any] = {"timestep_s": float, "iterations": int, "friction": str}
+    profiles = load_profiles()
+    if name not in profiles:
+        raise PronkError(f"profile {name!r}; expected one of {', '.join(profiles)}.")
+    chosen = profiles[name]
     for setting in settings:
         key, _, value = setting.partition("=")
-        if key not in kinds:
-            raise PronkError(f"profile {text}: setting {key!r}; expected {', '.join(kinds)}.")
         try:
-            own = kinds[key](value)
+            if key == "timestep_s":
+                chosen = replace(chosen, timestep_s=float(value))
+            elif key == "iterations":
+                chosen = replace(chosen, iterations=int(value))
+            elif key == "friction":
+                chosen = replace(chosen, friction=cast(Friction, value))
+            else:
+                raise PronkError(
+                    f"profile {text}: setting {key!r}; expected timestep_s, iterations, friction."
+                )
         except ValueError:
             raise PronkError(f"profile {text}: {key} {value!r}; expected a number.") from None
-        found = replace(found, **{key: own})
-    return found
+    return chosen
 
 
 def profile_of(info: SimulatorInfo) -> Profile:
-    """The profile that gains hold for, with their own step and iterations; PronkError if none."""
-    name = info.profile or ("mjlab" if info.engine == "mujoco" else info.engine)
+    """Return the profile that gains hold for, with the step and the iterations of the gains.
+
+    Raises:
+        PronkError: There is no profile of that simulator.
+    """
+    name = info.profile
+    if not name:
+        name = "mjlab" if info.engine == "mujoco" else info.engine
     return profile(f"{name},timestep_s={info.timestep_s!r},iterations={info.iterations}")

@@ -39,20 +39,15 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
-from pronk.identify.simulators.engines.links import Links, SentRobot, links_of
-from pronk.identify.simulators.simulator import (
-    ENTRY_POINTS,
-    Closing,
-    Simulator,
-    SimulatorInfo,
-    factory,
-)
+from pronk.identify.simulators.factory import ENTRY_POINTS, simulator_factory
+from pronk.identify.simulators.links import Links, SentRobot, links_of
+from pronk.identify.simulators.simulator import Closing, Simulator, SimulatorInfo
 from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 Message = tuple[dict[str, Any], dict[str, Array]]
-"""Header, and arrays by name."""
+"""Header of a message, and its arrays by name."""
 
 _START = """
 import importlib.util, sys
@@ -63,11 +58,12 @@ spec = importlib.util.spec_from_file_location(
 )
 sys.modules["pronk"] = module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-from pronk.identify.simulators.remote import serve
-serve()
+from pronk.identify.simulators.remote import serve_simulator
+serve_simulator()
 """
 """What the child runs. Its own packages are used, so only pronk comes from here."""
-_CLOSING_S = 5.0  # time that a child has to end after its standard input was closed [s]
+_CLOSING_S = 5.0
+"""Time that a child has to end after its standard input was closed [s]."""
 
 
 def send(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -81,32 +77,45 @@ def send(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, Arra
 
 
 def receive(stream: IO[bytes]) -> Message:
-    """Read one message; EOFError where the stream ends before or in it."""
+    """Read one message.
 
-    def exactly(count: int) -> bytes:
-        data = stream.read(count)
-        if len(data) < count:
-            raise EOFError
-        return data
-
-    header = json.loads(exactly(struct.unpack("<I", exactly(4))[0]))
+    Raises:
+        EOFError: The stream ends before the message or in it.
+    """
+    size = struct.unpack("<I", _read_exactly(stream, 4))[0]
+    header = json.loads(_read_exactly(stream, size))
     arrays = {}
     for name, shape in header.pop("arrays"):
-        data = exactly(8 * math.prod(shape))
+        data = _read_exactly(stream, 8 * math.prod(shape))
         arrays[name] = np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)
     return header, arrays
+
+
+def _read_exactly(stream: IO[bytes], count: int) -> bytes:
+    """Read so many bytes; EOFError if there are fewer."""
+    data = stream.read(count)
+    if len(data) < count:
+        raise EOFError
+    return data
 
 
 class RemoteSimulator(Closing):
     """A `Simulator` that runs in another Python."""
 
     def __init__(self, choice: str, robot: RobotSpec, python: Path) -> None:
-        """Start the program `python` and make the simulator there; PronkError if that fails.
+        """Start another Python and make the simulator there.
 
-        The choice is `FILE.py:NAME` or an entry point in `pronk.simulators`, of this installation
-        or of the other one.
+        Args:
+            choice: `FILE.py:NAME` or an entry point in `pronk.simulators`, of this installation or
+                of the other one.
+            robot: The robot.
+            python: Path of the Python interpreter.
+
+        Raises:
+            PronkError: The interpreter cannot be started, or the simulator cannot be made.
         """
-        self._choice, self._python = choice, python
+        self._choice = choice
+        self._python = python
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         try:
             self._child = subprocess.Popen(
@@ -120,22 +129,25 @@ class RemoteSimulator(Closing):
                 f"--simulator-python {python} cannot be started ({error.strerror}); expected the "
                 "path of a Python, as in /path/to/venv/bin/python."
             ) from None
-        known = entry_points(group=ENTRY_POINTS)
-        entry = known[choice].value if choice in known.names else ""
-        start = {"choice": choice, "entry": entry, **_as_json(robot)}
+        installed = entry_points(group=ENTRY_POINTS)
+        entry = ""
+        if choice in installed.names:
+            entry = installed[choice].value
         try:
-            made, _ = self._ask(start, {})
+            answer, _ = self._ask({"choice": choice, "entry": entry, **_as_json(robot)}, {})
         except PronkError:
             self.close()
             raise
-        self.info = SimulatorInfo(**made["info"])
-        self.joints, self.parameters = tuple(made["joints"]), frozenset(made["parameters"])
+        self.info = SimulatorInfo(**answer["info"])
+        self.joints = tuple(answer["joints"])
+        self.parameters = frozenset(answer["parameters"])
 
     def rollout(
         self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
     ) -> Array:
         """See `Simulator.rollout`; PronkError says what went wrong in the other Python."""
-        return self._ask({"locked": list(locked)}, {"command": command, **values})[1]["position"]
+        _, arrays = self._ask({"locked": list(locked)}, {"command": command, **values})
+        return arrays["position"]
 
     def close(self) -> None:
         """End the other Python."""
@@ -154,92 +166,136 @@ class RemoteSimulator(Closing):
         where = f"simulator {self._choice} in {self._python}"
         try:
             send(self._child.stdin, header, arrays)  # type: ignore[arg-type]
-            answer = receive(self._child.stdout)  # type: ignore[arg-type]
+            answer_header, answer_arrays = receive(self._child.stdout)  # type: ignore[arg-type]
         except (OSError, EOFError):
             status = self._child.wait()
-            self._messages.seek(0)
-            lines = self._messages.read().decode(errors="replace").split("\n")
-            last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+            reason = f"status {status}"
+            last_line = self._last_line()
+            if last_line:
+                reason = f"{reason}: {last_line}"
             raise PronkError(
-                f"{where} ended with status {status}{last and f': {last}'}; it needs Python 3.11 "
-                "or later, NumPy and the engine."
+                f"{where} ended with {reason}; it needs Python 3.11 or later, NumPy and the engine."
             ) from None
-        if error := answer[0].get("error"):
-            raise PronkError(f"{where}: {error}")
-        return answer
+        if "error" in answer_header:
+            raise PronkError(f"{where}: {answer_header['error']}")
+        return answer_header, answer_arrays
+
+    def _last_line(self) -> str:
+        """Return the last line that the other Python has printed."""
+        self._messages.seek(0)
+        last_line = ""
+        for line in self._messages.read().decode(errors="replace").split("\n"):
+            if line.strip():
+                last_line = line.strip()
+        return last_line
 
 
 def _as_json(robot: RobotSpec) -> dict[str, Any]:
-    """A robot and its chains as JSON has them."""
+    """Return a robot and its chains as JSON has them."""
     chains = {}
     for name in robot.joint_names:
         # What has no links is refused where it is used.
         with suppress(RobotError):
-            links = vars(links_of(robot, name))
-            chains[name] = {field: np.asarray(one).tolist() for field, one in links.items()}
-    fields = asdict(replace(robot, build_spec=_no_model))
-    del fields["build_spec"]
-    return {"robot": fields, "links": chains}
+            links = links_of(robot, name)
+            chains[name] = {
+                "joints": links.joints,
+                "parent": [int(parent) for parent in links.parent],
+                "offset": links.offset.tolist(),
+                "axis": links.axis.tolist(),
+                "mass": links.mass.tolist(),
+                "centre": links.centre.tolist(),
+                "inertia": links.inertia.tolist(),
+                "gravity": links.gravity.tolist(),
+            }
+    robot_fields = asdict(replace(robot, build_spec=_no_model))
+    del robot_fields["build_spec"]
+    return {"robot": robot_fields, "links": chains}
 
 
 def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot:
-    """The opposite of `_as_json`."""
+    """Make a robot of what `_as_json` returns."""
+    joints = []
+    for joint_fields in robot["joints"]:
+        drive = Drive(**joint_fields["drive"])
+        joints.append(Joint(**_with_tuples({**joint_fields, "drive": drive})))
+    links = {}
+    for name, chain in chains.items():
+        links[name] = Links(
+            joints=tuple(chain["joints"]),
+            parent=tuple(chain["parent"]),
+            offset=np.array(chain["offset"]),
+            axis=np.array(chain["axis"]),
+            mass=np.array(chain["mass"]),
+            centre=np.array(chain["centre"]),
+            inertia=np.array(chain["inertia"]),
+            gravity=np.array(chain["gravity"]),
+        )
+    robot_fields = {**robot, "joints": joints, "law": DriveLaw(**robot["law"])}
+    return SentRobot(**_with_tuples(robot_fields), build_spec=_no_model, links=links)
 
-    def tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
-        return {n: tuple(v) if isinstance(v, list) else v for n, v in fields.items()}
 
-    def links(fields: Mapping[str, Any]) -> Links:
-        arrays: dict[str, Any] = {n: np.array(v) for n, v in fields.items()}
-        return Links(**arrays | {n: tuple(fields[n]) for n in ("joints", "parent")})
-
-    joints = [Joint(**tuples({**one, "drive": Drive(**one["drive"])})) for one in robot["joints"]]
-    made = {**robot, "joints": joints, "law": DriveLaw(**robot["law"])}
-    known = {name: links(fields) for name, fields in chains.items()}
-    return SentRobot(**tuples(made), build_spec=_no_model, links=known)
+def _with_tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields with tuples in place of the lists that JSON makes of them."""
+    converted = {}
+    for name, value in fields.items():
+        converted[name] = tuple(value) if isinstance(value, list) else value
+    return converted
 
 
 def _no_model() -> Any:
+    """Refuse to build the model of a robot that was sent without it."""
     raise RobotError(
         "a robot's MuJoCo model is not sent to another Python; use its chains "
-        "(pronk.identify.simulators.engines.links.links_of)."
+        "(pronk.identify.simulators.links.links_of)."
     )
 
 
-def serve() -> None:
+def serve_simulator() -> None:
     """Be the child: make the simulator of the first message, then answer the others."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # What engines print must not reach the pipe.
+    # What engines print must not reach the pipe.
+    os.dup2(2, 1)
     messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
-
-    def read() -> None:
-        try:
-            while True:
-                messages.put(receive(sys.stdin.buffer))
-        finally:
-            os._exit(0)
-
-    threading.Thread(target=read, daemon=True).start()
+    threading.Thread(target=_read_messages, args=(messages,), daemon=True).start()
     simulator: Simulator | None = None
     while True:
         header, arrays = messages.get()
+        answer: dict[str, Any] = {}
+        answer_arrays: dict[str, Array] = {}
         try:
             if simulator is None:
-                choice, entry = header["choice"], header["entry"]
-                point = EntryPoint(choice, entry, ENTRY_POINTS)
-                own = load_entry_point(point) if entry else factory(choice)
-                simulator = own(_from_json(header["robot"], header["links"]))
+                simulator = _made_simulator(header)
                 answer = {
                     "info": asdict(simulator.info),
                     "joints": list(simulator.joints),
                     "parameters": sorted(simulator.parameters),
                 }
-                arrays = {}
             else:
                 command = arrays.pop("command")
                 position = simulator.rollout(command, arrays, locked=header["locked"])
-                answer, arrays = {}, {"position": position}
+                answer_arrays = {"position": position}
         except PronkError as error:
-            answer, arrays = {"error": str(error)}, {}
+            answer = {"error": str(error)}
         except Exception as error:  # Code of others may fail in any way.
-            answer, arrays = {"error": f"{type(error).__name__}: {error}."}, {}
-        send(answers, answer, arrays)
+            answer = {"error": f"{type(error).__name__}: {error}."}
+        send(answers, answer, answer_arrays)
+
+
+def _read_messages(messages: queue.SimpleQueue[Message]) -> None:
+    """Put all messages of the parent into a queue; end the process where they end."""
+    try:
+        while True:
+            messages.put(receive(sys.stdin.buffer))
+    finally:
+        os._exit(0)
+
+
+def _made_simulator(header: Mapping[str, Any]) -> Simulator:
+    """Make the simulator of the first message."""
+    choice = header["choice"]
+    if header["entry"]:
+        make = load_entry_point(EntryPoint(choice, header["entry"], ENTRY_POINTS))
+    else:
+        make = simulator_factory(choice)
+    simulator: Simulator = make(_from_json(header["robot"], header["links"]))
+    return simulator

@@ -328,7 +328,7 @@ def gains_errors(
         for joint, sources in logs_by_joint(logs, robot).items()
     ]
     requests = [SimRequest(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
-    with MujocoSimulator(robot, threads=settings.threads, device=settings.device) as simulator:
+    with MujocoSimulator(robot, threads=settings.threads) as simulator:
         simulated = iter(responses(simulator, requests))
     squares = {
         name: [np.mean(goal.error_db(next(simulated)) ** 2) for goal in goals] for name in gains
