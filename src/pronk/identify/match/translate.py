@@ -119,7 +119,9 @@ def translate(
     return translated_gains, translations
 
 
-def translated(first: LinearJoint, other: LinearJoint, gains: Pair, delay_s: float = 0.0) -> JointTranslation:
+def translated(
+    first: LinearJoint, other: LinearJoint, gains: Pair, delay_s: float = 0.0
+) -> JointTranslation:
     """Find the gains with which one linear joint responds like another.
 
     Args:
