@@ -38,7 +38,8 @@ ROOT = Path(__file__).resolve().parents[1]
 CELL = {"stiffness": (27.0 - 13.0) / 49.0, "damping": (0.7 - 0.1) / 49.0}
 """Distance of two nodes of the paper's grid [N m/rad], [N m s/rad]."""
 PARAMETERS = ("stiffness", "damping", "frictionloss", "delay")
-JUMP_FIGURES = ("height", "distance")
+JUMP_FIGURES = ("height_m", "distance_m")
+"""Columns of `trials.csv`."""
 PRONK = "pronk"
 NOMINAL = "nominal with delay"
 COMMAND_LINE = "import sys; from pronk.cli.main import main; sys.exit(main())"
@@ -99,10 +100,11 @@ def measure_match(checkout: Path, folder: Path) -> dict[str, Any]:
 
 def joint_numbers(joint: dict[str, Any]) -> dict[str, Any]:
     """Numbers of one joint in `gains.yaml`, of the first schema or of a later one."""
-    numbers = {"error_db": joint["error_db"]}
+    quality = joint.get("quality", joint)
+    numbers = {"error_db": quality["error_db"]}
     for name in ("stiffness", "damping"):
         entry = joint[name]
-        if isinstance(entry, dict):
+        if isinstance(entry, dict):  # From schema 2 on.
             numbers[name] = entry["value"]
             numbers[f"{name}_total95"] = entry["total95"]
         else:
@@ -176,7 +178,7 @@ def measure_trial(checkout: Path, folder: Path) -> dict[str, Any]:
     jumps = []
     for row in rows:
         figures = {name: f"{float(row[name]):.3f}" if row[name] else "" for name in JUMP_FIGURES}
-        jumps.append([row["case"], row["succeeded"], *figures.values()])
+        jumps.append([row["command"], row["success"], *figures.values()])
     return {"jumps": jumps, "seconds": seconds}
 
 
