@@ -386,7 +386,7 @@ def _one(kind: _Kind, path: Path, right: Any) -> tuple[str, str]:
         return "fault", f"{place.filename}:{place.lineno}: {type(error).__name__} {error}"
     if right is None:
         return "read", ""
-    said = isinstance(found, JointLog) and (not found.complete or found.notes != right.notes)
+    said = isinstance(found, JointLog) and (not found.origin.complete or found.notes != right.notes)
     if said or _same(found, right):
         return "read", ""
     return "fault", "other numbers without a word"

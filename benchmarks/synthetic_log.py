@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from pronk.arrays import Array
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.segment import Segment
 from pronk.identify.simulators.command_trace import CommandTrace
 from pronk.identify.simulators.mujoco import MujocoSimulator
@@ -162,6 +162,5 @@ def synthetic_log(
         stiffness=np.array([known.stiffness]),
         damping=np.array([known.damping]),
         pose=np.array([centre]),
-        virtual=True,
-        source=f"synthetic log of {joint}",
+        origin=LogOrigin(source=f"synthetic log of {joint}", virtual=True),
     )

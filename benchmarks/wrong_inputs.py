@@ -122,7 +122,13 @@ def recorded(robot: RobotSpec, seed: int, number: int, friction: str, cache: Pat
 
 def bare(log: JointLog) -> JointLog:
     """Time, command, position and the drive's gains alone."""
-    return replace(log, metadata={}, frequency=None, velocity=None, torque=None)
+    return replace(
+        log,
+        origin=replace(log.origin, metadata={}),
+        frequency=None,
+        velocity=None,
+        torque=None,
+    )
 
 
 def _columns(case: Case, **changes: Callable[[Array], Array]) -> Case:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import chirp, cont2discrete, lfilter
 
 from pronk.arrays import Array, ComplexArray
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.segment import Segment
 
 KNEE = {"stiffness": 21.9, "damping": 0.54, "inertia": 0.0068}
@@ -160,5 +160,5 @@ def make_log(
         position=stacked[2][:, None],
         frequency=stacked[3] if np.isfinite(stacked[3]).any() else None,
         segments=tuple(segments),
-        source="made for a test",
+        origin=LogOrigin(source="made for a test"),
     )

@@ -86,7 +86,7 @@ def check_reader(
         _require(bool(np.isfinite(values).all()), f"read: {name} is finite")
     _require(bool((np.diff(log.time) > 0.0).all()), "read: timestamps increase")
     _require(log.source == str(path), "read: source is the path")
-    _require(len(log.sha256) == 64, "read: sha256 of the file")
+    _require(len(log.origin.sha256) == 64, "read: sha256 of the file")
     again = chosen.read(path, robot=robot, **options)
     _require(np.array_equal(again.position, log.position), "read: repeatable")
     with TemporaryDirectory() as folder:

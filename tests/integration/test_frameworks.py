@@ -28,7 +28,7 @@ def recorded(name: str) -> JointLog:
     """A knee that a framework simulates, two amplitudes, two repeats, 0.1 mrad of noise."""
     robot = profile(name).robot(ROBOT)
     log = chirp_log(robot, "FR_knee", GAINS, repeats=2, noise_rad=1e-4, seed=3)
-    return replace(log, source="a.csv")
+    return replace(log, origin=replace(log.origin, source="a.csv"))
 
 
 @pytest.mark.parametrize("name", CHOSEN)

@@ -24,13 +24,15 @@ from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.readers import read_log
 
 LOG = example()
-TIMELESS = ("robot", "joints", "segments", "units", "virtual", "metadata", "complete")
+NAMES = ("robot", "joints", "segments", "units")
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 
 
 def assert_same(a: JointLog, b: JointLog) -> None:
-    for name in (*ARRAYS, *TIMELESS):
+    for name in (*ARRAYS, *NAMES):
         np.testing.assert_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    for name in ("virtual", "metadata", "complete"):
+        assert getattr(a.origin, name) == getattr(b.origin, name)
 
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
@@ -107,7 +109,7 @@ def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Path, share
         # Only what lies before the second sample may be lost altogether.
         assert share < 0.25
         return
-    assert not short.complete
+    assert not short.origin.complete
     count = len(short.time)
     np.testing.assert_array_equal(short.time, log.time[:count])
     np.testing.assert_array_equal(short.position, log.position[:count])
@@ -151,7 +153,7 @@ def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
         assert process.stdout.readline() == "ready\n"
         process.kill()
     log = read_mcap(tmp_path / "a.mcap")
-    assert not log.complete
+    assert not log.origin.complete
     assert len(log.time) == 768  # Whole chunks of 256 samples.
     assert log.segments[0].kind == "chirp"
     assert log.segments[0].stop == pytest.approx(768 / 500.0)
@@ -163,7 +165,7 @@ def test_the_reason_of_an_early_end_is_kept(tmp_path: Path) -> None:
         writer.sample(float(k), [0.0], [0.0])
     writer.end(complete=False, reason="the belt broke")
     log = read_mcap(tmp_path / "a.mcap")
-    assert not log.complete
+    assert not log.origin.complete
     assert "the belt broke" in log.notes[0]
 
 

@@ -33,7 +33,9 @@ KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": 
 
 def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: Any) -> JointLog:
     log = chirp_log(ROBOT, joint, known, repeats=3, noise_rad=0.001, seed=seed, **more)
-    return replace(log, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
+    return replace(
+        log, origin=replace(log.origin, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
+    )
 
 
 @pytest.fixture(scope="module")

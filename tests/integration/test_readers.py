@@ -44,7 +44,7 @@ recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the shared recordings 
 def test_so101_recordings_run_at_49_85_hz() -> None:
     logs = read_logs([SO101])
     assert [Path(log.source).name for log in logs] == list(RECORDINGS)
-    assert len({log.sha256 for log in logs}) == 5
+    assert len({log.origin.sha256 for log in logs}) == 5
     for log in logs:
         assert log.robot == "so101"
         assert log.joints == load_robot("so101").joint_names

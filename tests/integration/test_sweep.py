@@ -69,7 +69,7 @@ def test_one_whole_log_for_each_joint(recorded: Recorded) -> None:
     assert [path.name for path in paths] == ["FR_hip_roll.mcap", "FR_knee.mcap"]
     for path, joint in zip(paths, plan.joints, strict=True):
         log = read_mcap(path)
-        assert (log.complete, log.notes, log.virtual) == (True, (), True)
+        assert (log.origin.complete, log.notes, log.virtual) == (True, (), True)
         assert log.robot == "mini_cheetah"
         assert log.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
         assert [s.joints for s in log.segments] == [(joint,)] * 2
@@ -175,7 +175,7 @@ def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
     # At once where it happened, and again on the way out (closing damps too).
     assert watched.calls[-4:] == ["damp", "damp", "close", "damp"]
     log = read_mcap(tmp_path / "FR_knee.mcap")
-    assert not log.complete
+    assert not log.origin.complete
     assert why in log.notes[0]
     assert log.time[-1] > 4.9 or drive
 

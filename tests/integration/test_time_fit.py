@@ -29,7 +29,7 @@ def sweep(amplitudes: tuple[float, ...], repeats: int) -> JointLog:
     excitations = [Excitation(offsets=one, repeats=repeats) for one in signals]
     noise = 2e-4 * np.random.default_rng(5).standard_normal((repeats * len(signals), 40000))
     log = synthetic_log(ROBOT, "FR_knee", excitations, **KNOWN, noise=list(noise), delay_s=LATE_S)
-    return replace(log, source="a.csv")
+    return replace(log, origin=replace(log.origin, source="a.csv"))
 
 
 @pytest.fixture(scope="module")

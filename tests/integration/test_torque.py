@@ -12,7 +12,7 @@ import pytest
 from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, rig, run
 from command_line import accepted, refused
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
 from pronk.identify.match import gains, match_logs
@@ -90,7 +90,7 @@ def test_torque_that_cannot_be_used_is_named(logs: list[JointLog]) -> None:
     short = Segment(kind="unknown", joints=JOINTS, start=0.0, stop=7.0, amplitude=np.nan)
     for bad, reason in (
         (replace(log, torque=size), "magnitudes"),
-        (replace(log, metadata={"torque": "computed"}), "not measured"),
+        (replace(log, origin=LogOrigin(metadata={"torque": "computed"})), "not measured"),
         (replace(log, time=5.0 * log.time), "Hz, fewer than 160"),
         (replace(log, position=0.0 * log.position), "no joint moves"),
         (log.cut(short), "less than 7.5"),

@@ -82,7 +82,7 @@ def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
     recorded = record_wire(plan, tmp_path, link, limits=PATIENT, real_time=False)
     log = read_mcap(recorded["logs"][0])
     assert recorded["virtual"]
-    assert log.complete
+    assert log.origin.complete
     assert log.joints == plan.robot.joint_names
     assert np.ptp(log.cut(log.segments[0]).position[:, log.column("gripper")]) > 0.02
 
@@ -94,11 +94,11 @@ def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     assert recorded["servo"]["n"] > 100
     assert [path.name for path in recorded["logs"]] == ["FR_knee.mcap"]
     log = read_mcap(recorded["logs"][0])
-    assert log.complete
+    assert log.origin.complete
     assert log.virtual
-    assert log.metadata["link"] == f"lcm://?port={port}"
+    assert log.origin.metadata["link"] == f"lcm://?port={port}"
     # The spi messages carry no torque.
-    assert log.metadata["torque"] == "absent"
+    assert log.origin.metadata["torque"] == "absent"
     assert log.torque is None
     part = log.cut(log.segments[0])
     knee = log.column("FR_knee")
@@ -140,7 +140,7 @@ def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
     when, damps = wire.received()
     assert damps[-1]
     log = read_mcap(tmp_path / "FR_hip_roll.mcap")
-    assert not log.complete
+    assert not log.origin.complete
     assert reason in log.notes[0]
     assert "FR_hip_roll.mcap" in capsys.readouterr().err
     if reason == "was killed":  # the log holds the last of what it did
@@ -178,7 +178,7 @@ def test_a_killed_program_leaves_the_joints_damped_and_a_log(port: int, tmp_path
     assert when[~damps][-1] < first < gone + DAMPED_S
     assert when[-1] - first >= 0.95  # as far as this thread can tell
     log = read_mcap(path)
-    assert not log.complete
+    assert not log.origin.complete
     # The logger outlives the program that started it.
     assert killed - log.time[-1] < 0.7
     (segment,) = log.segments

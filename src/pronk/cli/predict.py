@@ -47,7 +47,11 @@ def predict(
 
     known, matched = load_robot(robot), gains_file.load_gains(gains)
     given, logs = options.drive_gains(drive_gains), reading.read(paths, known)
-    fitted = [log.source for log in logs if log.sha256 and log.sha256 in matched.logs.values()]
+    fitted = [
+        log.source
+        for log in logs
+        if log.origin.sha256 and log.origin.sha256 in matched.logs.values()
+    ]
     folder = out if out is not None else gains.parent
     rows: list[dict[str, Any]] = []
     written: list[Path] = []

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.checks import TIME_UNITS, check_unit, correlation_note
-from pronk.identify.logs.joint_log import JointLog, check_increasing
+from pronk.identify.logs.joint_log import JointLog, LogOrigin, check_increasing
 from pronk.names import check_names
 from pronk.robots.robot import RobotSpec
 
@@ -131,10 +131,8 @@ def import_columns(
         units=tuple(
             "unknown" if joint in other and joint not in scale else "rad" for joint in joints
         ),
-        source=where,
-        sha256=columns.sha256,
         notes=tuple(notes),
-        metadata=columns.metadata,
+        origin=LogOrigin(source=where, sha256=columns.sha256, metadata=columns.metadata),
     )
 
 

@@ -19,6 +19,22 @@ _SAME_INSTANT_S = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
+class LogOrigin:
+    """Where a log comes from."""
+
+    source: str = ""
+    """File or link it came from."""
+    sha256: str = ""
+    """Hash of the file it was read from; empty for a log that was never a file."""
+    virtual: bool = False
+    """True if the machine was pronk's virtual robot."""
+    complete: bool = True
+    """False if the recording was cut short or its file is truncated."""
+    metadata: dict[str, str] = field(default_factory=dict)
+    """Named remarks of the recorder, for instance the link and the rate of the servo."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class JointLog:
     """A recording of commands and positions, one column per joint.
 
@@ -51,17 +67,10 @@ class JointLog:
     """Position the signals are centred on [rad], shape (joints,)."""
     units: tuple[str, ...] | None = None
     """Unit of each column's position: `rad`, or `unknown` where the source gives another scale."""
-    virtual: bool = False
-    """True if the machine was pronk's virtual robot."""
-    source: str = ""
-    """File or link it came from."""
-    sha256: str = ""
-    """Hash of the file it was read from; empty for a log that was never a file."""
-    complete: bool = True
-    """False if the recording was cut short or its file is truncated."""
     notes: tuple[str, ...] = ()
     """Remarks of the reader: jitter, drift, gaps, dropped rows."""
-    metadata: dict[str, str] = field(default_factory=dict)
+    origin: LogOrigin = LogOrigin()
+    """File or link that the log came from, and whether it is whole."""
 
     def __post_init__(self) -> None:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
@@ -111,6 +120,16 @@ class JointLog:
                 f"{self.source or 'log'}: {name} of {self.joints[column]} is not finite at sample "
                 f"{row} (t = {self.time[row]:.3f} s); drop or repair such rows before reading."
             )
+
+    @property
+    def source(self) -> str:
+        """File or link that the log came from; empty if it has none."""
+        return self.origin.source
+
+    @property
+    def virtual(self) -> bool:
+        """True if the machine was pronk's virtual robot."""
+        return self.origin.virtual
 
     def column(self, joint: str) -> int:
         """Index of a joint's column; a LogError lists the joints if it is not one of them."""

@@ -22,7 +22,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import (
     BOOLEAN,
     INTEGER,
@@ -257,12 +257,14 @@ def _joint_log(path: Path, data: Mapping[str, Sequence[bytes]], damage: str) -> 
         damping=_array(header.damping),
         pose=_array(header.pose),
         units=header.units,
-        virtual=header.virtual,
-        source=str(path),
-        sha256=sha256(path),
-        complete=complete,
         notes=tuple(notes),
-        metadata=header.metadata,
+        origin=LogOrigin(
+            source=str(path),
+            sha256=sha256(path),
+            virtual=header.virtual,
+            complete=complete,
+            metadata=header.metadata,
+        ),
     )
 
 

@@ -14,7 +14,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.identify.logs.columns import in_force, ordered
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record, read_records
 from pronk.identify.logs.mcap_log import read_sweep
 from pronk.robots.robot import RobotSpec
@@ -104,11 +104,13 @@ def read_mcap(
         position=values(states, measured_topic, "position")[known],
         velocity=measured("velocity"),
         torque=measured("effort"),
-        source=str(path),
-        sha256=sha256(path),
-        complete=not damage,
         notes=tuple(note for note, applies in notes.items() if applies),
-        metadata={"measured_topic": measured_topic, "command_topic": command_topic},
+        origin=LogOrigin(
+            source=str(path),
+            sha256=sha256(path),
+            complete=not damage,
+            metadata={"measured_topic": measured_topic, "command_topic": command_topic},
+        ),
     )
 
 

@@ -226,7 +226,7 @@ def findings(
     hidden = _those(
         {
             "drive gains": not settled,
-            "other leg": not all("excited" in log.metadata for log in logs),
+            "other leg": not all("excited" in log.origin.metadata for log in logs),
             "command delay": not settled and any(log.frequency is None for log in logs),
             "position filter": not settled and not _counted(logs, joint),
         }
@@ -244,7 +244,7 @@ def _those(causes: Mapping[str, bool]) -> list[str]:
 def _names(own: _Recorded) -> Iterator[Finding]:
     """Whether the named joint is the one that was excited."""
     log, joint = own.log, own.joint.name
-    stated = log.metadata.get("excited", joint)
+    stated = log.origin.metadata.get("excited", joint)
     if stated != joint:
         yield Finding(f"the log says that {stated} was excited, its columns {joint}", "other leg")
     for part in own.parts:
@@ -345,7 +345,7 @@ def _clock(own: _Recorded, policy_rate_hz: float) -> Iterator[Finding]:
             f"Hz, fewer than {RATE_MIN:g}",
             "sample rate",
         )
-    stated = log.metadata.get("command_rate_hz")
+    stated = log.origin.metadata.get("command_rate_hz")
     tick = 1.0 / (float(stated) if stated else policy_rate_hz)
     if log.rate_hz * tick < 3.0:
         return

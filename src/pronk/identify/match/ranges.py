@@ -88,7 +88,7 @@ def matched_gains(
     """
     hashes = {}
     for log in logs:
-        hashes[Path(log.source or "log").name] = log.sha256
+        hashes[Path(log.source or "log").name] = log.origin.sha256
     return MatchedGains(
         robot=robot.name,
         simulator=simulator,

@@ -375,7 +375,7 @@ def joint_fits(
 def _unusable(log: JointLog, chain: Sequence[str]) -> str:
     """Why the torques of a log cannot be used."""
     assert log.torque is not None
-    if log.metadata.get("torque") == "computed":
+    if log.origin.metadata.get("torque") == "computed":
         return "it is computed from the command, not measured"
     if log.rate_hz < 4.0 * MOTION_HZ:
         return f"{log.rate_hz:.0f} Hz, fewer than {4.0 * MOTION_HZ:.0f}"
