@@ -51,11 +51,11 @@ from pronk.identify.match import result as match_file
 from pronk.identify.match.export import export_text
 from pronk.identify.match.predict import load_prediction
 from pronk.identify.response import response as response_file
-from pronk.jump.trial import bodies, results
+from pronk.jump.trial import results
+from pronk.jump.trial.conditions import TOLERANCE_FILE, read_conditions
 from pronk.jump.trial.crossing import CROSSING
 from pronk.jump.trial.training_sim.results import SCHEMA as EVALUATION
 from pronk.jump.trial.training_sim.results import load_speed_errors
-from pronk.jump.trial.variation import VARIATION
 from pronk.jump.trial.walk import WALK
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params
@@ -168,6 +168,7 @@ def _write(folder: Path) -> None:
     shutil.copy(folder / "robot" / f"{robot.name}.xml", folder / "model.xml")
     (folder / "model.urdf").write_text(_URDF)
     shutil.copy(SHIPPED, folder / "sim_params.yaml")
+    shutil.copy(TOLERANCE_FILE, folder / "conditions.yaml")
     shutil.copy(ROOT / "policies" / "matched" / "policy.onnx", folder / "policy.onnx")
     (folder / "contract.json").write_text(to_json(load_policy(folder / "policy.onnx").contract))
     walks = {"walks": [{"name": "a", "figures": {"speed_error": {"mean": 0.1}}}]}
@@ -203,9 +204,9 @@ def _kinds() -> dict[str, _Kind]:
             look(found)
         deploy_run.delay(found, None)
 
-    def trial(kind: results.Kind) -> _Kind:
+    def trial(kind: results.RunKind) -> _Kind:
         path = f"tree/trial/{kind.summary}"
-        return _Kind((path,), lambda path: results.load(path.parent, kind))
+        return _Kind((path,), lambda path: results.load_results(path.parent, kind))
 
     def command(*words: str) -> Callable[[Path], None]:
         return lambda path: _command([word.format(path, path.parent) for word in words])
@@ -231,8 +232,7 @@ def _kinds() -> dict[str, _Kind]:
         "trial": trial(results.JUMPS),
         "walk": trial(WALK),
         "crossing": trial(CROSSING),
-        "variation": trial(VARIATION),
-        "bodies": _Kind((f"tree/trial/{bodies.FILE}",), lambda path: bodies.load(path.parent)),
+        "conditions": _Kind(("conditions.yaml",), read_conditions),
         "evaluation": _Kind(("evaluation.json",), load_speed_errors),
         "policy": _Kind(("policy.onnx",), load_policy),
         "contract": _Kind(("contract.json",), lambda p: from_json(p.read_text("l1"), source=p)),

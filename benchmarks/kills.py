@@ -175,7 +175,7 @@ def _torn(folder: Path) -> list[str]:
             elif path.suffix == ".yaml":
                 read_yaml(path)
             elif path.name == results.SUMMARY:
-                results.load(path.parent)
+                results.load_results(path.parent)
             elif path.suffix in (".html", ".svg"):
                 end = path.read_text().rstrip().rpartition("<")[2]
                 if end != f"/{path.suffix[1:]}>":

@@ -24,7 +24,14 @@ from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.jump.trial.protocol import PAPER_COMMANDS
-from pronk.jump.trial.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
+from pronk.jump.trial.trial import (
+    TrialJob,
+    TrialPlan,
+    TrialSetup,
+    load_subjects,
+    plan_jobs,
+    run_job,
+)
 from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
 
@@ -37,7 +44,7 @@ CASE = PAPER_COMMANDS[1]
 class Recording:
     """Every physics step of one run, and what was set before each block of them."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: TrialJob) -> None:
         """Run one job and record it."""
         self.blocks: list[tuple[int, Array, Array]] = []
         """Steps, targets of the drives, parameters of the motors."""
@@ -102,9 +109,9 @@ def run(
         raise PronkError(f"{repeats} repeats; expected 1 or more.")
     robot = load_robot(ROBOT)
     (subject,) = load_subjects([policy], robot)
-    plan = Plan(cases=(CASE,), jumps=1, seed=seed)
+    plan = TrialPlan(cases=(CASE,), jumps=1, seed=seed)
     params = sim_params or load_sim_params()
-    [job] = plan_jobs([subject], plan, Setup(robot=robot, sim_params=params, out=Path()))
+    [job] = plan_jobs([subject], plan, TrialSetup(robot=robot, sim_params=params, out=Path()))
     recording = Recording(job)  # the warm-up as well
 
     def trial_block() -> float:

@@ -16,13 +16,19 @@ from pronk.identify.match.predict import JointPrediction, Prediction, save_predi
 from pronk.identify.match.result import JointFit, MatchResult
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.simulator import SimulatorInfo
-from pronk.jump.trial import bodies, results, variation, walk
-from pronk.jump.trial.bodies import Bodies, Body
+from pronk.jump.trial import walk
 from pronk.jump.trial.crossing import CROSSING, CrossingFigures
-from pronk.jump.trial.jumps import JumpFigures, JumpRules, measure
+from pronk.jump.trial.jumps import JumpRules, measure_jump
 from pronk.jump.trial.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.jump.trial.results import Kind, Results, Row, Subject
-from pronk.jump.trial.variation import NOMINAL, VARIATION
+from pronk.jump.trial.results import (
+    JUMPS,
+    RunKind,
+    TrialResults,
+    TrialRun,
+    TriedPolicy,
+    load_results,
+    save_results,
+)
 from pronk.jump.trial.walk import WALK, WalkFigures, walk_script
 from pronk.jump.virtual import capture as captures
 from pronk.jump.virtual.capture import Capture
@@ -165,33 +171,58 @@ def lift_off(flight: int) -> float:
     return G * flight / 2000.0
 
 
-def subject(name: str, **contract: Any) -> Subject:
-    gains = {"naive": ((17.0,) * 3, (0.4,) * 3)}
-    stiffness, damping = gains.get(name, ((20.0, 17.5, 21.5), (0.45, 0.40, 0.55)))
-    fields = {"gains": name, "joint_names": ROBOT.joint_names}
-    fields |= {"stiffness": stiffness * 4, "damping": damping * 4}
-    return Subject(name=name, path=f"{name}.onnx", sha256=name[0] * 64, contract=fields | contract)
+def subject(name: str, **contract: Any) -> TriedPolicy:
+    """Return a policy; `contract` replaces entries of its contract."""
+    stiffness = (20.0, 17.5, 21.5)
+    damping = (0.45, 0.40, 0.55)
+    if name == "naive":
+        stiffness = (17.0, 17.0, 17.0)
+        damping = (0.4, 0.4, 0.4)
+    fields = {
+        "gains": name,
+        "joint_names": ROBOT.joint_names,
+        "stiffness": stiffness * 4,
+        "damping": damping * 4,
+        **contract,
+    }
+    return TriedPolicy(name=name, path=f"{name}.onnx", sha256=name[0] * 64, contract=fields)
 
 
 def jump_capture(flight: int, scale: float) -> Capture:
-    made = seen_jump(up=lift_off(flight))
-    rate = np.zeros_like(made.angular_velocity)
-    rate[:, 0] = scale * RATE * np.sin(OMEGA * (made.time - SCRIPT.start))
-    velocity = np.tile(np.linspace(-10.0, 10.0, len(made.time))[:, None], (1, 12))
-    return replace(made, angular_velocity=rate, joint_velocity=velocity, torque=0.5 * velocity)
+    """Return a jump of so many milliseconds, whose roll rate is scaled."""
+    capture = seen_jump(up=lift_off(flight))
+    rate = np.zeros_like(capture.angular_velocity)
+    rate[:, 0] = scale * RATE * np.sin(OMEGA * (capture.time - SCRIPT.start))
+    velocity = np.tile(np.linspace(-10.0, 10.0, len(capture.time))[:, None], (1, 12))
+    return replace(capture, angular_velocity=rate, joint_velocity=velocity, torque=0.5 * velocity)
 
 
-def of_kind(kind: Kind, names: tuple[str, ...], **rest: Any) -> Results:
-    fields: dict[str, Any] = {"script": SCRIPT, "joint_names": ROBOT.joint_names, "seed": 3}
-    fields |= {"sim_params": {"file": "shipped with pronk", "sha256": "ab" * 32}}
-    fields |= {"robot": ROBOT.name, "versions": {"pronk": "0.1.0"}, "kind": kind}
-    return Results(**(fields | {"subjects": tuple(map(subject, names))} | rest))
+def of_kind(kind: RunKind, names: tuple[str, ...], **changes: Any) -> TrialResults:
+    """Return results of some policies; `changes` replace or add fields."""
+    fields: dict[str, Any] = {
+        "kind": kind,
+        "robot": ROBOT.name,
+        "subjects": tuple(subject(name) for name in names),
+        "joint_names": ROBOT.joint_names,
+        "seed": 3,
+        "sim_params": {"file": "shipped with pronk", "sha256": "ab" * 32},
+        "script": SCRIPT,
+        "versions": {"pronk": "0.1.0"},
+    }
+    return TrialResults(**(fields | changes))
 
 
-def row(policy: str, case: Case, number: int, figures: Any, **rest: Any) -> Row:
-    script = replace(SCRIPT, command=case.command)
-    one = {"policy": policy, "case": case.name, "number": number, "seed": number}
-    return Row(**one, figures=figures, script=script, **rest)
+def row(policy: str, case: Case, number: int, figures: Any, capture: str = "") -> TrialRun:
+    """Return one run."""
+    return TrialRun(
+        policy=policy,
+        case=case.name,
+        number=number,
+        seed=number,
+        script=replace(SCRIPT, command=case.command),
+        figures=figures,
+        capture=capture,
+    )
 
 
 def write_trial(
@@ -200,85 +231,81 @@ def write_trial(
     cases: tuple[Case, ...] = CASES,
     *,
     keep: bool = False,
-) -> Results:
+) -> TrialResults:
     """Write a trial measured by `pronk.jump.trial.jumps` on closed-form jumps, and read it."""
-    rules, rows = JumpRules(standing_height=STANDING), []
+    rules = JumpRules(standing_height=STANDING)
+    rows = []
     for name in policies:
+        scale = 2.0 if name == "naive" else 1.0
         for case in cases:
             script = replace(SCRIPT, command=case.command)
             for number, flight in enumerate(FLIGHTS[name]):
-                capture = jump_capture(flight, 2.0 if name == "naive" else 1.0)
-                path = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
+                capture = jump_capture(flight, scale)
+                path = ""
                 if keep:
+                    path = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
                     captures.save(folder / path, capture)
-                figures = measure(capture, script, ROBOT, began=0.0, rules=rules)
-                rows.append(row(name, case, number, figures, capture=path if keep else ""))
-    timing = {"seconds": 2.0, "simulated_s": 9.0, "processes": 1}
-    extra = {"cases": cases, "rows": tuple(rows), "rules": asdict(rules), "timing": timing}
-    results.save(folder, of_kind(results.JUMPS, policies, **extra))
-    return results.load(folder)
+                figures = measure_jump(capture, script, ROBOT, began=0.0, rules=rules)
+                rows.append(row(name, case, number, figures, path))
+    trial = of_kind(
+        JUMPS,
+        policies,
+        cases=cases,
+        rows=tuple(rows),
+        rules=asdict(rules),
+        timing={"seconds": 2.0, "simulated_s": 9.0, "processes": 1},
+    )
+    save_results(folder, trial)
+    return load_results(folder)
 
 
-def walks() -> Results:
+def walks() -> TrialResults:
     """Two walks a policy; the naive one falls once."""
     case = walk.WALKS[0]
-    fields: dict[str, Any] = {"non_foot_contact": False, "lasted": 20.0, "forward": 1.9}
-    rows = tuple(
-        row(name, case, i, WalkFigures(fell=name == "naive" and i == 0, **fields))
-        for name in ("matched", "naive")
-        for i in range(2)
+    rows = []
+    for name in ("matched", "naive"):
+        for number in range(2):
+            figures = WalkFigures(
+                fell=name == "naive" and number == 0,
+                non_foot_contact=False,
+                lasted=20.0,
+                forward=1.9,
+            )
+            rows.append(row(name, case, number, figures))
+    return of_kind(
+        WALK,
+        ("matched", "naive"),
+        cases=(case,),
+        rows=tuple(rows),
+        script=walk_script((0.0, 0.0, 0.0)),
     )
-    script = walk_script((0.0, 0.0, 0.0))
-    return of_kind(WALK, ("matched", "naive"), cases=(case,), rows=rows, script=script)
 
 
-def crossings() -> Results:
+def crossings() -> TrialResults:
     """Gaps of 0.2 m crossed 4 times of 5, of 0.4 m never."""
     case = PAPER_COMMANDS[1]
-    fields = {"obstacle": "gap", "lead": 0.4, "take_off": 0.1, "landing": 0.1, "reach": 0.3}
-    rows = tuple(
-        row("matched", case, i, CrossingFigures(size=size, why=why, speed=2.0, **fields))
-        for size in (0.2, 0.4)
-        for i in range(5)
-        for why in ["" if size < 0.3 and i else "a foot was in the gap"]
+    rows = []
+    for size in (0.2, 0.4):
+        for number in range(5):
+            crossed = size < 0.3 and number > 0
+            figures = CrossingFigures(
+                obstacle="gap",
+                why="" if crossed else "a foot was in the gap",
+                size=size,
+                lead=0.4,
+                take_off=0.1,
+                landing=0.1,
+                reach=0.3,
+                speed=2.0,
+            )
+            rows.append(row("matched", case, number, figures))
+    return of_kind(
+        CROSSING,
+        ("matched",),
+        cases=(case,),
+        rows=tuple(rows),
+        settings={"kinds": ["gap", "up"], "runs": 5, "enough": 4},
     )
-    settings = {"kinds": ["gap", "up"], "runs": 5, "enough": 4}
-    return of_kind(CROSSING, ("matched",), cases=(case,), rows=rows, settings=settings)
-
-
-def varied() -> Results:
-    """Heights of 0.4 m, and 0.3 m with 1 kg more mass, with which the naive policy falls."""
-    mass, rows = replace(variation.PARAMETERS[0], values=(1.0,)), []
-    for parameter, value, height in ((NOMINAL, 0.0, 0.4), (mass.name, 1.0, 0.3)):
-        for name in ("matched", "naive"):
-            for case in CASES[:2]:
-                for number in range(3):
-                    good = name == "matched" or parameter != mass.name
-                    known = dict.fromkeys(variation.VARIED_FIGURES, 0.5 + 0.1 * number)
-                    known |= {"height": height + 0.01 * (number - 1), "found": True}
-                    figures = JumpFigures(standing=True, upright=good, fell=not good, **known)
-                    rows.append(row(name, case, number, figures, parameter=parameter, value=value))
-    settings = {"parameters": [asdict(mass)], "nominal": {mass.name: 0.0}}
-    names = ("matched", "naive")
-    return of_kind(VARIATION, names, cases=CASES[:2], rows=tuple(rows), settings=settings)
-
-
-def write_bodies(folder: Path) -> Bodies:
-    """Write two randomized robots with trials of their own."""
-    gains, found = match(legs=1).gains, []
-    for i in (1, 2):
-        where = f"bodies/body_{i}"
-        gains_file.save_gains(folder / where / "gains.yaml", gains)
-        errors = {"training gains of matched": 0.1 * i, "training gains of naive": 0.6 * i}
-        errors[bodies.MATCHED] = 0.02 * i
-        trial = write_trial(folder / where / "trial", cases=CASES[:2])
-        one: dict[str, Any] = {"name": f"body {i}", "folder": where, "seed": i, "trial": trial}
-        found.append(Body(sha256="ef" * 32, errors=errors, **one))
-    head = of_kind(results.JUMPS, ("matched", "naive"), cases=(), rows=())
-    fields = {n: getattr(head, n) for n in ("robot", "subjects", "sim_params", "seed", "versions")}
-    made = Bodies(**fields, bodies=tuple(found))
-    bodies.save(folder, made)
-    return made
 
 
 def write_tree(root: Path) -> Path:
@@ -286,10 +313,9 @@ def write_tree(root: Path) -> Path:
     result = match(legs=1)
     write_match(root, replace(result, joints={"FR_knee": result.joints["FR_knee"]}))
     write_trial(root / "trial", keep=True)
-    for each in (walks(), crossings(), varied()):
-        results.save(root / "trial", each)
-    write_bodies(root / "trial")
-    frames = [Image.new("RGB", (64, 40), (i * 60, 90, 120)) for i in range(4)]
+    save_results(root / "trial", walks())
+    save_results(root / "trial", crossings())
+    frames = [Image.new("RGB", (64, 40), (index * 60, 90, 120)) for index in range(4)]
     film = root / "trial" / "videos" / "matched_forward_2"
     film.parent.mkdir()
     frames[0].save(film.with_suffix(".gif"), save_all=True, append_images=frames[1:], duration=40)

@@ -55,6 +55,34 @@ def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
                     child.kill()
 
 
+def results_in_order(
+    work: Callable[[Job], Result], jobs: Sequence[Job], *, processes: int = 1
+) -> Iterator[Result]:
+    """Do every job, in this process or in several, and yield each result as soon as it is there.
+
+    Args:
+        work: A function of a module, so that other processes can import it.
+        jobs: Its arguments, one for each call; the results come in this order.
+        processes: How many jobs are done at a time.
+
+    Raises:
+        PronkError: The number of processes is impossible, or one of them was killed.
+    """
+    if processes < 1:
+        raise PronkError(f"{processes} processes; expected 1 or more.")
+    if processes == 1 or len(jobs) <= 1:
+        yield from map(work, jobs)
+        return
+    with pool(min(processes, len(jobs))) as executor:
+        try:
+            yield from executor.map(work, jobs)
+        except BrokenProcessPool:
+            raise PronkError(
+                "one of the processes was killed, most likely for want of memory; "
+                "give fewer files, joints or processes at a time."
+            ) from None
+
+
 def in_processes(
     work: Callable[[Job], Result],
     jobs: Sequence[Job],
@@ -73,27 +101,9 @@ def in_processes(
     Raises:
         PronkError: The number of processes is impossible, or one of them was killed.
     """
-    if processes < 1:
-        raise PronkError(f"{processes} processes; expected 1 or more.")
-    if processes == 1 or len(jobs) <= 1:
-        return _collected(map(work, jobs), len(jobs), progress)
-    with pool(min(processes, len(jobs))) as executor:
-        try:
-            return _collected(executor.map(work, jobs), len(jobs), progress)
-        except BrokenProcessPool:
-            raise PronkError(
-                "one of the processes was killed, most likely for want of memory; "
-                "give fewer files, joints or processes at a time."
-            ) from None
-
-
-def _collected(
-    results: Iterator[Result], count: int, progress: Callable[[float], None] | None
-) -> list[Result]:
-    """Return results as a list and report the share that has arrived."""
-    collected = []
-    for result in results:
-        collected.append(result)
+    results = []
+    for result in results_in_order(work, jobs, processes=processes):
+        results.append(result)
         if progress is not None:
-            progress(len(collected) / count)
-    return collected
+            progress(len(results) / len(jobs))
+    return results

@@ -76,7 +76,7 @@ COMMANDS = [
     ("export no.yaml --to gazebo --out x.py", "mjlab"),
     ("train run --out x", "walk"),
     ("trial no.onnx --out x", "no.onnx"),
-    ("trial no.onnx --out x --own other.onnx", "--bodies"),
+    ("trial --out x", "no policy"),
     ("trial no.onnx --out x --commands fast", "fast"),
     ("deploy no.onnx", "no.onnx"),
     ("simulate cheetah", "mini_cheetah"),

@@ -40,7 +40,14 @@ from pronk.errors import LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.simulators.load import joint_rigs
 from pronk.jump.trial.protocol import Case
-from pronk.jump.trial.trial import Job, Plan, Setup, load_subjects, plan_jobs, run_job
+from pronk.jump.trial.trial import (
+    TrialJob,
+    TrialPlan,
+    TrialSetup,
+    load_subjects,
+    plan_jobs,
+    run_job,
+)
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
@@ -217,17 +224,19 @@ def test_limits_hold_for_the_warm_loop_on_an_idle_computer() -> None:
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> Job:
+def job(tmp_path: Path) -> TrialJob:
     pytest.importorskip("onnxruntime")
     script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
     subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], HOPPER)
-    plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
-    setup = Setup(robot=HOPPER, sim_params=load_sim_params(), out=tmp_path)
+    plan = TrialPlan(
+        cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0
+    )
+    setup = TrialSetup(robot=HOPPER, sim_params=load_sim_params(), out=tmp_path)
     [job] = plan_jobs(subjects, plan, setup)
     return replace(job, row=replace(job.row, capture=""))
 
 
-def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
+def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: TrialJob) -> None:
     before = repr(run_job(job))
     recording = trial.Recording(job)
     assert repr(run_job(job)) == before

@@ -15,10 +15,11 @@ import pytest
 from command_line import accepted
 from pronk.errors import ArtefactError
 from pronk.identify.match import gains as gains_file
-from pronk.jump.trial import results, tables
+from pronk.jump.trial import tables
 from pronk.jump.trial.jumps import JumpFigures
+from pronk.jump.trial.results import load_results, save_results
 from pronk.report import build, match_page
-from report_cases import CASES, match, walks, write_match, write_tree, write_trial
+from report_cases import CASES, match, write_match, write_tree, write_trial
 
 NASTY = "<img src=x onerror=alert(1)>"
 
@@ -69,14 +70,13 @@ def html(tree: Path) -> str:
 
 def test_the_page_of_everything(tree: Path, html: str) -> None:
     page = Checker(html)
-    assert {"trial", "walk", "crossing", "variation", "bodies", "match"} < set(page.ids)
-    assert "trial1" not in page.ids  # trials of the randomized robots belong to their part
+    assert {"trial", "match"} < set(page.ids)
     sections = "jumps-beside-table-iii-of-the-paper acceptance-criteria scatter films landings"
     sections += " all-figures roll-and-pitch-rates trunk-height-over-time"
     assert {f"trial-{section}" for section in sections.split()} < set(page.ids)
     assert "match-matched-gains" in page.ids
     assert len(html.encode()) < 8e6
-    assert len(page.pictures) > 12
+    assert len(page.pictures) > 7
     assert all(len(alt) > 20 for _, alt in page.pictures)
     kinds = {address.split(";")[0] for address, _ in page.pictures}
     assert kinds == {"data:image/svg+xml", "data:image/png", "data:image/gif"}
@@ -84,13 +84,16 @@ def test_the_page_of_everything(tree: Path, html: str) -> None:
 
 def test_tables_hashes_seeds_and_versions_are_on_the_page(tree: Path, html: str) -> None:
     text = Checker(html).text.replace("_", " ")
-    trial = results.load(tree / "trial")
-    for one in tables.sheets(trial):
-        for cell in {cell for row in one.rows for cell in row}:
-            shown = cell.replace("+-", "±").replace(">=", "≥").replace("<=", "≤")
-            shown = "–" if shown == "-" else shown.split(": ")[-1].replace("_", " ")
-            assert shown in text, (one.title, cell)
-    for word in (*(s.sha256 for s in trial.subjects), "ab" * 32, "seed 3", "pronk 0.1.0"):
+    trial = load_results(tree / "trial")
+    for table in tables.trial_tables(trial):
+        for row in table.text_rows():
+            for cell in row:
+                printed = cell.replace("+-", "±").replace(">=", "≥").replace("<=", "≤")
+                printed = "–" if printed == "-" else printed.split(": ")[-1].replace("_", " ")
+                assert printed in text, (table.title, cell)
+    for subject in trial.subjects:
+        assert subject.sha256 in html
+    for word in ("ab" * 32, "seed 3", "pronk 0.1.0"):
         assert word in html
 
 
@@ -103,12 +106,10 @@ def test_numbers_of_the_virtual_robot_are_called_so(html: str, tmp_path: Path) -
 def test_outcomes_of_the_parts(html: str) -> None:
     text = Checker(html).text
     for words in (
-        *("matched, virtual robot", "paper, matched", "hardware", "a simulated machine"),
-        "matched, virtual robot: 0 of 2 walks ended in a fall.",
-        "matched, virtual robot: gaps crossed 0.20 m (forward 2).",
-        "a foot was in the gap (5)",
-        "12 of 12 jumps on varied robots landed",
-        "2 other virtual robots: 24 of 24 jumps landed",
+        "matched, virtual robot",
+        "paper, matched",
+        "hardware",
+        "a simulated machine",
     ):
         assert words in text
 
@@ -159,7 +160,7 @@ def test_text_of_files_is_escaped(tmp_path: Path) -> None:
 def test_one_policy_that_never_jumps_without_captures_or_match(tmp_path: Path) -> None:
     trial = write_trial(tmp_path, ("matched",), CASES[:2])
     rows = tuple(replace(row, figures=JumpFigures(standing=True, fell=True)) for row in trial.rows)
-    results.save(tmp_path, replace(trial, rows=rows))
+    save_results(tmp_path, replace(trial, rows=rows))
     page = report(tmp_path)
     assert "6 jumps commanded, 0 jumped" in page.text
     assert "trial-jumps-beside-table-iii-of-the-paper" in page.ids
@@ -178,8 +179,6 @@ def test_missing_captures_are_counted(tmp_path: Path) -> None:
     ("name", "bytes_kept"),
     [
         ("trial/summary.json", 300),
-        *((f"trial/{name}.json", 200) for name in ("walk", "crossing", "variation", "bodies")),
-        ("trial/bodies/body_2/trial/summary.json", 2000),
         ("trial/captures/naive_forward_1_001.npz", 500),
         ("trial/videos/matched_forward_2.gif", 5),
         ("match.npz", 100),
@@ -221,10 +220,9 @@ def test_gains_under_another_name_are_found(tmp_path: Path) -> None:
 
 def test_the_command_writes_the_page_and_its_figures(tmp_path: Path) -> None:
     write_trial(tmp_path / "trial", ("matched",), CASES[:1])
-    results.save(tmp_path / "trial", walks())
     figures = tmp_path / "figures.json"
     accepted("report", tmp_path, "--json", figures)
     assert (tmp_path / "report.html").exists()
     parts = json.loads(figures.read_text())["parts"]
-    assert [one["source"] for one in parts] == ["trial/summary.json", "trial/walk.json"]
+    assert [one["source"] for one in parts] == ["trial/summary.json"]
     assert parts[0]["checks"][0]["what"] == "forward 1: height"

@@ -25,7 +25,7 @@ from pronk.jump.train.provenance import SCHEMA, RunFolder
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import contract_for, export_policy
 from pronk.jump.train.tasks import load_task
-from pronk.jump.trial.jumps import JumpRules, measure
+from pronk.jump.trial.jumps import JumpRules, measure_jump
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.training_sim import adapter
 from pronk.jump.trial.training_sim.evaluation import NEVER, Plan
@@ -126,7 +126,7 @@ def test_figures_are_those_of_the_recorded_motion(observed: SimpleNamespace) -> 
     on = next(sample for sample, _, jump in observed.reads if jump[4])
     standing = observed.captures[4]
     script = replace(SHORT.script, command=(0.0, 1.0, 0.0), run_s=on * DT - SHORT.script.start)
-    figures = measure(standing, script, ROBOT, began=0.0, rules=SHORT.rules)
+    figures = measure_jump(standing, script, ROBOT, began=0.0, rules=SHORT.rules)
     (jump,) = found.jumps
     assert jump["height"].mean == pytest.approx(figures.height)
     assert jump["non_foot_contact"].mean == standing.other_contact[on : on + 41].any() / 2

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -16,10 +17,17 @@ from command_line import invoke
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
-from pronk.jump.trial import results
-from pronk.jump.trial.jumps import measure
+from pronk.jump.trial.jumps import measure_jump
 from pronk.jump.trial.protocol import PAPER_COMMANDS, Case, parse_case
-from pronk.jump.trial.trial import Plan, Setup, draw, load_subjects, prepare, run_trial
+from pronk.jump.trial.results import TrialResults, load_results
+from pronk.jump.trial.trial import (
+    TrialPlan,
+    TrialSetup,
+    draw_run,
+    load_subjects,
+    prepare_folder,
+    run_trial,
+)
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params
 from pronk.policy.script import STILL, Script
@@ -30,7 +38,7 @@ pytest.importorskip("onnxruntime")
 # A hop on the spot takes half a second; then it is watched for two.
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=2.4)
 CASE = Case(name="forward 1", command=(1.0, 0.0, 0.0))
-PLAN = Plan(cases=(CASE,), jumps=1, script=SCRIPT, spread_s=0.1)
+PLAN = TrialPlan(cases=(CASE,), jumps=1, script=SCRIPT, spread_s=0.1)
 SIM_PARAMS = load_sim_params()
 
 
@@ -47,9 +55,9 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_hopper(path, 0.5, gains="naive", gains_sha256="", **gains)
 
 
-def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
+def go(policies: list[Path], out: Path, **changes: Any) -> TrialResults:
     progress = changes.pop("progress", None)
-    setup = Setup(robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes)
+    setup = TrialSetup(robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes)
     return run_trial(policies, PLAN, setup, progress=progress)
 
 
@@ -57,19 +65,27 @@ def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
 
 
 def test_every_jump_has_a_start_of_its_own() -> None:
-    plan = Plan(spread_s=0.5)
-    drawn = [draw(plan, case, n, ROBOT) for case in plan.cases for n in range(30)]
-    assert len({(start.yaw, start.joint_offset) for _, start, _ in drawn}) == len(drawn)
-    assert len({seed for _, _, seed in drawn}) == len(drawn)
+    plan = TrialPlan(spread_s=0.5)
+    runs = []
+    for case in plan.cases:
+        for number in range(30):
+            runs.append(draw_run(plan, case, number, ROBOT))
+    assert len({(run.start.yaw, run.start.joint_offset) for run in runs}) == len(runs)
+    assert len({run.seed for run in runs}) == len(runs)
     # Whole policy steps, from none to all 25 of them.
-    later = {round((script.run_s - 2.5) * 50, 6) for script, _, _ in drawn}
+    later = {round((run.script.run_s - 2.5) * 50, 6) for run in runs}
     assert {0, 25} <= later <= set(range(26))
-    offsets = [each for _, start, _ in drawn for each in start.joint_offset or ()]
-    assert (min(offsets), max(offsets)) == pytest.approx((-0.05, 0.05), abs=0.01)
-    # Draws depend on seed, command and number alone.
-    few = Plan(cases=PAPER_COMMANDS[3:4], jumps=2)
-    assert draw(few, PAPER_COMMANDS[3], 1, ROBOT) == drawn[3 * 30 + 1]
-    assert draw(replace(few, seed=1), PAPER_COMMANDS[3], 1, ROBOT) != drawn[3 * 30 + 1]
+    offsets = np.array([run.start.joint_offset for run in runs])
+    assert offsets.min() == pytest.approx(-0.05, abs=0.01)
+    assert offsets.max() == pytest.approx(0.05, abs=0.01)
+
+
+def test_draws_depend_on_seed_command_and_number_alone() -> None:
+    case = PAPER_COMMANDS[3]
+    run = draw_run(TrialPlan(jumps=30), case, 1, ROBOT)
+    few = TrialPlan(cases=(case,), jumps=2)
+    assert draw_run(few, case, 1, ROBOT) == run
+    assert draw_run(replace(few, seed=1), case, 1, ROBOT) != run
 
 
 @pytest.mark.parametrize(
@@ -83,7 +99,7 @@ def test_every_jump_has_a_start_of_its_own() -> None:
 )
 def test_impossible_plans_are_refused(changes: Any, what: str) -> None:
     with pytest.raises(PronkError, match=what):
-        Plan(**changes)
+        TrialPlan(**changes)
 
 
 # --- Running ------------------------------------------------------------------------------------
@@ -110,7 +126,7 @@ def test_the_number_of_processes_changes_no_digit(
 
 
 def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
-    made = results.load(tried)
+    made = load_results(tried)
     first, _ = made.subjects
     assert (first.name, first.sha256, first.contract["gains_sha256"]) == (
         "matched",
@@ -121,7 +137,8 @@ def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
     assert made.mass == pytest.approx(12.0)
     assert made.versions["mujoco"]
     # The hop is real, and half as hard is a lower one.
-    strong, half = (made.cell(n, CASE.name).figures["height"].mean for n in ("matched", "naive"))
+    strong = made.cell("matched", CASE.name).figures["height"].mean
+    half = made.cell("naive", CASE.name).figures["height"].mean
     assert half < strong
     assert 0.2 < strong < 0.5
     # What is kept measures the same again.
@@ -129,14 +146,14 @@ def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
     assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
     for row in made.rows:
         seen = capture.load(tried / row.capture)
-        again = measure(seen, row.script, ROBOT, began=row.began)
+        again = measure_jump(seen, row.script, ROBOT, began=row.began)
         assert repr(again) == repr(row.figures)
     jump = made.rows[0].figures
     assert jump.found
     # The trunk rises about as far as its lift-off velocity takes it.
-    assert jump.rise == pytest.approx(jump.ballistic, abs=0.03)
-    assert jump.lift_off_velocity > 1.0
-    assert jump.peak_torque[2] > 15.0
+    assert jump.flight.rise == pytest.approx(jump.flight.ballistic, abs=0.03)
+    assert jump.flight.lift_off_velocity > 1.0
+    assert jump.loads.peak_torque[2] > 15.0
 
 
 def test_processes_keep_the_order_and_pass_errors_on() -> None:
@@ -194,7 +211,7 @@ def test_a_policy_that_does_not_fit_is_refused(
 
 
 def test_only_a_trial_is_overwritten(tmp_path: Path) -> None:
-    prepare(tmp_path / "new")
+    prepare_folder(tmp_path / "new")
     assert (tmp_path / "new").is_dir()
     (tmp_path / "file").write_text("mine")
     for out, overwrite, what in (
@@ -204,13 +221,13 @@ def test_only_a_trial_is_overwritten(tmp_path: Path) -> None:
         (tmp_path / "file" / "below", False, "cannot be written to"),
     ):
         with pytest.raises(PronkError, match=what):
-            prepare(out, overwrite=overwrite)
+            prepare_folder(out, overwrite=overwrite)
     assert (tmp_path / "file").read_text() == "mine"
     old = tmp_path / "old"
     for name in ("trials.csv", "summary.json", "captures/a.npz", "videos/a.gif", "notes.txt"):
         (old / name).parent.mkdir(exist_ok=True, parents=True)
         (old / name).write_text("old")
-    prepare(old, overwrite=True)
+    prepare_folder(old, overwrite=True)
     assert sorted(path.name for path in old.rglob("*")) == ["captures", "notes.txt", "videos"]
 
 
@@ -227,7 +244,7 @@ def test_the_command_writes_tables_page_and_figures(hopper: Path, tmp_path: Path
     body = json.loads(figures.read_text())
     assert body["virtual"] is True
     assert [cell["case"] for cell in body["cells"]] == ["side -1"]
-    assert results.load(out).sim_params["file"] == "shipped with pronk"
+    assert load_results(out).sim_params["file"] == "shipped with pronk"
     assert "Table III" in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / "videos").exists()
 

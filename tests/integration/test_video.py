@@ -19,11 +19,10 @@ from PIL import Image
 from hopper import DEFAULT, ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.jump.trial.films import render, video
+from pronk.jump.trial.films import record, render
 from pronk.jump.trial.films.film import FPS, Film, JumpEvents, plan
 from pronk.jump.trial.protocol import Case
-from pronk.jump.trial.trial import Plan as TrialPlan
-from pronk.jump.trial.trial import Setup, run_trial
+from pronk.jump.trial.trial import TrialPlan, TrialSetup, run_trial
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Script
@@ -118,7 +117,7 @@ def test_every_frame_says_that_the_robot_is_virtual() -> None:
 @pytest.fixture(scope="module")
 def backend() -> str:
     try:
-        return video.find_gl()
+        return record.find_gl()
     except PronkError as error:
         pytest.skip(str(error))
 
@@ -127,7 +126,7 @@ def test_files_are_rendered(backend: str, tmp_path: Path) -> None:
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     film = planned(span=(0.95, 1.15))
     warnings: list[str] = []
-    files = video.record(film, tmp_path / "jump", warn=warnings.append)
+    files = record.record_film(film, tmp_path / "jump", warn=warnings.append)
     assert [path.name for path in files] == ["jump.mp4", "jump.gif", "jump.png"]
     assert sorted(tmp_path.iterdir()) == sorted(files)
     assert not warnings
@@ -152,7 +151,7 @@ def test_files_are_rendered(backend: str, tmp_path: Path) -> None:
 def test_a_failed_rendering_is_one_warning(backend: str, tmp_path: Path) -> None:
     warnings: list[str] = []
     film = planned(span=(0.9, 1.0), robot="so101")
-    assert video.record(film, tmp_path / "x", warn=warnings.append) == ()
+    assert record.record_film(film, tmp_path / "x", warn=warnings.append) == ()
     (warning,) = warnings
     assert "MUJOCO_GL" in warning
     assert "\n" not in warning
@@ -164,17 +163,17 @@ def test_without_gl_or_encoder_one_warning_names_what_to_install(
 ) -> None:
     """Rendering processes die at once, as they do where the GL library is broken."""
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert "pronk[video]" in str(video.no_encoder())
+    assert "pronk[video]" in str(record.no_encoder())
     dying = tmp_path / "python"
     dying.write_text("#!/bin/sh\nexit 139\n", encoding="utf-8")
     dying.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(dying))
-    video.find_gl.cache_clear()
+    record.find_gl.cache_clear()
     warnings: list[str] = []
     nothing: Any = None
     how: Any = {"robot": ROBOT, "cases": (), "warn": warnings.append}
-    assert video.record_all(nothing, tmp_path, tmp_path / "out", **how) == ()
-    video.find_gl.cache_clear()
+    assert record.record_trial(nothing, tmp_path, tmp_path / "out", **how) == ()
+    record.find_gl.cache_clear()
     (warning,) = warnings
     assert "libosmesa6" in warning
     assert "\n" not in warning
@@ -197,10 +196,10 @@ def test_only_rendering_needs_the_requested_opengl(
     opengl.keep_out()
     assert os.environ["MUJOCO_GL"] == "disable"
     assert opengl.requested() == "nonsense"
-    found = video.environment("osmesa")
+    found = record.environment("osmesa")
     assert found["MUJOCO_GL"] == "osmesa"
     assert "PYOPENGL_PLATFORM" not in found
-    assert "MUJOCO_GL" not in video.environment("")
+    assert "MUJOCO_GL" not in record.environment("")
 
 
 def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> None:
@@ -210,21 +209,21 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
     found = run_trial(
         [write_hopper(tmp_path / "policy.onnx"), write_hopper(tmp_path / "still.onnx", 0.0)],
         TrialPlan(cases=cases, jumps=1, script=script, spread_s=0.0),
-        Setup(robot=ROBOT, sim_params=load_sim_params(), out=tmp_path / "trial"),
+        TrialSetup(robot=ROBOT, sim_params=load_sim_params(), out=tmp_path / "trial"),
     )
     # A robot given by its path is filmed with its own model.
     own = replace(ROBOT, source="mine/robot.yaml")
     how: Any = {"folder": tmp_path / "trial", "robot": own}
-    (stem, hop), (_, still) = video.films_of(found, cases=("forward 1",), **how).items()
+    (stem, hop), (_, still) = record.films_of(found, cases=("forward 1",), **how).items()
     assert hop.robot == own.source
     assert stem == f"{found.subjects[0].name}_forward_1".replace(" ", "_")
     assert hop.title == "forward 1 m/s"
 
     assert hop.events is not None
-    figures = found.rows[0].figures
+    figures = found.rows[0].figures.flight
     assert hop.events.liftoff - hop.events.on == pytest.approx(figures.delay, abs=0.002)
     flight = hop.events.touchdown - hop.events.liftoff
     assert flight == pytest.approx(figures.duration, abs=0.002)
-    assert (hop.rate == 1.0 / video.SLOW).any()
+    assert (hop.rate == 1.0 / record.SLOW).any()
     assert still.events is None
-    assert not video.films_of(found, cases=("back 2",), **how)
+    assert not record.films_of(found, cases=("back 2",), **how)

@@ -12,12 +12,12 @@ import pytest
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
-from pronk.jump.trial import crossing, results
+from pronk.jump.trial import crossing
 from pronk.jump.trial.crossing import Attempt, CrossingFigures, CrossingPlan, Ladder, Obstacle
 from pronk.jump.trial.jumps import JumpRules
 from pronk.jump.trial.protocol import Case
-from pronk.jump.trial.results import Results, Row
-from pronk.jump.trial.trial import Setup
+from pronk.jump.trial.results import TrialResults, TrialRun, load_results
+from pronk.jump.trial.trial import TrialSetup
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.ground import Ground
 from pronk.jump.virtual.sim_params import load_sim_params
@@ -78,7 +78,7 @@ def test_a_course_leads_straight_on() -> None:
 def test_the_operator_looks_at_the_trunk() -> None:
     script = Script(command=FORWARD, stand_s=1.0, jump_s=0.4, keep_s=0.2)
     place = 5.0  # where it stands does not matter before it runs
-    operator = crossing.Operator(script, trigger_at=1.5, where=lambda: place)
+    operator = crossing.CourseOperator(script, trigger_at=1.5, trunk_place=lambda: place)
     assert operator(0.5) == (STILL, False)
     place = 1.49
     assert operator(1.0) == (FORWARD, False)
@@ -127,7 +127,7 @@ LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
 )
 def test_why_a_gap_was_not_crossed(seen: Capture, size: float, why: str, ends: bool) -> None:
     assert settled(seen, obstacle(size=size)).why == why
-    assert crossing.lost(seen, obstacle(size=size)) is ends
+    assert crossing.is_lost(seen, obstacle(size=size)) is ends
 
 
 def test_what_happens_elsewhere_does_not_count() -> None:
@@ -138,12 +138,12 @@ def test_what_happens_elsewhere_does_not_count() -> None:
     # Steps have no bottom to fall into.
     assert settled(LOW, obstacle("down")).success
     assert settled(LOW, obstacle("up")).landing == pytest.approx(LANDED - EDGE, abs=2e-3)
-    assert not crossing.lost(LOW, obstacle("up"))
+    assert not crossing.is_lost(LOW, obstacle("up"))
 
 
 # --- The search ---------------------------------------------------------------------------------
 
-SETUP = Setup(robot=ROBOT, sim_params=load_sim_params(), out=Path())
+SETUP = TrialSetup(robot=ROBOT, sim_params=load_sim_params(), out=Path())
 CASE = Case(name="forward 2", command=FORWARD)
 LADDER = Ladder((0.1, 0.2, 0.3, 0.4), (0.0, 0.1))
 PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2)
@@ -151,11 +151,11 @@ PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, pr
 
 def climb(
     crossed: dict[tuple[float, float], int], plan: CrossingPlan = PLAN, reach: float = 0.5
-) -> tuple[list[Row], list[Attempt]]:
+) -> tuple[list[TrialRun], list[Attempt]]:
     """Climb with a robot that crosses so many runs of each size and lead beyond its reach."""
     done: list[Attempt] = []
 
-    def run(tasks: list[Attempt]) -> list[Row]:
+    def run(tasks: list[Attempt]) -> list[TrialRun]:
         done.extend(tasks)
         return [replace(task.row, figures=figures(task)) for task in tasks]
 
@@ -167,10 +167,10 @@ def climb(
         why = "" if good else crossing.NON_FOOT_CONTACT
         return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
 
-    return crossing.search([subject("matched")], plan, SETUP, run=run), done
+    return crossing.climb_ladders([subject("matched")], plan, SETUP, run=run), done
 
 
-def result(rows: list[Row]) -> Results:
+def result(rows: list[TrialRun]) -> TrialResults:
     settings = {"kinds": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough}
     rest: Any = {"rows": tuple(rows), "settings": settings}
     return of_kind(crossing.CROSSING, ("matched",), cases=(CASE,), **rest)
@@ -224,5 +224,5 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     found = crossing.add_crossings([policy], plan, replace(SETUP, out=tmp_path))
     assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
     assert crossing.climbs(found)[0].largest == 0.0
-    assert repr(results.load(tmp_path, crossing.CROSSING).rows) == repr(found.rows)
+    assert repr(load_results(tmp_path, crossing.CROSSING).rows) == repr(found.rows)
     assert np.isnan(found.rows[0].figures.reach)

@@ -26,14 +26,13 @@ from pronk.identify.match import gains
 from pronk.identify.response.response import FrequencyResponse
 from pronk.jump.trial import results
 from pronk.jump.trial.training_sim.results import SCHEMA, load_speed_errors
-from pronk.jump.trial.variation import VARIATION
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.names import check_names, file_name
 from pronk.policy.contract import from_json
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model, yaml_of_model
 from pronk.robots.load import read_robot
-from report_cases import joint_fit, varied
+from report_cases import CASES, joint_fit, write_trial
 
 GAINS = """
 schema: pronk/gains/1
@@ -315,11 +314,14 @@ def test_arrays_of_an_npz_log_that_are_no_text_or_no_arrays_or_not_read(tmp_path
 
 
 def test_results_with_numbers_of_some_joints_are_refused(tmp_path: Path) -> None:
-    _, path = results.save(tmp_path, varied())
-    assert results.load(tmp_path, VARIATION).rows
-    path.write_text(path.read_text().replace('"peak_torque": []', '"peak_torque": [1.0]', 1))
+    trial = write_trial(tmp_path, ("matched",), CASES[:1])
+    path = tmp_path / results.SUMMARY
+    body = orjson.loads(path.read_bytes())
+    body["rows"][0]["figures"]["loads"]["peak_torque"] = [1.0]
+    path.write_bytes(orjson.dumps(body))
+    assert trial.rows
     with pytest.raises(ArtefactError):
-        results.load(tmp_path, VARIATION)
+        results.load_results(tmp_path)
 
 
 def test_a_folder_in_the_place_of_the_output_is_refused_in_one_sentence(tmp_path: Path) -> None:

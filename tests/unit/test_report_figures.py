@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from pronk.jump.trial.crossing import climbs
-from pronk.report import extra_pages, figures, style, trial_figures, trial_page
+from pronk.report import figures, style, trial_figures, trial_page
 from pronk.report.paper import published_jumps
 from report_cases import (
     CASES,
@@ -19,11 +18,8 @@ from report_cases import (
     NOMINAL_GAINS,
     OMEGA,
     RATE,
-    crossings,
     joint_prediction,
     match,
-    varied,
-    write_bodies,
     write_trial,
 )
 from seen_jump import SCRIPT
@@ -110,9 +106,11 @@ def test_prediction_shows_where_the_nominal_simulation_is_worst() -> None:
 
 def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
     trial = write_trial(tmp_path)
-    distance, paper = trial_page.values(trial, "distance"), published_jumps("distance")
+    distance = trial_page.jump_values(trial, "distance")
+    paper = published_jumps("distance")
     assert list(distance) == ["naive", "matched"]  # as in the paper
-    axes = trial_figures.cells([("distance [m]", distance, paper)]).axes[0]
+    panel = trial_figures.JumpPanel(label="distance [m]", values=distance, published=paper)
+    axes = trial_figures.draw_jumps([panel]).axes[0]
     points = {
         (round(float(y), 6), round(float(np.ptp(bar.get_segments()[0][:, 1])) / 2.0, 6))
         for line, _, bars in (one.lines for one in axes.containers)
@@ -128,52 +126,13 @@ def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
 
 
 def test_rates_are_of_the_acceleration_at_the_papers_speed(tmp_path) -> None:
-    captured, missing = trial_page.traces(write_trial(tmp_path, keep=True), tmp_path)
-    assert (missing, set(captured["roll"]["naive"])) == (0, {CASES[2].name})
-    runs = captured["roll"]["naive"][CASES[2].name]
+    traces = trial_page.load_traces(write_trial(tmp_path, keep=True), tmp_path)
+    assert traces.missing == 0
+    assert set(traces.roll_rate["naive"]) == {CASES[2].name}
+    runs = traces.roll_rate["naive"][CASES[2].name]
     time, rate = runs[0]
     assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
     assert np.allclose(rate, 2.0 * RATE * np.sin(OMEGA * time), atol=1e-6)
     # A sine over nearly whole periods.
     expected = 2.0 * RATE / math.sqrt(2.0)
     assert trial_page.rate_rms({CASES[2].name: runs}) == pytest.approx(expected, rel=0.02)
-
-
-def test_crossings_become_shares_with_wilsons_interval() -> None:
-    size, share, low, high = extra_pages.climb_line(climbs(crossings())[0])
-    assert size.tolist() == [0.2, 0.4]
-    assert share.tolist() == [0.8, 0.0]
-    # Wilson with 4 of 5, z = 1.96.
-    z2 = 1.959964**2
-    middle = (0.8 + z2 / 10.0) / (1.0 + z2 / 5.0)
-    half = math.sqrt(z2 * 0.8 * 0.2 / 5.0 + z2**2 / 100.0) / (1.0 + z2 / 5.0)
-    assert (low[0], high[0]) == pytest.approx((middle - half, middle + half))
-
-
-def test_variation_gives_means_over_commands_and_shares_of_landings() -> None:
-    of_mass = (varied(), "trunk_mass_offset", "naive")
-    value, height, low, high = extra_pages.varied_line(*of_mass, "height")
-    assert value.tolist() == [0.0, 1.0]
-    assert height == pytest.approx([0.4, 0.3])
-    assert high - low == pytest.approx([0.02, 0.02])
-    assert extra_pages.varied_line(*of_mass, "landed")[1].tolist() == [1.0, 0.0]
-    assert [panel.marks for panel in extra_pages.variation_panels(varied())] == [(0.0,)] * 3
-
-
-def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
-    found = write_bodies(tmp_path)
-    errors = extra_pages.errors_db(found)
-    distance = {
-        f"{policy}, {body.name}": own
-        for body in found.bodies
-        for policy, own in trial_page.values(body.trial, "distance").items()
-    }
-    expected = {"matched, body 1": 0.1, "naive, body 1": 0.6}
-    expected |= {"matched, body 2": 0.2, "naive, body 2": 1.2}
-    assert errors == pytest.approx(expected)
-    figure = trial_figures.scatter_over_error(errors, {"distance [m]": distance})
-    axes, texts = figure.axes[0], figure.legends[0].get_texts()
-    assert len(texts) == 3  # the robots of a policy share a look
-    lines = [line for line in axes.lines if line.get_marker() == "_"]
-    means = {line.get_xdata()[0]: line.get_ydata()[0] for line in lines}
-    assert means[1.2] == pytest.approx(np.std([0.38, 0.40, 0.42], ddof=1), rel=0.6)

@@ -23,7 +23,7 @@ from pronk.processes import pool
 if TYPE_CHECKING:
     from pronk.identify.match.predict import JointPrediction
     from pronk.identify.match.result import MatchResult
-    from pronk.jump.trial.results import Results
+    from pronk.jump.trial.results import TrialResults
     from pronk.robots.robot import RobotSpec
 
 ROBOT = "mini_cheetah"
@@ -73,9 +73,9 @@ def demo(
     seconds = time.perf_counter() - begun
     cells = show_match(result, replays)
     if trial is not None:
-        sheets = (tables.table_iii(trial, figure) for figure in ("height", "distance"))
-        for sheet in (*sheets, tables.landings(trial)):
-            console.show_sheet(sheet)
+        console.show(tables.paper_table(trial, "height"))
+        console.show(tables.paper_table(trial, "distance"))
+        console.show(tables.landings(trial))
     console.say(
         "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
         f"come with pronk. {seconds:.0f} s in all."
@@ -123,20 +123,20 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
 
 def jump_and_film(
     policies: Sequence[Path], out: Path, jumps: int, seed: int
-) -> tuple[Results | None, tuple[Path, ...]]:
+) -> tuple[TrialResults | None, tuple[Path, ...]]:
     """Run a short trial on the shipped virtual robot and film one jump of the first policy.
 
     An existing trial is replaced. Without policies the results are None and no film.
     """
-    from pronk.jump.trial.films.video import record_all
-    from pronk.jump.trial.trial import VIDEOS, Plan, run_trial, setup_of
+    from pronk.jump.trial.films.record import record_trial
+    from pronk.jump.trial.trial import VIDEOS, TrialPlan, run_trial, setup_of
 
     if not policies:
         return None, ()
     setup = setup_of(policies[0], out)
-    trial = run_trial(policies, Plan(jumps=jumps, seed=seed), setup, overwrite=True)
+    trial = run_trial(policies, TrialPlan(jumps=jumps, seed=seed), setup, overwrite=True)
     first = replace(trial, subjects=trial.subjects[:1])
-    films = record_all(
+    films = record_trial(
         first, out, out / VIDEOS, robot=setup.robot, cases=(FILMED,), slow=2.0, warn=console.warn
     )
     return trial, films

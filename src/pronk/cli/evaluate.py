@@ -11,6 +11,7 @@ import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.tables import Table
 
 
 def evaluate(
@@ -78,5 +79,8 @@ def evaluate(
         )
     save(out, found)
     for sheet in sheets(found):
-        console.show_sheet(sheet)
+        if isinstance(sheet, Table):
+            console.show(sheet)
+        else:
+            console.show_sheet(sheet)
     console.say(f"wrote {out}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,157 +13,234 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.jump.trial.tables import Sheet
-    from pronk.jump.trial.trial import Plan, Setup
+    from pronk.jump.trial.trial import TrialPlan, TrialSetup
+    from pronk.tables import Table
 
 RATES_JUMPS = 3
-"""At 2.25 m/s, beside the paper's commands: enough to draw its figure of roll and pitch rates."""
+"""Jumps at 2.25 m/s beside the paper's commands: enough for its figure of roll and pitch rates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions:
+    """The virtual robot that jumps."""
+
+    robot: str | None = None
+    """A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out."""
+    sim_params: Path | None = None
+    """Parameters of the virtual robot, instead of the shipped ones."""
+    processes: int | None = None
+    """Jumps at once; as many as there are cores if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JumpOptions:
+    """What is commanded."""
+
+    commands: tuple[str, ...] = ()
+    """Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may follow. Give it
+    repeatedly; "paper" is the paper's five. If left out, those, and a few jumps at 2.25 m/s for the
+    figure of roll and pitch rates."""
+    jumps: int = 20
+    """Jumps with each command."""
+    seed: int = 0
+    """Seed of all draws."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """What is done besides the jumps, or instead of them."""
+
+    walk: bool = False
+    """Also walk 20 s with each velocity, 20 times."""
+    crossing: bool = False
+    """Also cross gaps and steps of growing size."""
+    conditions: str | None = None
+    """Instead of all that, jump under other conditions of the virtual robot: a YAML file,
+    "tolerance" (weaker and stronger drives, delay, friction) or "bodies" (random robots). A run
+    that was interrupted goes on in its folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """What is kept and printed."""
+
+    out: Path
+    """Folder for tables, captures, videos and the page."""
+    video: bool = True
+    """MP4, GIF and strip of each command, where this machine can render."""
+    keep_captures: bool = False
+    """Keep the capture of every jump (4 MB each), not of the first of each command."""
+    overwrite: bool = False
+    """Replace the trial in that folder; with conditions, run finished ones again."""
+    definitions: bool = False
+    """Also print the equation of every figure."""
 
 
 def trial(
-    policy: tyro.conf.Positional[Path],
-    out: Path,
-    robot: str | None = None,
+    policies: tyro.conf.Positional[tuple[Path, ...]],
+    output: OutputOptions,
+    machine: MachineOptions,
+    jump: JumpOptions,
+    study: StudyOptions,
     also: tuple[Path, ...] = (),
-    commands: tuple[str, ...] = (),
-    jumps: int = 20,
-    sim_params: Path | None = None,
-    seed: int = 0,
-    processes: int | None = None,
-    walk: bool = False,
-    crossing: bool = False,
-    variation: bool = False,
-    bodies: bool = False,
-    own: tuple[Path, ...] = (),
-    video: bool = True,
-    keep_captures: bool = False,
-    overwrite: bool = False,
-    definitions: bool = False,
 ) -> console.Outcome:
     """Stand, run, jump, stop: 20 times with each command; the paper's table beside ours.
 
     Args:
-        policy: policy.onnx.
-        robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
-        out: Folder for tables, captures, videos and the page.
-        also: Another policy to compare with, as the naive one. Give it repeatedly.
-        commands: Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may
-            follow. Give it repeatedly; "paper" is the paper's five. If left out, those,
-            and a few jumps at 2.25 m/s for the figure of roll and pitch rates.
-        jumps: Jumps with each command.
-        sim_params: Parameters of the virtual robot, instead of the shipped ones.
-        seed: Of all draws.
-        processes: Jumps at once; as many as there are cores if left out.
-        walk: Also walk 20 s with each velocity, 20 times.
-        crossing: Also cross gaps and steps of growing size.
-        variation: Also vary mass, friction, delay and bus voltage, one by one.
-        bodies: Also try three randomized robots, each matched by its own sweep.
-        own: A policy trained with the gains of the first robot of --bodies; give it
-            again for the second and the third.
-        video: MP4, GIF and strip of each command, where this machine can render.
-        keep_captures: Keep the capture of every jump (4 MB each), not of the first of each
-            command.
-        overwrite: Replace the trial in that folder.
-        definitions: Also print the equation of every figure.
+        policies: policy.onnx, one or more; the others are compared with the first.
+        output: What is kept and printed.
+        machine: The virtual robot that jumps.
+        jump: What is commanded.
+        study: What is done besides the jumps, or instead of them.
+        also: Another policy to compare with, as one trained with nominal gains. Give it repeatedly.
     """
+    from pronk.jump.trial.protocol import parse_cases
+    from pronk.jump.trial.trial import TrialPlan, setup_of
+
+    paths = [*policies, *also]
+    if not paths:
+        raise PronkError("no policy; give one or more, as in `pronk trial policy.onnx --out DIR`.")
+    plan = TrialPlan(
+        cases=parse_cases(jump.commands or ["paper"]),
+        jumps=jump.jumps,
+        rates=0 if jump.commands or study.conditions else RATES_JUMPS,
+        seed=jump.seed,
+    )
+    setup = setup_of(
+        paths[0], output.out, machine.sim_params, machine.robot, processes=machine.processes
+    )
+    if study.conditions is not None:
+        if study.walk or study.crossing:
+            raise PronkError(
+                "--conditions jumps only; give --walk and --crossing in a run without it."
+            )
+        return _trial_of_conditions(paths, study.conditions, plan, setup, output)
+    return _trial_of_jumps(paths, plan, setup, study, output)
+
+
+def _trial_of_jumps(
+    policies: Sequence[Path],
+    plan: TrialPlan,
+    setup: TrialSetup,
+    study: StudyOptions,
+    output: OutputOptions,
+) -> console.Outcome:
+    """Jump, film, walk and cross as asked for; print tables and write the page."""
     from pronk.jump.trial import tables
     from pronk.jump.trial.criteria import trial_checks
-    from pronk.jump.trial.films.video import record_all
-    from pronk.jump.trial.protocol import parse_cases
+    from pronk.jump.trial.crossing import CrossingPlan, add_crossings
+    from pronk.jump.trial.films.record import record_trial
     from pronk.jump.trial.results import SUMMARY, TABLE
-    from pronk.jump.trial.trial import CAPTURES, VIDEOS, Plan, run_trial, setup_of
+    from pronk.jump.trial.trial import CAPTURES, VIDEOS, run_trial
+    from pronk.jump.trial.walk import add_walks
     from pronk.report.build import write_report
 
-    if own and not bodies:
-        raise PronkError("--own without --bodies; it names policies that are tried on those.")
-    cases, rates = parse_cases(commands or ["paper"]), 0 if commands else RATES_JUMPS
-    plan = Plan(cases=cases, jumps=jumps, rates=rates, seed=seed)
-    policies = [policy, *also]
-    setup = setup_of(policy, out, sim_params, robot, processes=processes)
     with console.progress() as report:
-        found = run_trial(
+        results = run_trial(
             policies,
             plan,
             setup,
-            keep_captures=keep_captures,
-            overwrite=overwrite,
+            keep_captures=output.keep_captures,
+            overwrite=output.overwrite,
             progress=report.bar("jumping"),
         )
-    sheets = list(tables.sheets(found))
-    for sheet in sheets:
-        if definitions or sheet.title != tables.DEFINITIONS:
-            console.show_sheet(sheet)
-    timing = found.timing
+    jump_tables = tables.trial_tables(results)
+    for table in jump_tables:
+        if output.definitions or table.title != tables.DEFINITIONS:
+            console.show(table)
+    timing = results.timing
     console.say(
-        f"{len(found.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
+        f"{len(results.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
         f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
         f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
     )
     films: tuple[Path, ...] = ()
+    study_tables: list[Table] = []
+    wrote = [output.out / TABLE, output.out / SUMMARY, output.out / CAPTURES]
     with console.progress() as report:
-        if video:
-            films = record_all(
-                found,
-                out,
-                out / VIDEOS,
+        if output.video:
+            films = record_trial(
+                results,
+                output.out,
+                output.out / VIDEOS,
                 robot=setup.robot,
                 cases=[case.name for case in plan.cases],
                 warn=console.warn,
                 at_once=setup.processes,
                 progress=report.bar("rendering videos"),
             )
-        wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
-        names = [name for name, on in wanted.items() if on]
-        extra = list(_extra_sheets(names, policies, setup, plan, own, report))
-        page, _ = write_report(out, report)
-    for sheet in extra:
-        console.show_sheet(sheet)
-    figures = {
-        "virtual": found.virtual,
-        "sheets": [*sheets, *extra],
-        "checks": [check.row() for check in trial_checks(found)],
-        "cells": found.cells,
-        "ratios": found.ratios,
-        "timing": dict(timing),
-        "page": page,
-        "videos": films,
-    }
-    files = (TABLE, SUMMARY, CAPTURES, *[VIDEOS] * bool(films))
+        if films:
+            wrote.append(output.out / VIDEOS)
+        if study.walk:
+            walks = add_walks(policies, setup, seed=plan.seed, progress=report.bar("walking"))
+            for subject in walks.subjects:
+                study_tables.append(tables.walk_table(walks, subject.name))
+            wrote.append(output.out / walks.kind.table)
+        if study.crossing:
+            crossing_plan = CrossingPlan(seed=plan.seed)
+            crossings = add_crossings(
+                policies, crossing_plan, setup, progress=report.bar("crossing")
+            )
+            study_tables.append(tables.crossing_table(crossings))
+            wrote.append(output.out / crossings.kind.table)
+        page, _ = write_report(output.out, report)
+    for table in study_tables:
+        console.show(table)
+    wrote.append(page)
     return console.Outcome(
-        figures=figures,
-        wrote=[*(out / name for name in files), page],
-        following=[f"open {page} in a browser", f"pronk play {policy}"],
+        figures={
+            "virtual": results.virtual,
+            "tables": [*jump_tables, *study_tables],
+            "checks": [check.row() for check in trial_checks(results)],
+            "cells": results.cells,
+            "ratios": results.ratios,
+            "timing": dict(timing),
+            "page": page,
+            "videos": films,
+        },
+        wrote=wrote,
+        following=[f"open {page} in a browser", f"pronk play {policies[0]}"],
     )
 
 
-def _extra_sheets(
-    names: Sequence[str],
+def _trial_of_conditions(
     policies: Sequence[Path],
-    setup: Setup,
-    plan: Plan,
-    own: Sequence[Path],
-    report: console.Reporter,
-) -> Iterator[Sheet]:
-    """Run what belongs to a trial besides its jumps, and yield the tables."""
-    from pronk.jump.trial import bodies, variation
-    from pronk.jump.trial.crossing import CrossingPlan, add_crossings
-    from pronk.jump.trial.trial import Plan
-    from pronk.jump.trial.walk import add_walks
-    from pronk.report import extra_pages
+    conditions_text: str,
+    plan: TrialPlan,
+    setup: TrialSetup,
+    output: OutputOptions,
+) -> console.Outcome:
+    """Jump with every policy under every condition; print the table and draw the figure."""
+    from pronk.jump.trial import tables
+    from pronk.jump.trial.condition_trial import ROBOTS, SUMMARY, TABLE, run_conditions
+    from pronk.jump.trial.conditions import load_conditions
+    from pronk.report import style
+    from pronk.report.trial_figures import draw_conditions
 
-    seed = plan.seed
-    if "walk" in names:
-        walks = add_walks(policies, setup, seed=seed, progress=report.bar("walking"))
-        for sheet in extra_pages.walk_tables(walks):
-            yield replace(sheet, title=f"Virtual robot, walking: {sheet.title}")
-    if "crossing" in names:
-        bar = report.bar("crossing")
-        crossed = add_crossings(policies, CrossingPlan(seed=seed), setup, progress=bar)
-        sheet = extra_pages.crossing_table(crossed)
-        yield replace(sheet, title=f"Virtual robot, crossing: {sheet.title}")
-    if "variation" in names:
-        bar, few = report.bar("varying the robot"), Plan(jumps=5, seed=seed)
-        yield variation.table(variation.add_variation(policies, few, setup, progress=bar))
-    if "bodies" in names:
-        plan_n = Plan(jumps=plan.jumps, seed=seed)
-        yield bodies.table(bodies.add_bodies(policies, plan_n, setup, own=own, stages=report))
+    conditions = load_conditions(conditions_text, setup.sim_params, setup.robot, seed=plan.seed)
+    with console.progress() as report:
+        results = run_conditions(
+            policies,
+            conditions,
+            plan,
+            setup,
+            overwrite=output.overwrite,
+            progress=report.bar("jumping"),
+        )
+    figure = style.save(draw_conditions(results), output.out / "conditions.svg")
+    table = tables.condition_table(results)
+    console.show(table)
+    console.say(
+        f"{len(results.cells)} cells of policy and condition in {results.seconds:.0f} s, "
+        f"{results.kept} of which were there already"
+    )
+    return console.Outcome(
+        figures={
+            "virtual": results.virtual,
+            "tables": [table],
+            "cells": results.cells,
+            "figure": figure,
+        },
+        wrote=[output.out / TABLE, output.out / SUMMARY, output.out / ROBOTS, figure],
+        following=[f"open {figure} in a browser"],
+    )

@@ -12,22 +12,14 @@ from pathlib import Path
 from pronk.deploy.runtime.log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
-from pronk.jump.trial import bodies
-from pronk.jump.trial.crossing import CROSSING
 from pronk.jump.trial.results import SUMMARY
-from pronk.jump.trial.variation import VARIATION
-from pronk.jump.trial.walk import WALK
-from pronk.report import deploy_page, extra_pages, match_page, trial_page
+from pronk.report import deploy_page, match_page, trial_page
 from pronk.report.page import Part, page
 
 NAME = "report.html"
 LOGS = "*.mcap"
 KINDS: dict[str, Callable[[Path], Part]] = {
     SUMMARY: trial_page.part,
-    WALK.summary: extra_pages.walk_part,
-    CROSSING.summary: extra_pages.crossing_part,
-    VARIATION.summary: extra_pages.variation_part,
-    bodies.FILE: extra_pages.bodies_part,
     LOGS: deploy_page.part,
     "match.npz": match_page.part,
 }
@@ -35,11 +27,10 @@ KINDS: dict[str, Callable[[Path], Part]] = {
 
 
 def artefacts(root: Path, pattern: str) -> list[Path]:
-    """Return the files below `root`, upper ones first, without those under a `bodies.json`."""
+    """Return the files below `root`, upper ones first."""
     if root.is_file():
         return [root] if pattern == LOGS else []
-    covered = {path.parent / bodies.FOLDER for path in root.rglob(bodies.FILE)}
-    found = [p for p in root.rglob(pattern) if p.is_file() and covered.isdisjoint(p.parents)]
+    found = [path for path in root.rglob(pattern) if path.is_file()]
     found = [path for path in found if pattern != LOGS or is_deploy_log(path)]
     return sorted(found, key=lambda path: (len(path.parts), path))
 

@@ -1,10 +1,13 @@
-"""What the paper published (arXiv 2404.15096), to compare with; Table III is in `evaluation`."""
+"""What the paper published (arXiv 2404.15096), to compare with.
+
+Its jumps (Table III and the gaps) are in `pronk.jump.trial.protocol`.
+"""
 
 from __future__ import annotations
 
 import math
 
-from pronk.jump.trial.protocol import TABLE_III
+from pronk.jump.trial.protocol import PAPER_GAPS, TABLE_III
 
 ROBOT = "mini_cheetah"
 """The paper's robot."""
@@ -27,14 +30,10 @@ TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0
 """Last column of Table I: those of each joint group, as used in training."""
 RANGES = (2.0, 0.05)
 """Half-widths of their randomization [N m/rad], [N m s/rad] (D3, D4)."""
-GAPS = {"forward 2": 0.55, "back 2": 0.5, "side -1": 0.4, "side +1": 0.4}
-"""Widest gaps by command, read off video (R3) [m]; of which policy is not stated."""
-WALKS = ("forward 2", "back 2", "side -1", "side +1")
-"""Velocities of R4."""
 
 
 def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and deviation of `height`, `distance` or `gap` [m] by policy and command."""
     if figure == "gap":
-        return {"matched": {case: (gap, math.nan) for case, gap in GAPS.items()}}
+        return {"matched": {command: (gap, math.nan) for command, gap in PAPER_GAPS.items()}}
     return {gains: dict(TABLE_III[figure, gains]) for gains in ("naive", "matched")}

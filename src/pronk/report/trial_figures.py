@@ -1,17 +1,19 @@
-"""Figures of trials: jumps beside the paper's, traces over time, lines over a varied parameter."""
+"""Figures of trials: jumps beside the paper's, traces over time, outcomes over conditions."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as MplFigure
 from matplotlib.lines import Line2D
 
 from pronk.arrays import Array
+from pronk.jump.trial.condition_trial import ConditionCell, ConditionResults
 from pronk.jump.trial.results import Spread
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
@@ -23,166 +25,246 @@ Published = Mapping[str, Mapping[str, tuple[float, float]]]
 Traces = Mapping[str, Mapping[str, Sequence[Array]]]
 """By policy, then by command: runs as time [s] and value, each (2, T)."""
 
-_NAMED = {"naive": (style.NAIVE, "D"), "matched": (style.MATCHED, "o")}
-_OTHERS = (("#009E73", "s"), ("#56B4E9", "^"), ("#E69F00", "v"), ("#7a5195", "P"))
-_DASH: dict[str, Any] = {"color": "#666666", "linewidth": 0.9, "linestyle": (0, (2, 2))}
-_PAPER: dict[str, Any] = {"linestyle": "none", "markersize": 6.5, "markerfacecolor": "white"}
-_PAPER |= {"markeredgecolor": style.PAPER, "markeredgewidth": 1.4}
+_PAPER_LOOKS = {"naive": (style.NAIVE, "D"), "matched": (style.MATCHED, "o")}
+"""Colour and marker of the policies that the paper has."""
+_OTHER_LOOKS = (("#009E73", "s"), ("#56B4E9", "^"), ("#E69F00", "v"), ("#7a5195", "P"))
+"""Colours and markers of other policies, in turn."""
+_DASHED: dict[str, Any] = {"color": "#666666", "linewidth": 0.9, "linestyle": (0, (2, 2))}
+_PAPER: dict[str, Any] = {
+    "linestyle": "none",
+    "markersize": 6.5,
+    "markerfacecolor": "white",
+    "markeredgecolor": style.PAPER,
+    "markeredgewidth": 1.4,
+}
 
 
 def looks(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return colour and marker of each policy; text after a comma (`naive, body 1`) is ignored."""
-    found, spare = {}, iter(_OTHERS * (1 + len(policies) // len(_OTHERS)))
+    """Return colour and marker of each policy."""
+    spare = itertools.cycle(_OTHER_LOOKS)
+    look_by_policy = {}
     for name in policies:
-        base = name.split(",")[0]
-        colour, marker = _NAMED[base] if base in _NAMED else next(spare)
-        found[name] = {"color": colour, "marker": marker}
-    return found
+        colour, marker = _PAPER_LOOKS[name] if name in _PAPER_LOOKS else next(spare)
+        look_by_policy[name] = {"color": colour, "marker": marker}
+    return look_by_policy
 
 
-def _keys(policies: Sequence[str], *, marks: bool = True) -> list[Line2D]:
-    named = {name.split(",")[0]: look for name, look in looks(policies).items()}
-    line = {"linestyle": "none"} if marks else {}
-    return [key(f"{name}, virtual robot", **look, **line) for name, look in named.items()]
+def _policy_keys(policies: Sequence[str], **changes: Any) -> list[Line2D]:
+    """Return the legend's entries of the policies; `changes` are of their lines."""
+    keys = []
+    for name, look in looks(policies).items():
+        keys.append(key(f"{name}, virtual robot", **(look | changes)))
+    return keys
 
 
 def offsets(count: int, width: float) -> Array:
-    """Return places of `count` things about zero, `width` from first to last."""
-    return np.linspace(-0.5, 0.5, count) * width if count > 1 else np.zeros(1)
+    """Return the places of several marks about zero, `width` from the first to the last."""
+    if count == 1:
+        return np.zeros(1)
+    return np.linspace(-0.5, 0.5, count) * width
 
 
 def commands_of(values: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the commands in the order in which they first appear."""
-    return list(dict.fromkeys(name for cases in values.values() for name in cases))
+    """Return the commands of all policies in the order in which they first appear."""
+    commands: list[str] = []
+    for cases in values.values():
+        for name in cases:
+            if name not in commands:
+                commands.append(name)
+    return commands
 
 
-def cells(panels: Sequence[tuple[str, Values, Published]]) -> Figure:
-    """Draw every jump with mean and standard deviation, beside the paper's.
-
-    Panels, one below the other, have the label of the axis with its unit, ours and the paper's.
-    """
-    height = 2.9 if len(panels) < 3 else 2.1
-    size = height * len(panels) + 0.5
-    with drawing(len(panels), height=size, sharex=True) as (figure, grid):
-        for axes, (label, values, published) in zip(grid[:, 0], panels, strict=True):
-            _cells_panel(axes, values, published)
-            axes.set_ylabel(label)
-        policies = list(panels[0][1])
-        paper = [name for name in policies if any(name in given for _, _, given in panels)]
-        keys = [key(f"paper, hardware, {n}", marker=_NAMED[n][1], **_PAPER) for n in paper]
-        legend(figure, [*_keys(policies), *keys])
-    return figure
-
-
-def _cells_panel(axes: Axes, values: Values, published: Published) -> None:
-    commands, policies = commands_of(values), looks(list(values))
-    places = offsets(len(policies) + sum(name in published for name in policies), 0.62)
-    for i, command in enumerate(commands):
-        slot = iter(i + places)
-        for name, look in policies.items():
-            if name in published:
-                x = next(slot)
-                if command in published[name]:
-                    mean, spread = published[name][command]
-                    bar: dict[str, Any] = {"ecolor": style.PAPER, "capsize": 3.0, "zorder": 3}
-                    axes.errorbar(x, mean, yerr=spread, marker=look["marker"], **_PAPER, **bar)
-            x = next(slot)
-            known = np.asarray(values[name].get(command, ()), dtype=float)
-            known = known[np.isfinite(known)]
-            sums = Spread.of(known)
-            if len(known):
-                many: dict[str, Any] = {"linestyle": "none", "alpha": 0.45, "markersize": 4.5}
-                axes.plot(x + np.linspace(-0.05, 0.03, len(known)), known, **look, **many)
-                bar = {"capsize": 3.5, "markeredgecolor": "white", "zorder": 4}
-                spread = sums.std if sums.n > 1 else 0.0
-                axes.errorbar(x + 0.06, sums.mean, yerr=spread, **look, **bar)
-    axes.set_xticks(range(len(commands)), commands)
-    axes.set_xlim(-0.55, len(commands) - 0.45)
-    axes.grid(visible=False, axis="x")
-    axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.04 * axes.get_ylim()[1])
-
-
-def scatter_over_error(errors_db: Mapping[str, float], panels: Mapping[str, Values]) -> Figure:
-    """Draw the scatter of each command's jumps over the error of the policy's training gains.
-
-    Errors are by policy, RMS over the joints' bands; panels by quantity as in `height [m]`.
-    """
-    policies = looks(list(errors_db))
-    with drawing(1, len(panels), height=3.4) as (figure, grid):
-        for axes, (label, values) in zip(grid[0], panels.items(), strict=True):
-            for name, look in policies.items():
-                stds = np.array([Spread.of(one).std for one in values.get(name, {}).values()])
-                at = np.full(len(stds), errors_db[name])
-                axes.plot(at, stds, linestyle="none", alpha=0.7, **look)
-                if np.isfinite(stds).any():
-                    bar = {"markersize": 22.0, "markeredgewidth": 2.6, "color": look["color"]}
-                    axes.plot(errors_db[name], np.nanmean(stds), marker="_", **bar)
-            axes.set_xlim(0.0, 1.1 * max(errors_db.values()))
-            axes.set_ylim(0.0, 1.12 * axes.get_ylim()[1])
-            axes.set_xlabel("error of the training gains on the sweep [dB RMS]")
-            axes.set_ylabel(f"standard deviation of the {label}")
-        mean = key("mean over the commands", color="#444444", linewidth=2.6)
-        legend(figure, [*_keys(list(errors_db)), mean])
-    return figure
+# ---- jumps beside the paper's ----
 
 
 @dataclass(frozen=True, kw_only=True)
-class Panel:
-    """One panel of a figure of lines."""
+class JumpPanel:
+    """One figure of every jump, and what the paper published of it."""
 
-    title: str
-    x_label: str
-    y_label: str
-    lines: Mapping[str, Array]
-    """By policy: rows of x, the result, and the ends of its error bar, (4, n)."""
-    marks: tuple[float, ...] = ()
-    """Places along x that are marked."""
-    share: bool = False
-    """The result is a share, 0 to 1."""
+    label: str
+    """Label of the axis, with the unit."""
+    values: Values
+    published: Published
 
 
-def lines(panels: Sequence[Panel], *, columns: int, mark: str, bar: str) -> Figure:
-    """Draw panels of lines, row by row; `mark` and `bar` name the marks and the error bars."""
-    policies = list(dict.fromkeys(name for panel in panels for name in panel.lines))
-    rows = -(-len(panels) // columns)
-    with drawing(rows, columns, height=2.35 * rows + 0.5) as (figure, grid):
-        for axes, panel in zip(grid.flat, panels, strict=True):
-            width = max((float(np.ptp(line[0])) for line in panel.lines.values()), default=0.0)
-            shifts = width * offsets(len(panel.lines), 0.012)
-            for shift, (name, line) in zip(shifts, panel.lines.items(), strict=False):
-                x, y, low, high = line[:, np.argsort(line[0], kind="stable")]
-                look = looks(policies)[name]
-                axes.plot(x + shift, y, markersize=5.0, linewidth=1.4, zorder=3, **look)
-                axes.vlines(x + shift, low, high, color=look["color"], linewidth=1.0)
-            for place in panel.marks:
-                axes.axvline(place, **_DASH)
-            axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
-            if panel.share:
-                axes.set_ylim(-0.04, 1.04)
-        tick: dict[str, Any] = {"color": "#444444", "marker": "|", "linestyle": "none"}
-        legend(figure, [*_keys(policies, marks=False), key(mark, **_DASH), key(bar, **tick)])
+def draw_jumps(panels: Sequence[JumpPanel]) -> MplFigure:
+    """Draw every jump with mean and standard deviation, beside the paper's; a row a panel."""
+    panel_height = 2.9 if len(panels) < 3 else 2.1
+    height = panel_height * len(panels) + 0.5
+    with drawing(len(panels), height=height, sharex=True) as (figure, grid):
+        for axes, panel in zip(grid[:, 0], panels, strict=True):
+            _draw_jump_panel(axes, panel)
+        policies = list(panels[0].values)
+        keys = _policy_keys(policies, linestyle="none")
+        for name in policies:
+            if any(name in panel.published for panel in panels):
+                marker = _PAPER_LOOKS[name][1]
+                keys.append(key(f"paper, hardware, {name}", marker=marker, **_PAPER))
+        legend(figure, keys)
     return figure
 
 
-def traces(found: Mapping[str, Traces], *, x_label: str, level: float) -> Figure:
-    """Draw runs over time, a row for each quantity and policy, a column a command.
+def _draw_jump_panel(axes: Axes, panel: JumpPanel) -> None:
+    """Draw one figure of every jump: a group of marks a command, in it a column a policy."""
+    commands = commands_of(panel.values)
+    look_by_policy = looks(list(panel.values))
+    published_count = sum(name in panel.published for name in look_by_policy)
+    places = offsets(len(look_by_policy) + published_count, 0.62)
+    for index, command in enumerate(commands):
+        columns = iter(index + places)
+        for name, look in look_by_policy.items():
+            if name in panel.published:
+                place = next(columns)
+                if command in panel.published[name]:
+                    mean, std = panel.published[name][command]
+                    _draw_published(axes, place, mean, std, look["marker"])
+            place = next(columns)
+            jumps = np.asarray(panel.values[name].get(command, ()), dtype=float)
+            jumps = jumps[np.isfinite(jumps)]
+            if len(jumps):
+                _draw_measured(axes, place, jumps, look)
+    axes.set_ylabel(panel.label)
+    axes.set_xticks(range(len(commands)), commands)
+    axes.set_xlim(-0.55, len(commands) - 0.45)
+    axes.grid(visible=False, axis="x")
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(0.0, low), 1.04 * high)
 
-    `found` is by quantity with its unit; `level` is drawn dashed in each panel.
+
+def _draw_published(axes: Axes, place: float, mean: float, std: float, marker: str) -> None:
+    axes.errorbar(
+        place, mean, yerr=std, marker=marker, ecolor=style.PAPER, capsize=3.0, zorder=3, **_PAPER
+    )
+
+
+def _draw_measured(axes: Axes, place: float, jumps: Array, look: Mapping[str, Any]) -> None:
+    """Draw every jump as a small mark, and mean and standard deviation beside them."""
+    spread = Spread.of(jumps)
+    marks = place + np.linspace(-0.05, 0.03, len(jumps))
+    axes.plot(marks, jumps, linestyle="none", alpha=0.45, markersize=4.5, **look)
+    std = spread.std if spread.n > 1 else 0.0
+    axes.errorbar(
+        place + 0.06,
+        spread.mean,
+        yerr=std,
+        capsize=3.5,
+        markeredgecolor="white",
+        zorder=4,
+        **look,
+    )
+
+
+# ---- outcomes over conditions ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Outcome:
+    """One row of the figure of conditions."""
+
+    label: str
+    value: Array
+    """One number a condition. (n,)"""
+    low: Array
+    """Lower end of its bar. (n,)"""
+    high: Array
+    """Upper end of its bar. (n,)"""
+
+
+def draw_conditions(results: ConditionResults) -> MplFigure:
+    """Draw landings, height, distance and velocity error over the conditions, a line a policy.
+
+    Each series of conditions is a column of panels; conditions by themselves are one more.
     """
-    first = next(iter(found.values()))
-    commands, policies = commands_of(first), looks(list(first))
-    rows = [(quantity, name) for quantity in found for name in policies]
-    options: dict[str, Any] = {"sharex": True, "sharey": "row", "height": 1.7 * len(rows) + 0.6}
-    with drawing(len(rows), len(commands), **options) as (figure, grid):
-        for row, (quantity, name) in zip(grid, rows, strict=True):
-            for axes, command in zip(row, commands, strict=True):
-                for time, value in found[quantity][name].get(command, ()):
-                    look = {"color": policies[name]["color"], "linewidth": 0.7, "alpha": 0.55}
-                    axes.plot(time, value, **look)
-                axes.axhline(level, **_DASH)
-            row[0].set_ylabel(f"{name}\n{quantity}")
-        for top, bottom, command in zip(grid[0], grid[-1], commands, strict=True):
-            top.set_title(command)
-            bottom.set_xlabel(x_label)
-        legend(figure, [key(f"{n}, virtual robot", color=p["color"]) for n, p in policies.items()])
+    series = [condition.series for condition in results.conditions]
+    columns = sorted(set(series), key=series.index)
+    policies = [subject.name for subject in results.subjects]
+    look_by_policy = looks(policies)
+    with drawing(4, len(columns), height=9.0, sharex="col", sharey="row") as (figure, grid):
+        for column, name in enumerate(columns):
+            conditions = [each for each in results.conditions if each.series == name]
+            if name:
+                places = np.array([condition.place for condition in conditions], dtype=float)
+            else:
+                places = np.arange(len(conditions), dtype=float)
+            order = np.argsort(places, kind="stable")
+            for policy in policies:
+                cells = []
+                for index in order:
+                    cells.append(results.cell(policy, conditions[index].name))
+                for row, outcome in enumerate(_outcomes(cells)):
+                    axes = grid[row, column]
+                    look = look_by_policy[policy]
+                    line = "-" if name else "none"
+                    axes.plot(places[order], outcome.value, linestyle=line, **look)
+                    axes.vlines(places[order], outcome.low, outcome.high, color=look["color"])
+                    if column == 0:
+                        axes.set_ylabel(outcome.label)
+            if name:
+                grid[-1, column].set_xlabel(name)
+            else:
+                labels = [condition.name for condition in conditions]
+                grid[-1, column].set_xticks(places, labels, rotation=30, ha="right")
+        grid[0, 0].set_ylim(-0.04, 1.04)
+        keys = _policy_keys(policies)
+        bar_look: dict[str, Any] = {"color": "#444444", "marker": "|", "linestyle": "none"}
+        keys.append(key("95 % interval of the share; standard deviation", **bar_look))
+        legend(figure, keys)
+    return figure
+
+
+def _outcomes(cells: Sequence[ConditionCell]) -> list[_Outcome]:
+    """Return the rows of the figure, of one policy under several conditions."""
+    landed = _Outcome(
+        label="landed [1]",
+        value=np.array([cell.landed_share for cell in cells]),
+        low=np.array([cell.landed_interval[0] for cell in cells]),
+        high=np.array([cell.landed_interval[1] for cell in cells]),
+    )
+    return [
+        landed,
+        _spread_outcome("height [m]", [cell.height for cell in cells]),
+        _spread_outcome("distance [m]", [cell.distance for cell in cells]),
+        _spread_outcome("velocity error [m/s]", [cell.velocity_error for cell in cells]),
+    ]
+
+
+def _spread_outcome(label: str, spreads: Sequence[Spread]) -> _Outcome:
+    mean = np.array([spread.mean for spread in spreads])
+    std = np.nan_to_num(np.array([spread.std for spread in spreads]))
+    return _Outcome(label=label, value=mean, low=mean - std, high=mean + std)
+
+
+# ---- traces ----
+
+
+def draw_traces(quantities: Mapping[str, Traces], *, x_label: str, level: float) -> MplFigure:
+    """Draw runs over time: a row for each quantity and policy, a column for each command.
+
+    Args:
+        quantities: Runs by the quantity's name with its unit.
+        x_label: Label of the time axis.
+        level: A value that is drawn dashed in each panel.
+    """
+    first = next(iter(quantities.values()))
+    commands = commands_of(first)
+    look_by_policy = looks(list(first))
+    rows = list(itertools.product(quantities, look_by_policy))
+    height = 1.7 * len(rows) + 0.6
+    with drawing(len(rows), len(commands), height=height, sharex=True, sharey="row") as drawn:
+        figure, grid = drawn
+        for row, (quantity, policy) in enumerate(rows):
+            colour = look_by_policy[policy]["color"]
+            for column, command in enumerate(commands):
+                axes = grid[row, column]
+                for time, value in quantities[quantity][policy].get(command, ()):
+                    axes.plot(time, value, color=colour, linewidth=0.7, alpha=0.55)
+                axes.axhline(level, **_DASHED)
+            grid[row, 0].set_ylabel(f"{policy}\n{quantity}")
+        for column, command in enumerate(commands):
+            grid[0, column].set_title(command)
+            grid[-1, column].set_xlabel(x_label)
+        keys = []
+        for policy, look in look_by_policy.items():
+            keys.append(key(f"{policy}, virtual robot", color=look["color"]))
+        legend(figure, keys)
     return figure

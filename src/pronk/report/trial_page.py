@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,40 +15,100 @@ from pronk.errors import ArtefactError
 from pronk.jump.trial import tables
 from pronk.jump.trial.criteria import trial_checks
 from pronk.jump.trial.protocol import RATES, in_paper_order
-from pronk.jump.trial.results import SUMMARY, Results, load, share_interval
+from pronk.jump.trial.results import (
+    SUMMARY,
+    TrialResults,
+    TriedPolicy,
+    load_results,
+    share_interval,
+)
 from pronk.jump.virtual import capture as capture_file
 from pronk.report import style
-from pronk.report import trial_figures as draw
 from pronk.report.page import Part
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture, rms
-from pronk.report.trial_figures import Values
+from pronk.report.trial_figures import JumpPanel, Values, draw_jumps, draw_traces
+from pronk.tables import Cell, Column, Table
 
-BEFORE_S, AFTER_S = 0.5, 2.0
-"""Window of the height traces about the jump input [s]."""
+BEFORE_S = 0.5
+"""Time before the jump input that the height traces show [s]."""
+AFTER_S = 2.0
+"""Time after the jump input that the height traces show [s]."""
 TRACE_RATE_HZ = 250.0
-"""Rate of drawn traces."""
-Traces = dict[str, dict[str, dict[str, list[Array]]]]
-"""By quantity, policy and command: runs as time [s] and value, each (2, T). `height` [m] over the
-time since the jump input; `roll` and `pitch` rate [rad/s] over the time since the command to run,
-of `RATES` alone."""
+"""Rate of drawn traces [Hz]."""
+DRAWN_FIGURES = ("height", "distance", "gap")
+"""Figures that are drawn beside the paper's."""
+
+Runs = dict[str, dict[str, list[Array]]]
+"""By policy and command: runs as time [s] and value, each (2, T)."""
 
 
-def policies(trial: Results) -> list[str]:
+@dataclass(frozen=True, kw_only=True)
+class CapturedTraces:
+    """What the captures of a trial show over time."""
+
+    height: Runs
+    """Height of the trunk [m] over the time since the jump input."""
+    roll_rate: Runs
+    """Roll rate [rad/s] over the time since the command to run, of `RATES` alone."""
+    pitch_rate: Runs
+    """Pitch rate [rad/s] over the time since the command to run, of `RATES` alone."""
+    missing: int
+    """Number of captures that the trial kept and the folder has not."""
+
+    @property
+    def captured(self) -> int:
+        """Number of runs with a capture."""
+        count = 0
+        for cases in self.height.values():
+            for runs in cases.values():
+                count += len(runs)
+        return count
+
+
+def policy_names(trial: TrialResults) -> list[str]:
     """Return the names of the policies, `naive` first."""
     return in_paper_order(subject.name for subject in trial.subjects)
 
 
-def values(trial: Results, figure: str) -> Values:
+def jump_values(trial: TrialResults, figure: str) -> Values:
     """Return one figure of every jump, by policy and command."""
-    return {
-        name: {case.name: trial.values(name, case.name, figure) for case in trial.cases}
-        for name in policies(trial)
-    }
+    values = {}
+    for name in policy_names(trial):
+        values[name] = {case.name: trial.values(name, case.name, figure) for case in trial.cases}
+    return values
+
+
+def load_traces(trial: TrialResults, folder: Path) -> CapturedTraces | None:
+    """Read the captures of a trial; None if the folder has none of them."""
+    kept = [row for row in trial.rows if row.capture]
+    present = [row for row in kept if (folder / row.capture).exists()]
+    if not present:
+        return None
+    height: Runs = {name: {} for name in policy_names(trial)}
+    roll_rate: Runs = {name: {} for name in policy_names(trial)}
+    pitch_rate: Runs = {name: {} for name in policy_names(trial)}
+    for row in present:
+        capture = capture_file.load(folder / row.capture)
+        since_jump = capture.time - row.began - row.script.on
+        trace = _cut(since_jump, capture.position[:, 2], -BEFORE_S, AFTER_S)
+        height[row.policy].setdefault(row.case, []).append(trace)
+        if row.case == RATES.name:
+            since_run = capture.time - row.began - row.script.start
+            roll = _cut(since_run, capture.angular_velocity[:, 0], 0.0, row.script.run_s)
+            pitch = _cut(since_run, capture.angular_velocity[:, 1], 0.0, row.script.run_s)
+            roll_rate[row.policy].setdefault(row.case, []).append(roll)
+            pitch_rate[row.policy].setdefault(row.case, []).append(pitch)
+    return CapturedTraces(
+        height=height,
+        roll_rate=roll_rate,
+        pitch_rate=pitch_rate,
+        missing=len(kept) - len(present),
+    )
 
 
 def _cut(time: Array, value: Array, start: float, end: float) -> Array:
-    """Return `value` between two times, thinned to `TRACE_RATE_HZ`, as (2, T)."""
+    """Return time and value between two times, thinned to `TRACE_RATE_HZ`. (2, T)."""
     inside = np.flatnonzero((time >= start) & (time <= end))
     if len(inside) > 1:
         dt = float(time[inside[-1]] - time[inside[0]]) / (len(inside) - 1)
@@ -55,40 +116,43 @@ def _cut(time: Array, value: Array, start: float, end: float) -> Array:
     return np.stack([time[inside], value[inside]])
 
 
-def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
-    """Read the captures of a trial, and count missing ones; None if there are none."""
-    kept = [(row, folder / row.capture) for row in trial.rows if row.capture]
-    present = [(row, path) for row, path in kept if path.exists()]
-    if not present:
-        return None
-    axes = {"roll": 0, "pitch": 1}
-    found: Traces = {what: {name: {} for name in policies(trial)} for what in ("height", *axes)}
-    for row, path in present:
-        capture = capture_file.load(path)
-        since = capture.time - row.began - row.script.on
-        own = {"height": _cut(since, capture.position[:, 2], -BEFORE_S, AFTER_S)}
-        if row.case == RATES.name:
-            run = capture.time - row.began - row.script.start
-            for what, axis in axes.items():
-                own[what] = _cut(run, capture.angular_velocity[:, axis], 0.0, row.script.run_s)
-        for what, trace in own.items():
-            found[what][row.policy].setdefault(row.case, []).append(trace)
-    return found, len(kept) - len(present)
+def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
+    """Return the RMS of a rate over all runs with the command `RATES`; NaN without any."""
+    rates = [np.array([np.nan])]
+    for run in runs.get(RATES.name, ()):
+        rates.append(run[1])
+    return float(rms(np.concatenate(rates)))
 
 
-def films(folder: Path) -> tuple[dict[str, str], list[str]]:
-    """Return pictures in a trial's folder as caption and `data:` address, and names of films."""
-    # A folder with a trial of its own is a part of its own.
-    inner = [path for path in folder.iterdir() if path.is_dir() and not (path / SUMMARY).exists()]
-    png, gif, mp4 = (
-        sorted(path for place in (folder, *inner) for path in place.glob(f"*.{kind}"))
-        for kind in ("png", "gif", "mp4")
-    )
-    pictures = {f"{path.stem} ({path.suffix[1:]})": _image(path) for path in (*png, *gif)}
-    return pictures, [str(path.relative_to(folder)) for path in mp4]
+# ---- films ----
 
 
-def _image(path: Path) -> str:
+def film_pictures(folder: Path) -> dict[str, str]:
+    """Return the pictures in a trial's folder as `data:` addresses, by caption."""
+    pictures = {}
+    for path in [*_films(folder, "png"), *_films(folder, "gif")]:
+        pictures[f"{path.stem} ({path.suffix[1:]})"] = _picture_address(path)
+    return pictures
+
+
+def film_names(folder: Path) -> list[str]:
+    """Return the names of the films in a trial's folder, relative to it."""
+    return [str(path.relative_to(folder)) for path in _films(folder, "mp4")]
+
+
+def _films(folder: Path, ending: str) -> list[Path]:
+    """Return files of one kind in a trial's folder and in folders in it without a trial."""
+    places = [folder]
+    for path in folder.iterdir():
+        if path.is_dir() and not (path / SUMMARY).exists():
+            places.append(path)
+    films: list[Path] = []
+    for place in places:
+        films += place.glob(f"*.{ending}")
+    return sorted(films)
+
+
+def _picture_address(path: Path) -> str:
     from PIL import Image
 
     data = path.read_bytes()
@@ -102,89 +166,158 @@ def _image(path: Path) -> str:
     return style.data_uri(data, path.suffix[1:])
 
 
+# ---- the part ----
+
+
 def part(path: Path) -> Part:
     """Make the part of the trial in `path`, a `summary.json`."""
     folder = path.parent
-    trial = load(folder)
-    where = tables.place(trial)
-    checks, first = trial_checks(trial), trial.subjects[0].name
-    passed = sum(check.passed for check in checks)
-    pictures, names = films(folder)
-    drawn = ("height", "distance", "gap")
-    panels = [(f"{name} [m]", values(trial, name), published_jumps(name)) for name in drawn]
+    trial = load_results(folder)
+    place = tables.place_words(trial.virtual)
+    checks = trial_checks(trial)
+    passed = len([check for check in checks if check.passed])
+    policy = trial.subjects[0].name
+    others = trial.subjects[1:]
+    panels = []
+    for name in DRAWN_FIGURES:
+        panels.append(
+            JumpPanel(
+                label=f"{name} [m]",
+                values=jump_values(trial, name),
+                published=published_jumps(name),
+            )
+        )
+    scatter_tables = []
+    for other in others:
+        if trial.ratios:
+            scatter_tables.append(tables.scatter_table(trial, other.name))
+    other_figures = {}
+    for subject in trial.subjects:
+        other_figures[subject.name] = tables.other_figures(trial, subject.name)
     content = {
         "trial": trial,
-        "where": where,
-        "totals": {name: _total(trial, name) for name in policies(trial)},
-        "verdicts": [tables.verdict(trial, other.name) for other in trial.subjects[1:]],
-        "cells": picture(draw.cells(panels)),
-        "table_iii": [tables.table_iii(trial, figure) for figure in ("height", "distance")],
-        "criteria": tables.criteria(trial),
-        "scatter_table": tables.scatter(trial) if trial.ratios else None,
-        "pictures": pictures,
-        "films": names,
+        "where": place,
+        "totals": {name: _total(trial, name) for name in policy_names(trial)},
+        "verdicts": [tables.scatter_verdict(trial, other.name) for other in others],
+        "cells": picture(draw_jumps(panels)),
+        "table_iii": [tables.paper_table(trial, "height"), tables.paper_table(trial, "distance")],
+        "criteria": tables.criteria_table(trial),
+        "scatter_tables": scatter_tables,
+        "pictures": film_pictures(folder),
+        "films": film_names(folder),
         "landings": tables.landings(trial),
-        "more": {subject.name: tables.more(trial, subject.name) for subject in trial.subjects},
-        "drives": tables.drives(trial),
+        "more": other_figures,
+        "drives": tables.drive_loads(trial),
         "definitions": tables.definitions(),
-        "setup": _setup(trial),
+        "setup": setup_table(trial.subjects),
+        **_trace_content(trial, folder),
     }
     return Part(
         kind="trial",
         title="Trial",
         virtual=trial.virtual,
-        summary=f"{first}, {where}: {passed} of {len(checks)} acceptance criteria passed.",
+        summary=f"{policy}, {place}: {passed} of {len(checks)} acceptance criteria passed.",
         warning=passed < len(checks),
-        content=content | _trace_figures(trial, folder),
+        content=content,
         figures={"checks": [check.row() for check in checks]},
     )
 
 
-def _total(trial: Results, name: str) -> dict[str, float]:
-    """Counts over all commands, and the share of landings [%] with its interval."""
-    own = [cell for cell in trial.cells if cell.policy == name]
-    counts = {of: sum(getattr(cell, of) for cell in own) for of in ("n", "found", "fell")}
-    landed, n = tables.tally(own)
-    low, high = share_interval(landed, n)
-    share = {"share": 100 * landed / n, "low": 100 * low, "high": 100 * high}
-    return counts | {"landed": landed} | share
+def _total(trial: TrialResults, policy: str) -> dict[str, float]:
+    """Return counts over all commands, and the share of landings [%] with its interval."""
+    commanded = 0
+    jumped = 0
+    landed = 0
+    fell = 0
+    for cell in trial.cells:
+        if cell.policy == policy:
+            commanded += cell.n
+            jumped += cell.found
+            landed += cell.succeeded
+            fell += cell.fell
+    low, high = share_interval(landed, commanded)
+    return {
+        "n": commanded,
+        "found": jumped,
+        "fell": fell,
+        "landed": landed,
+        "share": 100.0 * landed / commanded,
+        "low": 100.0 * low,
+        "high": 100.0 * high,
+    }
 
 
-def _trace_figures(trial: Results, folder: Path) -> dict[str, Any]:
-    """Figures that need captures; None without."""
-    made: dict[str, Any] = dict.fromkeys(("rates", "rates_table", "rates_case", "heights"))
-    if (found := traces(trial, folder)) is None:
-        return made
-    (height, roll, pitch), made["missing"] = found[0].values(), found[1]
-    if any(roll.values()):
-        quantities = {"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch}
-        x_label = "time since the command to run [s]"
-        made["rates"] = picture(draw.traces(quantities, x_label=x_label, level=0.0), dense=True)
-        rows = [(name, rate_rms(roll[name]), rate_rms(pitch[name])) for name in roll]
-        columns = "policy | roll rate, RMS [rad/s];2 | pitch rate, RMS [rad/s];2"
-        made |= {"rates_table": tables.table(columns, rows), "rates_case": RATES.name}
-    made["captured"] = sum(len(runs) for cases in height.values() for runs in cases.values())
+def _trace_content(trial: TrialResults, folder: Path) -> dict[str, Any]:
+    """Return what the page shows of the captures; None without them."""
+    content: dict[str, Any] = {
+        "rates": None,
+        "rates_table": None,
+        "rates_case": RATES.name,
+        "heights": None,
+        "captured": 0,
+        "missing": 0,
+    }
+    traces = load_traces(trial, folder)
+    if traces is None:
+        return content
+    content["captured"] = traces.captured
+    content["missing"] = traces.missing
     standing = float(trial.rules.get("standing_height", np.nan))
-    label = "time since the jump input [s]"
-    drawn = draw.traces({"trunk height [m]": height}, x_label=label, level=standing)
-    return made | {"heights": picture(drawn, dense=True)}
+    heights = draw_traces(
+        {"trunk height [m]": traces.height},
+        x_label="time since the jump input [s]",
+        level=standing,
+    )
+    content["heights"] = picture(heights, dense=True)
+    if any(traces.roll_rate.values()):
+        rates = draw_traces(
+            {"roll rate [rad/s]": traces.roll_rate, "pitch rate [rad/s]": traces.pitch_rate},
+            x_label="time since the command to run [s]",
+            level=0.0,
+        )
+        content["rates"] = picture(rates, dense=True)
+        content["rates_table"] = rates_table(traces)
+    return content
 
 
-def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
-    """Return the RMS of a rate over all runs with the command `RATES`; NaN without any."""
-    return float(rms(np.concatenate([[np.nan], *(run[1] for run in runs.get(RATES.name, ()))])))
+def rates_table(traces: CapturedTraces) -> Table:
+    """Return the RMS of roll and pitch rate of every policy."""
+    rows: list[tuple[Cell, ...]] = []
+    for policy, runs in traces.roll_rate.items():
+        rows.append((policy, rate_rms(runs), rate_rms(traces.pitch_rate[policy])))
+    return Table(
+        title="",
+        columns=(
+            Column(heading="policy"),
+            Column(heading="roll rate, RMS", unit="rad/s", digits=2),
+            Column(heading="pitch rate, RMS", unit="rad/s", digits=2),
+        ),
+        rows=tuple(rows),
+    )
 
 
-def _setup(trial: Results) -> tables.Sheet:
+def setup_table(subjects: Sequence[TriedPolicy]) -> Table:
     """Return files of the policies and the gains that they were trained with, by joint group."""
-    rows = []
-    for one in trial.subjects:
-        columns = [one.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping")]
+    rows: list[tuple[Cell, ...]] = []
+    for subject in subjects:
+        contract = subject.contract
         groups: dict[str, str] = {}
-        for name, stiffness, damping in zip(*columns, strict=False):
+        names = contract.get("joint_names", ())
+        stiffnesses = contract.get("stiffness", ())
+        dampings = contract.get("damping", ())
+        for name, stiffness, damping in zip(names, stiffnesses, dampings, strict=False):
             group = style.joint_words(name.removeprefix(f"{style.leg_of(name)}_"))
             groups.setdefault(group, f"{group} {stiffness:.1f} / {damping:.3f}")
-        gains = one.contract.get("gains", "unknown")
-        rows.append((one.name, gains, ", ".join(groups.values()), one.path, one.sha256))
-    heads = "policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256"
-    return tables.table(heads, rows)
+        gains = contract.get("gains", "unknown")
+        rows.append((subject.name, gains, ", ".join(groups.values()), subject.path, subject.sha256))
+    return Table(
+        title="",
+        columns=(
+            Column(heading="policy"),
+            Column(heading="gains"),
+            Column(heading="stiffness [N m/rad] / damping [N m s/rad]"),
+            Column(heading="file"),
+            Column(heading="SHA-256"),
+        ),
+        rows=tuple(rows),
+    )

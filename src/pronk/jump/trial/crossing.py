@@ -30,10 +30,10 @@ import itertools
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -43,13 +43,27 @@ from pronk.jump.trial.jumps import (
     FALLEN_COSINE,
     JumpRules,
     cosine_of_tilt,
+    figure,
     jump_flights,
-    number,
+    measure_jump,
     sample_at,
 )
 from pronk.jump.trial.protocol import Case, named
-from pronk.jump.trial.results import Results, Row, Subject, extra_kind
-from pronk.jump.trial.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
+from pronk.jump.trial.results import (
+    TrialResults,
+    TrialRun,
+    TriedPolicy,
+    save_results,
+    study_kind,
+)
+from pronk.jump.trial.trial import (
+    OFFSET,
+    TrialJob,
+    TrialSetup,
+    case_rng,
+    load_subjects,
+    software_versions,
+)
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.ground import Box, Ground, Start
 from pronk.policy.rollout import ticks
@@ -59,19 +73,23 @@ from pronk.processes import in_processes
 Shape = Literal["flat", "gap", "up", "down"]
 
 DEPTH = 1.0
-"""Of a gap [m]."""
-BEHIND, BEYOND = 5.0, 15.0
-"""Floor behind the start and behind the far edge [m]."""
+"""Depth of a gap [m]."""
+BEHIND = 5.0
+"""Length of the floor behind the start [m]."""
+BEYOND = 15.0
+"""Length of the floor behind the far edge [m]."""
 WIDE = 8.0
 """Half-width of the course [m]."""
 RUN_UP_S = 2.0
-"""The edge is as far away as the command goes in this time [s]."""
+"""Time in which the command reaches the edge [s]."""
 PHASE_S = 0.5
-"""Starts lie up to this many seconds of the command further back: more than a stride [s]."""
+"""Starts lie up to this many seconds of the command further back, more than a stride [s]."""
 LATE = 3.0
-"""A run ends if the robot has not reached the edge after this many times the run-up."""
+"""A run ends if the robot has not reached the edge after this many times the run-up [1]."""
 STEERED = 0.02
 """Half-width of the headings at the start [rad]."""
+ROUNDS_LEFT = 5.0
+"""Number of rounds of the search that still come, as the progress guesses."""
 
 NOT_TRIGGERED = "never came to the place of the jump"
 STEPPED_IN = "a foot went below the floor between the edges"
@@ -88,36 +106,44 @@ class Obstacle:
     size: float = 0.0
     """Width of a gap, height of a step [m]."""
     command: Velocity
-    """Straight forward, back or to a side."""
+    """Velocity straight forward, back or to a side."""
     edge: float
-    """Where it begins, along the course [m]."""
+    """Place where it begins, along the course [m]."""
 
     @property
     def far(self) -> float:
-        """Where the floor goes on, along the course [m]."""
-        return self.edge + (self.size if self.kind == "gap" else 0.0)
+        """Place where the floor goes on, along the course [m]."""
+        return self.edge + self.size if self.kind == "gap" else self.edge
 
     def on(self, ground: Ground) -> Ground:
         """Put the obstacle on a ground, whose friction and stiffness stay."""
         if self.kind == "flat":
             return replace(ground, floor=0.0, terrain=())
-        floor = {"gap": -DEPTH, "up": 0.0, "down": -self.size}[self.kind]
-        boxes = [] if self.kind == "up" else [self._box(-BEHIND, self.edge, floor, 0.0)]
-        if self.kind != "down":
-            top = self.size if self.kind == "up" else 0.0
-            boxes.append(self._box(self.far, self.far + BEYOND, floor, top))
-        return replace(ground, floor=floor, terrain=tuple(boxes))
+        if self.kind == "gap":
+            floor = -DEPTH
+            near_block = self._box(-BEHIND, self.edge, floor, 0.0)
+            far_block = self._box(self.far, self.far + BEYOND, floor, 0.0)
+            terrain: tuple[Box, ...] = (near_block, far_block)
+        elif self.kind == "up":
+            floor = 0.0
+            terrain = (self._box(self.far, self.far + BEYOND, floor, self.size),)
+        else:
+            floor = -self.size
+            terrain = (self._box(-BEHIND, self.edge, floor, 0.0),)
+        return replace(ground, floor=floor, terrain=terrain)
 
     def _box(self, begin: float, end: float, low: float, high: float) -> Box:
-        """A block between two places of the course and two heights."""
-        along = direction(self.command)
-        x, y = (0.5 * (begin + end) * along).tolist()
-        a, b = np.where(along != 0.0, 0.5 * (end - begin), WIDE).tolist()
-        return Box(center=(x, y, 0.5 * (low + high)), half_size=(a, b, 0.5 * (high - low)))
+        """Return a block between two places of the course and two heights [m]."""
+        way = direction(self.command)
+        x, y = (0.5 * (begin + end) * way).tolist()
+        half_x, half_y = np.where(way != 0.0, 0.5 * (end - begin), WIDE).tolist()
+        return Box(
+            center=(x, y, 0.5 * (low + high)), half_size=(half_x, half_y, 0.5 * (high - low))
+        )
 
 
 def direction(command: Velocity) -> Array:
-    """Unit vector in the plane of a command straight forward, back or to a side. (2,)."""
+    """Return the unit vector of a command straight forward, back or to a side. (2,)."""
     forward, left, _ = command
     if bool(forward) == bool(left):
         raise PronkError(
@@ -130,13 +156,13 @@ def direction(command: Velocity) -> Array:
 
 
 @dataclass
-class Operator:
+class CourseOperator:
     """The command over time: run, and jump when the trunk is at `trigger_at`."""
 
     script: Script
     trigger_at: float
-    """Along the course [m]."""
-    where: Callable[[], float]
+    """Place of the trunk at which the jump is commanded, along the course [m]."""
+    trunk_place: Callable[[], float]
     """Returns the trunk's place along the course [m]."""
     triggered: float | None = None
     """When the jump input rose, since the policy took over [s]."""
@@ -146,13 +172,13 @@ class Operator:
         script = self.script
         if t < script.stand_s:
             return STILL, False
-        if self.triggered is None and self.where() >= self.trigger_at:
+        if self.triggered is None and self.trunk_place() >= self.trigger_at:
             self.triggered = t
         if self.triggered is None:
             return script.command, False
         since = t - self.triggered
-        moving = since < script.jump_s + script.keep_s
-        return (script.command if moving else STILL), since < script.jump_s
+        is_moving = since < script.jump_s + script.keep_s
+        return (script.command if is_moving else STILL), since < script.jump_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,113 +186,185 @@ class CrossingFigures:
     """One run at an obstacle."""
 
     obstacle: str = "flat"
-    """Its kind; `flat` for practice."""
+    """Kind of the obstacle; `flat` for practice."""
     why: str = ""
-    """Empty if it was crossed, else the first condition that was not met."""
-    size: float = number("m", "width of the gap, height of the step")
-    lead: float = number("m", "from the trunk to the edge when the jump input rises")
-    take_off: float = number("m", "from the front-most last foothold before the flight to the edge")
-    landing: float = number("m", "from the far edge to the hind-most first foothold behind it")
-    reach: float = number("m", "from the trunk at the jump input to the front-most last foothold")
-    speed: float = number("m/s", "along the course at the jump input")
+    """First condition that was not met; empty if the obstacle was crossed."""
+    size: float = figure("m", "width of the gap, height of the step")
+    lead: float = figure("m", "from the trunk to the edge when the jump input rises")
+    take_off: float = figure("m", "from the front-most last foothold before the flight to the edge")
+    landing: float = figure("m", "from the far edge to the hind-most first foothold behind it")
+    reach: float = figure("m", "from the trunk at the jump input to the front-most last foothold")
+    speed: float = figure("m/s", "along the course at the jump input")
+
+    @property
+    def standing(self) -> bool:
+        """Whether there was a run to measure, which is always so."""
+        return True
+
+    @property
+    def found(self) -> bool:
+        """Whether there was a run to measure, which is always so."""
+        return True
 
     @property
     def success(self) -> bool:
-        """The obstacle was crossed."""
+        """Whether the obstacle was crossed."""
         return not self.why
 
+    @property
+    def fell(self) -> bool:
+        """Whether the robot was not upright at the end."""
+        return self.why == FELL
 
-CROSSING = extra_kind("crossing", figures=CrossingFigures)
+    @property
+    def non_foot_contact(self) -> bool:
+        """Whether something but a foot touched the ground."""
+        return self.why == NON_FOOT_CONTACT
 
 
-def lost(seen: Capture, obstacle: Obstacle) -> bool:
-    """Whether a run has failed already: a sample leans too far, or a foot stepped in."""
-    fallen = cosine_of_tilt(seen.orientation) < FALLEN_COSINE
-    return bool(fallen.any() or _stepped_in(seen, obstacle).any())
+CROSSING = study_kind("crossing", CrossingFigures, measure_jump)
+
+
+def is_lost(capture: Capture, obstacle: Obstacle) -> bool:
+    """Return whether a run has failed already: a sample leans too far, or a foot stepped in."""
+    fallen = cosine_of_tilt(capture.orientation) < FALLEN_COSINE
+    return bool(fallen.any() or _stepped_in(capture, obstacle).any())
 
 
 def measure_crossing(
-    seen: Capture, obstacle: Obstacle, lead: float, *, triggered: float | None, rules: JumpRules
+    capture: Capture,
+    obstacle: Obstacle,
+    lead: float,
+    *,
+    triggered: float | None,
+    rules: JumpRules,
 ) -> CrossingFigures:
     """Measure one run at an obstacle.
 
-    `triggered` is when the jump input rose, on the capture's clock [s]; None for never.
+    Args:
+        capture: The recorded motion.
+        obstacle: What was to be crossed.
+        lead: Distance from the trunk to the edge at which the jump was commanded [m].
+        triggered: When the jump input rose, on the capture's clock [s]; None for never.
+        rules: Times and heights of the definitions.
     """
-    figures: dict[str, Any] = {"obstacle": obstacle.kind, "size": obstacle.size, "lead": lead}
     if triggered is None:
-        return CrossingFigures(why=NOT_TRIGGERED, **figures)
-    along, count, far = direction(obstacle.command), len(seen.time), obstacle.far
-    on = min(sample_at(seen, triggered), count - 1)
-    feet, trunk = seen.foot_position[:, :, :2] @ along, seen.position[:, :2] @ along
-    behind = seen.contact & (feet >= far)
-    first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
-    landed, legs = int(first.max()), np.arange(feet.shape[1])
-    settled = landed + round(rules.upright_s / seen.dt)
-    figures["speed"] = float(seen.velocity[on, :2] @ along)
-    main = jump_flights(seen, on, rules, count).main
+        return CrossingFigures(
+            obstacle=obstacle.kind, size=obstacle.size, lead=lead, why=NOT_TRIGGERED
+        )
+    way = direction(obstacle.command)
+    count = len(capture.time)
+    on = min(sample_at(capture, triggered), count - 1)
+    foot_place = capture.foot_position[:, :, :2] @ way
+    trunk_place = capture.position[:, :2] @ way
+    legs = np.arange(foot_place.shape[1])
+    # The first sample from the jump input on at which each foot stands behind the far edge.
+    behind = capture.contact & (foot_place >= obstacle.far)
+    touched = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
+    landed = int(touched.max())
+    reach = math.nan
+    take_off = math.nan
+    main = jump_flights(capture, on, rules, count).main
     if main is not None:
-        before = seen.contact[: main.liftoff]
-        stood = feet[main.liftoff - 1 - before[::-1].argmax(axis=0), legs]
-        front = float(np.where(before.any(axis=0), stood, -np.inf).max())
-        figures["reach"] = front - float(trunk[on])
+        before = capture.contact[: main.liftoff]
+        last_stance = main.liftoff - 1 - before[::-1].argmax(axis=0)
+        stood = np.where(before.any(axis=0), foot_place[last_stance, legs], -np.inf)
+        front = float(stood.max())
+        reach = front - float(trunk_place[on])
         if obstacle.kind != "flat":
-            figures["take_off"] = obstacle.edge - front
+            take_off = obstacle.edge - front
+    landing = math.nan
     if landed < count and obstacle.kind != "flat":
-        figures["landing"] = float(feet[first, legs].min()) - far
-    end, cosine = min(settled + 1, count), cosine_of_tilt(seen.orientation)
-    upright = settled < count and cosine[settled] >= rules.upright_cosine
-    why = ""
-    if _stepped_in(seen, obstacle)[:end].any():
-        why = STEPPED_IN
-    elif seen.other_contact[on:end].any():
-        why = NON_FOOT_CONTACT
-    elif landed >= count:
-        why = NOT_OVER
-    elif not upright or (cosine[:end] < FALLEN_COSINE).any():
-        why = FELL
-    elif min(trunk[settled], feet[settled].min()) < far:
-        why = NOT_OVER
-    return CrossingFigures(why=why, **figures)
+        landing = float(foot_place[touched, legs].min()) - obstacle.far
+    return CrossingFigures(
+        obstacle=obstacle.kind,
+        size=obstacle.size,
+        lead=lead,
+        why=_why_not_crossed(capture, obstacle, on=on, landed=landed, rules=rules),
+        take_off=take_off,
+        landing=landing,
+        reach=reach,
+        speed=float(capture.velocity[on, :2] @ way),
+    )
 
 
-def _stepped_in(seen: Capture, obstacle: Obstacle) -> Mask:
-    """Samples with the centre of a foot below the floor between the edges of a gap. (T,)."""
-    feet = seen.foot_position[:, :, :2] @ direction(obstacle.command)
-    between = (feet > obstacle.edge) & (feet < obstacle.far)  # empty but for a gap
-    return np.asarray((between & (seen.foot_position[:, :, 2] < 0.0)).any(axis=1))
+def _why_not_crossed(
+    capture: Capture, obstacle: Obstacle, *, on: int, landed: int, rules: JumpRules
+) -> str:
+    """Return the first condition that was not met; empty if the obstacle was crossed.
+
+    Args:
+        capture: The recorded motion.
+        obstacle: What was to be crossed.
+        on: Sample at which the jump input rose.
+        landed: Sample from which on every foot has stood behind the far edge.
+        rules: Times and heights of the definitions.
+    """
+    way = direction(obstacle.command)
+    count = len(capture.time)
+    settled = landed + round(rules.upright_s / capture.dt)
+    end = min(settled + 1, count)
+    cosine = cosine_of_tilt(capture.orientation)
+    if _stepped_in(capture, obstacle)[:end].any():
+        return STEPPED_IN
+    if capture.other_contact[on:end].any():
+        return NON_FOOT_CONTACT
+    if landed >= count:
+        return NOT_OVER
+    is_upright = settled < count and cosine[settled] >= rules.upright_cosine
+    if not is_upright or (cosine[:end] < FALLEN_COSINE).any():
+        return FELL
+    hindmost_foot = float((capture.foot_position[settled, :, :2] @ way).min())
+    trunk = float(capture.position[settled, :2] @ way)
+    if min(trunk, hindmost_foot) < obstacle.far:
+        return NOT_OVER
+    return ""
+
+
+def _stepped_in(capture: Capture, obstacle: Obstacle) -> Mask:
+    """Return the samples with a foot's centre below the floor between the edges of a gap. (T,)."""
+    foot_place = capture.foot_position[:, :, :2] @ direction(obstacle.command)
+    between = (foot_place > obstacle.edge) & (foot_place < obstacle.far)  # empty but for a gap
+    return np.asarray((between & (capture.foot_position[:, :, 2] < 0.0)).any(axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attempt(Job):
+class Attempt(TrialJob):
     """One run at an obstacle; the row's script has `stand_s`, `jump_s` and `keep_s`."""
 
     obstacle: Obstacle
     lead: float
-    """From the trunk to it when the jump input rises [m]."""
+    """Distance from the trunk to it when the jump input rises [m]."""
 
 
-def attempt(task: Attempt) -> Row:
+def run_attempt(attempt: Attempt) -> TrialRun:
     """Run once at an obstacle and measure it."""
-    script, obstacle, robot = task.row.script, task.obstacle, task.setup.robot
-    along, machine, rules = direction(script.command), task.set_down(), JumpRules.of(robot)
-    operator = Operator(
+    script = attempt.row.script
+    obstacle = attempt.obstacle
+    robot = attempt.setup.robot
+    rules = JumpRules.of(robot)
+    way = direction(script.command)
+    machine = attempt.set_down()
+    operator = CourseOperator(
         script,
-        trigger_at=obstacle.edge - task.lead,
-        where=lambda: float(machine.snapshot().position[0, :2] @ along),
+        trigger_at=obstacle.edge - attempt.lead,
+        trunk_place=lambda: float(machine.snapshot().position[0, :2] @ way),
     )
     # Time to lift off, to fly and land on all feet, and to stand.
-    after = rules.search_s + 1.0 + rules.upright_s
-    late, began = script.stand_s + LATE * (RUN_UP_S + PHASE_S), machine.now()
-    for since in ticks(machine, task.policy(), robot, operator):
+    after_jump_s = rules.search_s + 1.0 + rules.upright_s
+    latest_s = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
+    began = machine.now()
+    for since in ticks(machine, attempt.policy(), robot, operator):
         if operator.triggered is None:
-            if since > late:
+            if since > latest_s:
                 break
-        elif since > operator.triggered + after or lost(machine.snapshot(), obstacle):
+        elif since > operator.triggered + after_jump_s or is_lost(machine.snapshot(), obstacle):
             break
     triggered = None if operator.triggered is None else began + operator.triggered
-    how: Any = {"triggered": triggered, "rules": rules}
-    figures = measure_crossing(machine.capture(), obstacle, task.lead, **how)
-    return replace(task.row, figures=figures)
+    figures = measure_crossing(
+        machine.capture(), obstacle, attempt.lead, triggered=triggered, rules=rules
+    )
+    return replace(attempt.row, figures=figures)
 
 
 # ---- many runs ----
@@ -279,10 +377,15 @@ class Ladder(NamedTuple):
     leads: tuple[float, ...]
 
 
+def _sizes(first_cm: int, step_cm: int) -> tuple[float, ...]:
+    """Return sizes up to 1.5 m [m]."""
+    return tuple(cm / 100 for cm in range(first_cm, 151, step_cm))
+
+
 LADDERS: Mapping[Shape, Ladder] = {
-    "gap": Ladder(tuple(cm / 100 for cm in range(10, 151, 5)), (0.04, 0.09, 0.14)),
-    "up": Ladder(tuple(cm / 100 for cm in range(5, 151, 5)), (0.05, 0.15, 0.25)),
-    "down": Ladder(tuple(cm / 100 for cm in range(10, 151, 10)), (0.0, 0.1)),
+    "gap": Ladder(_sizes(10, 5), (0.04, 0.09, 0.14)),
+    "up": Ladder(_sizes(5, 5), (0.05, 0.15, 0.25)),
+    "down": Ladder(_sizes(10, 10), (0.0, 0.1)),
 }
 
 
@@ -292,120 +395,200 @@ class CrossingPlan:
 
     cases: tuple[Case, ...] = named("forward 2", "back 2", "side +1", "side -1")
     ladders: Mapping[Shape, Ladder] = field(default_factory=lambda: dict(LADDERS))
+    """Sizes and leads by kind of obstacle."""
     runs: int = 5
-    """For each size and lead."""
+    """Number of runs for each size and lead."""
     enough: int = 4
-    """Of them must cross."""
+    """Number of them that must cross."""
     practice: int = 8
-    """Jumps on flat ground with each command."""
+    """Number of jumps on flat ground with each command."""
     seed: int = 0
+    """Seed of all draws."""
     script: Script = field(default_factory=lambda: Script(command=STILL))
-    """Times `stand_s`, `jump_s` and `keep_s`."""
+    """Times of every run: `stand_s`, `jump_s` and `keep_s`."""
 
 
-def search(
-    subjects: Sequence[Subject],
+@dataclass(frozen=True, kw_only=True)
+class _OpenClimb:
+    """A ladder that one policy still climbs with one command."""
+
+    subject: TriedPolicy
+    case: Case
+    kind: Shape
+    reach: float
+    """Mean reach of practice [m]."""
+
+
+def climb_ladders(
+    subjects: Sequence[TriedPolicy],
     plan: CrossingPlan,
-    setup: Setup,
+    setup: TrialSetup,
     *,
-    run: Callable[[list[Attempt]], list[Row]],
-) -> list[Row]:
-    """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
-    robot, params = setup.robot, setup.sim_params
+    run: Callable[[list[Attempt]], list[TrialRun]],
+) -> list[TrialRun]:
+    """Practise, then climb all ladders at once, a size of each in every round.
 
-    def attempts(
-        subject: Subject, case: Case, kind: Shape, size: float, lead: float, runs: int
-    ) -> Iterator[Attempt]:
-        """Plan runs at one obstacle; their starts are alike for all obstacles and leads."""
-        speed = math.hypot(*case.command[:2])
-        obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
-        script = replace(plan.script, command=case.command)
-        for count in range(runs):
-            rng = case_rng(plan.seed, case, count)
-            x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
-            offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
-            yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
-            row = Row(policy=subject.name, case=case.name, number=count, seed=seed, script=script)
-            yield Attempt(
+    Args:
+        subjects: The policies.
+        plan: Commands, sizes and runs.
+        setup: What the runs are on.
+        run: Runs the attempts of one round.
+
+    Returns:
+        All runs, those of practice first.
+    """
+    practice: list[Attempt] = []
+    for subject in subjects:
+        for case in plan.cases:
+            practice += _plan_attempts(
+                subject, case, plan, setup, kind="flat", size=0.0, lead=0.0, runs=plan.practice
+            )
+    rows = run(practice)
+    climbing: list[_OpenClimb] = []
+    for subject in subjects:
+        for case in plan.cases:
+            reaches = []
+            for row in rows:
+                is_its_own = row.policy == subject.name and row.case == case.name
+                if is_its_own and math.isfinite(row.figures.reach):
+                    reaches.append(row.figures.reach)
+            # Without a jump there is nothing to cross.
+            if reaches:
+                for kind in plan.ladders:
+                    climbing.append(
+                        _OpenClimb(
+                            subject=subject, case=case, kind=kind, reach=float(np.mean(reaches))
+                        )
+                    )
+    for rung in itertools.count():
+        climbing = [climb for climb in climbing if rung < len(plan.ladders[climb.kind].sizes)]
+        if not climbing:
+            break
+        attempts: list[Attempt] = []
+        for climb in climbing:
+            sizes, leads = plan.ladders[climb.kind]
+            for beyond in leads:
+                attempts += _plan_attempts(
+                    climb.subject,
+                    climb.case,
+                    plan,
+                    setup,
+                    kind=climb.kind,
+                    size=sizes[rung],
+                    lead=round(climb.reach + beyond, 4),
+                    runs=plan.runs,
+                )
+        round_rows = run(attempts)
+        rows += round_rows
+        still_climbing = []
+        for climb in climbing:
+            climb_rows = []
+            for row in round_rows:
+                if (row.policy, row.case, row.figures.obstacle) == (
+                    climb.subject.name,
+                    climb.case.name,
+                    climb.kind,
+                ):
+                    climb_rows.append(row)
+            if rung_of(climb_rows).crossed >= plan.enough:
+                still_climbing.append(climb)
+        climbing = still_climbing
+    return rows
+
+
+def _plan_attempts(
+    subject: TriedPolicy,
+    case: Case,
+    plan: CrossingPlan,
+    setup: TrialSetup,
+    *,
+    kind: Shape,
+    size: float,
+    lead: float,
+    runs: int,
+) -> list[Attempt]:
+    """Plan runs at one obstacle; their starts are alike for all obstacles and leads."""
+    speed = math.hypot(*case.command[:2])
+    obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
+    ground = obstacle.on(setup.sim_params.ground)
+    course_setup = replace(setup, sim_params=replace(setup.sim_params, ground=ground))
+    attempts = []
+    for number in range(runs):
+        rng = case_rng(plan.seed, case, number)
+        x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
+        offset = rng.uniform(-OFFSET, OFFSET, len(setup.robot.joints))
+        yaw = float(rng.uniform(-STEERED, STEERED))
+        row = TrialRun(
+            policy=subject.name,
+            case=case.name,
+            number=number,
+            seed=int(rng.integers(2**31)),
+            script=replace(plan.script, command=case.command),
+        )
+        attempts.append(
+            Attempt(
                 row=row,
                 subject=subject,
                 kind=CROSSING,
-                setup=replace(setup, sim_params=replace(params, ground=obstacle.on(params.ground))),
+                setup=course_setup,
                 start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
                 obstacle=obstacle,
                 lead=lead,
             )
-
-    pairs = list(itertools.product(subjects, plan.cases))
-    flat = (attempts(*pair, "flat", 0.0, 0.0, plan.practice) for pair in pairs)
-    rows = run([task for tasks in flat for task in tasks])
-    climbing: list[tuple[Subject, Case, Shape, float]] = []
-    for subject, case in pairs:
-        names = (subject.name, case.name)
-        own = [row.figures.reach for row in rows if (row.policy, row.case) == names]
-        if known := list(filter(math.isfinite, own)):  # without a jump there is nothing to cross
-            climbing += [(subject, case, kind, float(np.mean(known))) for kind in plan.ladders]
-    for rung in itertools.count():
-        climbing = [one for one in climbing if rung < len(plan.ladders[one[2]].sizes)]
-        if not climbing:
-            break
-        steps: list[Attempt] = []
-        for subject, case, kind, reach in climbing:
-            sizes, leads = plan.ladders[kind]
-            for lead in (round(reach + beyond, 4) for beyond in leads):
-                steps += attempts(subject, case, kind, sizes[rung], lead, plan.runs)
-        found = run(steps)
-        rows += found
-        tried: dict[tuple[str, str, str], list[Row]] = {}
-        for row in found:
-            tried.setdefault((row.policy, row.case, row.figures.obstacle), []).append(row)
-        climbing = [
-            (subject, case, kind, reach)
-            for subject, case, kind, reach in climbing
-            if rung_of(tried[subject.name, case.name, kind]).crossed >= plan.enough
-        ]
-    return rows
+        )
+    return attempts
 
 
 def add_crossings(
     policies: Sequence[Path],
     plan: CrossingPlan,
-    setup: Setup,
+    setup: TrialSetup,
     *,
     progress: Callable[[float], None] = lambda share: None,
-) -> Results:
+) -> TrialResults:
     """Let policies cross gaps and steps; write `crossing.csv` and `crossing.json`.
 
-    Arguments and errors as of `run_trial`; the progress is an estimate.
+    Args:
+        policies: Files of the policies.
+        plan: Commands, sizes and runs.
+        setup: What the runs are on.
+        progress: Called with an estimate of the share that is done, 0 to 1.
+
+    Raises:
+        PronkError: A policy or parameter is impossible; nothing was run then.
     """
-    begun, rounds = time.perf_counter(), itertools.count()
+    begun = time.perf_counter()
     subjects = load_subjects(policies, setup.robot)
+    rounds = itertools.count()
 
-    def run(tasks: list[Attempt]) -> list[Row]:
-        """Run one round; about five more follow each."""
-        tasks[0].build()  # refuses impossible parameters
+    def run(attempts: list[Attempt]) -> list[TrialRun]:
+        """Run one round."""
+        attempts[0].build()  # refuses impossible parameters
         done = next(rounds)
-        return in_processes(
-            attempt,
-            tasks,
-            processes=setup.processes,
-            progress=lambda part: progress((done + part) / (done + part + 5.0)),
-        )
 
-    rows = search(subjects, plan, setup, run=run)
+        def report(share: float) -> None:
+            progress((done + share) / (done + share + ROUNDS_LEFT))
+
+        return in_processes(run_attempt, attempts, processes=setup.processes, progress=report)
+
+    rows = climb_ladders(subjects, plan, setup, run=run)
     progress(1.0)
-    return finished(
-        CROSSING,
-        subjects,
-        rows,
-        setup,
+    results = TrialResults(
+        kind=CROSSING,
+        rows=tuple(rows),
+        robot=setup.robot.name,
+        subjects=subjects,
         cases=plan.cases,
         seed=plan.seed,
+        sim_params=setup.about,
         script=plan.script,
         rules=asdict(JumpRules.of(setup.robot)),
         settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
+        versions=software_versions(),
         timing={"seconds": time.perf_counter() - begun},
     )
+    save_results(setup.out, results)
+    return results
 
 
 # ---- sums ----
@@ -417,8 +600,9 @@ class Rung(NamedTuple):
     size: float
     lead: float
     crossed: int
+    """Number of runs that crossed with that lead."""
     runs: int
-    """With that lead."""
+    """Number of runs with that lead."""
     reasons: Mapping[str, int]
     """Why the others were not crossed, with all leads."""
 
@@ -436,33 +620,63 @@ class Climb(NamedTuple):
     """Largest size crossed in any run; 0 for none [m]."""
 
 
-def rung_of(rows: Sequence[Row]) -> Rung:
+def rung_of(rows: Sequence[TrialRun]) -> Rung:
     """Sum up the runs at obstacles of one size, with any lead."""
-    figures = [row.figures for row in rows]
-    leads = sorted({each.lead for each in figures})
-    counts = {lead: sum(each.success for each in figures if each.lead == lead) for lead in leads}
+    crossed: Counter[float] = Counter()
+    runs: Counter[float] = Counter()
+    reasons: Counter[str] = Counter()
+    for row in rows:
+        runs[row.figures.lead] += 1
+        if row.figures.success:
+            crossed[row.figures.lead] += 1
+        else:
+            reasons[row.figures.why] += 1
     # With equal counts the shorter lead: the one nearer to the edge.
-    best = max(leads, key=lambda lead: (counts[lead], -lead))
+    best = max(sorted(runs), key=lambda lead: (crossed[lead], -lead))
     return Rung(
-        size=figures[0].size,
+        size=rows[0].figures.size,
         lead=best,
-        crossed=counts[best],
-        runs=sum(each.lead == best for each in figures),
-        reasons=Counter(each.why for each in figures if each.why),
+        crossed=crossed[best],
+        runs=runs[best],
+        reasons=reasons,
     )
 
 
-def climbs(results: Results) -> tuple[Climb, ...]:
+def climbs(results: TrialResults) -> tuple[Climb, ...]:
     """Sum up every policy with every command and kind of obstacle."""
-    found = []
-    tried = itertools.product(results.subjects, results.cases, results.settings["kinds"])
-    for subject, case, kind in tried:
-        rows = results.of(subject.name, case.name)
-        own = [row for row in rows if row.figures.obstacle == kind]
-        sizes = sorted({row.figures.size for row in own})
-        rungs = [rung_of([row for row in own if row.figures.size == size]) for size in sizes]
-        crossed = itertools.takewhile(lambda r: r.crossed >= results.settings["enough"], rungs)
-        largest = max((rung.size for rung in crossed), default=0.0)
-        ever = max((row.figures.size for row in own if row.figures.success), default=0.0)
-        found.append(Climb(subject.name, case.name, kind, tuple(rungs), largest, ever))
-    return tuple(found)
+    summed_climbs = []
+    for subject in results.subjects:
+        for case in results.cases:
+            rows = results.of(subject.name, case.name)
+            for kind in results.settings["kinds"]:
+                obstacle_rows = [row for row in rows if row.figures.obstacle == kind]
+                summed_climbs.append(
+                    _sum_up_climb(
+                        subject.name, case.name, kind, obstacle_rows, results.settings["enough"]
+                    )
+                )
+    return tuple(summed_climbs)
+
+
+def _sum_up_climb(
+    policy: str, case: str, kind: str, rows: Sequence[TrialRun], enough: int
+) -> Climb:
+    """Sum up all sizes of one kind of obstacle."""
+    rungs = []
+    largest = 0.0
+    is_unbroken = True
+    for size in sorted({row.figures.size for row in rows}):
+        rung = rung_of([row for row in rows if row.figures.size == size])
+        rungs.append(rung)
+        is_unbroken = is_unbroken and rung.crossed >= enough
+        if is_unbroken:
+            largest = rung.size
+    crossed_sizes = [row.figures.size for row in rows if row.figures.success]
+    return Climb(
+        policy=policy,
+        case=case,
+        kind=kind,
+        rungs=tuple(rungs),
+        largest=largest,
+        ever=max(crossed_sizes, default=0.0),
+    )

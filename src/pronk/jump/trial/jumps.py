@@ -24,22 +24,22 @@ import numpy as np
 from pronk.arrays import Array, Mask
 from pronk.jump.virtual.capture import Capture
 from pronk.policy.script import Script
-from pronk.robots import motor as drive
 from pronk.robots.legged import legged
+from pronk.robots.motor import torque_limits
 from pronk.robots.robot import RobotSpec
 
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Acceleration of free fall [m/s^2]."""
 RISE = 0.03
-"""Over standing height; a flight in which the trunk goes higher is a jump, commanded or not [m]."""
+"""Height over standing height that the trunk exceeds in a jump, commanded or not [m]."""
 FALLEN_COSINE = 0.34
-"""A trunk that leans further (70 degrees) has fallen, as in training."""
+"""Cosine of the tilt, 70 degrees, beyond which the robot has fallen, as in training [1]."""
 FALLEN_HEIGHT = 0.08
-"""A trunk that is lower lies on the ground, as in training [m]."""
+"""Height of the trunk below which the robot has fallen, as in training [m]."""
 AVERAGE_S = 0.01
-"""Over which joint speeds are averaged [s]."""
+"""Time over which joint speeds are averaged: links ring on their belts at 100 Hz and more [s]."""
 SETTLE_S = 1.0
-"""Time to reach the commanded speed, left out of the figures of the run [s]."""
+"""Time to reach the commanded speed, left out of the figures of the approach [s]."""
 SYMBOLS = (
     "c: the jump input rises. l, d: lift-off and touchdown of the main flight, the longest in "
     "which the trunk rises more than 3 cm over standing. e: d + 0.5 s. p, z, v: position, height "
@@ -50,40 +50,40 @@ SYMBOLS = (
 
 @dataclass(frozen=True, kw_only=True)
 class JumpRules:
-    """Times [s] and heights [m] of the definitions."""
+    """Times and heights that the definitions use."""
 
     flight_s: float = 0.015
-    """Shortest flight phase: three physics steps of training."""
+    """Shortest flight phase, three physics steps of training [s]."""
     long_s: float = 0.06
-    """Shortest high flight; a ballistic hop of this length rises 4 mm."""
+    """Shortest high flight; a ballistic hop of this length rises 4 mm [s]."""
     search_s: float = 1.5
-    """A jump lifts off within this time after its command."""
+    """Time after the jump input within which a jump lifts off [s]."""
     tail_s: float = 0.5
-    """Time after touchdown that still belongs to the height."""
+    """Time after touchdown that still belongs to the height [s]."""
     upright_s: float = 2.0
-    """Time after touchdown at which the robot must be upright."""
+    """Time after touchdown at which the robot must be upright [s]."""
     tilt_deg: float = 30.0
     """Largest tilt of an upright robot [deg]."""
     grace_s: float = 0.5
-    """Time after the start in which flights are not counted: the robot is set down."""
+    """Time after the start in which flights are not counted, as the robot is set down [s]."""
     standing_height: float
-    """Of the trunk, in the default pose."""
+    """Height of the trunk in the default pose [m]."""
     rise: float = RISE
-    """Over standing height, what a high flight exceeds."""
+    """Height over standing height that a high flight exceeds [m]."""
 
     @classmethod
     def of(cls, robot: RobotSpec, **times: float) -> Self:
-        """Return the rules with the standing height of a robot."""
+        """Return the rules with the standing height of a robot; `times` replace their defaults."""
         return cls(standing_height=legged(robot.source).standing_height, **times)
 
     @property
     def high(self) -> float:
-        """Trunk height that a high flight exceeds [m]."""
+        """Height of the trunk that a high flight exceeds [m]."""
         return self.standing_height + self.rise
 
     @property
     def upright_cosine(self) -> float:
-        """Cosine of the largest tilt of an upright robot."""
+        """Cosine of the largest tilt of an upright robot [1]."""
         return math.cos(math.radians(self.tilt_deg))
 
 
@@ -91,22 +91,46 @@ class JumpRules:
 
 
 def heading(orientation: Array) -> Array:
-    """Yaw of unit quaternions w, x, y, z [rad]: atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)). (...,)."""
+    """Return the yaw of unit quaternions [rad].
+
+    It is atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)).
+
+    Args:
+        orientation: Unit quaternions w, x, y, z. (..., 4)
+
+    Returns:
+        The yaw angles. (...,)
+    """
     w, x, y, z = np.moveaxis(np.asarray(orientation), -1, 0)
     yaw: Array = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return yaw
 
 
 def cosine_of_tilt(orientation: Array) -> Array:
-    """Vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2), of quaternions w, x, y, z. (...,)."""
-    cosine: Array = 1.0 - 2.0 * (orientation[..., 1] ** 2 + orientation[..., 2] ** 2)
+    """Return the vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2).
+
+    Args:
+        orientation: Unit quaternions w, x, y, z. (..., 4)
+
+    Returns:
+        The cosines. (...,)
+    """
+    x = orientation[..., 1]
+    y = orientation[..., 2]
+    cosine: Array = 1.0 - 2.0 * (x**2 + y**2)
     return cosine
 
 
 def along(vector: Array, orientation: Array, command: Sequence[float]) -> Array:
-    """Parts of horizontal vectors (..., 2 or more) along the commanded direction. (...,).
+    """Return the parts of horizontal vectors along the commanded direction.
 
-    `vector` is in the world, `orientation` the trunk's, `command` a velocity in the trunk's frame.
+    Args:
+        vector: Vectors in the world; their first two parts count. (..., 2 or more)
+        orientation: The trunk's, unit quaternions w, x, y, z. (..., 4)
+        command: Forward and left velocity in the trunk's frame.
+
+    Returns:
+        The parts, in the unit of the vectors. (...,)
     """
     direction = heading(orientation) + math.atan2(command[1], command[0])
     part: Array = vector[..., 0] * np.cos(direction) + vector[..., 1] * np.sin(direction)
@@ -114,19 +138,19 @@ def along(vector: Array, orientation: Array, command: Sequence[float]) -> Array:
 
 
 def steps(capture: Capture, seconds: float) -> int:
-    """Samples in a time, to the nearest."""
+    """Return the number of samples in a time, to the nearest."""
     return round(seconds / capture.dt)
 
 
 def sample_at(capture: Capture, time: float) -> int:
-    """First sample at or after a time on the capture's clock [s]."""
+    """Return the first sample at or after a time on the capture's clock [s]."""
     return int(np.searchsorted(capture.time, time - 1e-3 * capture.dt))
 
 
 def fallen_at(capture: Capture) -> int:
-    """First sample at which the robot lies or leans too far; the sample count if it never does.
+    """Return the first sample at which the robot has fallen; the sample count if it never has.
 
-    A robot whose motion is not finite has fallen.
+    A robot has fallen that lies or leans too far, or whose motion is not finite.
     """
     upright = cosine_of_tilt(capture.orientation) >= FALLEN_COSINE
     fallen = ~(upright & (capture.position[:, 2] >= FALLEN_HEIGHT))
@@ -149,54 +173,80 @@ class Flight(NamedTuple):
 
 
 class JumpFlights(NamedTuple):
-    """The flight phases of one jump input, the high ones of them, and all others."""
+    """The flight phases of a capture, by whether they belong to one jump input."""
 
-    all: tuple[Flight, ...]
+    commanded: tuple[Flight, ...]
+    """Flights that lift off within the search time after the jump input."""
     high: tuple[Flight, ...]
+    """High flights among the commanded ones."""
     uncommanded: tuple[Flight, ...]
+    """All other flights."""
 
     @property
     def main(self) -> Flight | None:
-        """The longest of the high ones; None if there was no jump."""
-        return max(self.high, key=lambda phase: phase.samples, default=None)
+        """The longest of the high flights; None if there was no jump."""
+        return max(self.high, key=lambda flight: flight.samples, default=None)
 
 
 def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
-    """Return the flight phases of `least` samples or more that have ended, in their order.
+    """Return the flight phases of some length that have ended, in their order.
 
-    `contact`: feet on the ground. (T, 4)
+    Args:
+        contact: Feet on the ground. (T, 4)
+        least: Shortest flight phase in samples.
     """
     airborne = ~np.asarray(contact, dtype=bool).any(axis=-1)
     edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0)).tolist()
-    pairs = zip(edges[0::2], edges[1::2], strict=False)
-    return tuple(Flight(begin, end) for begin, end in pairs if end - begin >= least)
+    phases = []
+    # A flight that has not ended has an edge without a partner.
+    for liftoff, touchdown in zip(edges[0::2], edges[1::2], strict=False):
+        if touchdown - liftoff >= least:
+            phases.append(Flight(liftoff, touchdown))
+    return tuple(phases)
 
 
 def jump_flights(capture: Capture, on: int | None, rules: JumpRules, end: int) -> JumpFlights:
-    """Sort the flight phases by whether they belong to the jump input that rises at sample `on`.
+    """Sort the flight phases by whether they belong to a jump input.
 
-    Samples from `end` on are left out.
+    Args:
+        capture: The recorded motion.
+        on: First sample with the jump input; None without one.
+        rules: Times and heights of the definitions.
+        end: First sample that is left out.
     """
-    z = capture.position[:, 2]
-    phases = flights(capture.contact[:end], least=steps(capture, rules.flight_s))
-    last = -1 if on is None else on + steps(capture, rules.search_s)
-    own = tuple(phase for phase in phases if on is not None and on <= phase.liftoff <= last)
-    long = (phase for phase in own if phase.samples >= steps(capture, rules.long_s))
-    high = tuple(phase for phase in long if z[slice(*phase)].max() > rules.high)
-    return JumpFlights(own, high, tuple(phase for phase in phases if phase not in own))
+    height = capture.position[:, 2]
+    latest = -1 if on is None else on + steps(capture, rules.search_s)
+    commanded = []
+    high = []
+    uncommanded = []
+    for flight in flights(capture.contact[:end], least=steps(capture, rules.flight_s)):
+        if on is None or not on <= flight.liftoff <= latest:
+            uncommanded.append(flight)
+            continue
+        commanded.append(flight)
+        top = height[flight.liftoff : flight.touchdown].max()
+        if flight.samples >= steps(capture, rules.long_s) and top > rules.high:
+            high.append(flight)
+    return JumpFlights(tuple(commanded), tuple(high), tuple(uncommanded))
 
 
 def uncommanded_height(capture: Capture, on: int | None, rules: JumpRules) -> float:
-    """Highest trunk in a flight phase that belongs to no jump input [m]; NaN without one.
+    """Return the highest trunk in a flight phase that belongs to no jump input [m].
 
-    `on` is the first sample with the jump input, None for a robot that only walks.
+    Args:
+        capture: The recorded motion.
+        on: First sample with the jump input; None for a robot that only walks.
+        rules: Times and heights of the definitions.
+
+    Returns:
+        The height over the floor; NaN without such a flight.
     """
-    tops = [
-        capture.position[slice(*phase), 2].max()
-        for phase in jump_flights(capture, on, rules, fallen_at(capture)).uncommanded
-        if phase.liftoff >= steps(capture, rules.grace_s)
-    ]
-    return float(max(tops, default=math.nan))
+    highest = math.nan
+    for flight in jump_flights(capture, on, rules, fallen_at(capture)).uncommanded:
+        if flight.liftoff >= steps(capture, rules.grace_s):
+            top = float(capture.position[flight.liftoff : flight.touchdown, 2].max())
+            highest = top if math.isnan(highest) else max(highest, top)
+    return highest
 
 
 # ---- definitions of figures ----
@@ -204,14 +254,15 @@ def uncommanded_height(capture: Capture, on: int | None, rules: JumpRules) -> fl
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """What a figure of a run is."""
+    """What a figure of a run is, and where it stands among the run's figures."""
 
     name: str
     unit: str
-    says: str
-    """Its equation."""
+    equation: str
+    part: str = ""
+    """Field of the figures that holds it; empty for one of the figures themselves."""
     joints: bool = False
-    """One number for each joint."""
+    """It is one number for each joint."""
 
     @property
     def column(self) -> str:
@@ -219,11 +270,94 @@ class Figure:
         unit = self.unit.replace("/", "_per_").replace(" ", "_")
         return self.name if unit == "1" else f"{self.name}_{unit}"
 
+    def value(self, figures: Any) -> Any:
+        """Return this figure of one run: a number, or a tuple with one of each joint."""
+        holder = getattr(figures, self.part) if self.part else figures
+        return getattr(holder, self.name)
 
-def number(unit: str, says: str, *, joints: bool = False) -> Any:
-    """Declare a figure that is a number, or one of each joint: its unit and its equation."""
-    metadata = {"unit": unit, "says": says, "joints": joints}
-    return field(default=() if joints else math.nan, metadata=metadata)
+
+def figure(unit: str, equation: str) -> Any:
+    """Declare a field that is a figure, by its unit and its equation; NaN if it does not exist."""
+    return field(default=math.nan, metadata={"unit": unit, "equation": equation, "joints": False})
+
+
+def joint_figure(unit: str, equation: str) -> Any:
+    """Declare a field with a figure of each joint; empty if it does not exist."""
+    return field(default=(), metadata={"unit": unit, "equation": equation, "joints": True})
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightFigures:
+    """The main flight of a jump. All are NaN if there was no jump."""
+
+    apex_gain: float = figure(
+        "m", "max z over l .. d-1, less the height of the trunk in the default pose"
+    )
+    rise: float = figure("m", "max z over l .. d-1, less z_l")
+    ballistic: float = figure("m", "v_z^2 / 2g with v_z at l: the rise of a ballistic flight")
+    clearance: float = figure(
+        "m",
+        "max over l .. d-1 of min over the feet of (height of f_i - r): all feet are this high at "
+        "once",
+    )
+    clearance_half: float = figure(
+        "m",
+        "min over the middle half of l .. d-1 of min over the feet of (height of f_i - r): no foot "
+        "is lower for half of the flight",
+    )
+    # Paper E6, in reading A17.
+    distance: float = figure("m", "|p_d - p_l| in the plane")
+    along: float = figure("m", "(p_d - p_l) along the commanded direction, heading at l")
+    # The other reading of A17.
+    distance_minima: float = figure(
+        "m", "|p_b - p_a| in the plane, z_a the least over c .. l and z_b the least over d .. e"
+    )
+    # Reading A16.
+    gap: float = figure(
+        "m",
+        "min over the feet of f_i . u at its first contact from d on, less max over the feet of "
+        "f_i . u at its last contact before l",
+    )
+    # Reading A6.
+    lift_off_velocity: float = figure("m/s", "v_z at l")
+    horizontal_velocity: float = figure("m/s", "|v_xy| at l")
+    delay: float = figure("s", "time from c to l")
+    duration: float = figure("s", "time from l to d")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ApproachFigures:
+    """The run before the jump input."""
+
+    speed: float = figure(
+        "m/s", "mean velocity along the command and the heading, from 1 s after it to c"
+    )
+    roll_rate_rms: float = figure("rad/s", "root mean square of the roll rate while accelerating")
+    roll_rate_peak: float = figure("rad/s", "greatest |roll rate| while accelerating")
+    pitch_rate_rms: float = figure("rad/s", "root mean square of the pitch rate while accelerating")
+    pitch_rate_peak: float = figure("rad/s", "greatest |pitch rate| while accelerating")
+    cost_of_transport: float = figure(
+        "1", "electrical energy / (m g |p_c - p_b|) from b, 1 s after the command to run, to c"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadFigures:
+    """Energy and loads of the drives, from the jump input to half a second after touchdown."""
+
+    energy: float = figure(
+        "J", "electrical energy over c .. e, what comes back into the battery taken off"
+    )
+    peak_torque: tuple[float, ...] = joint_figure("N m", "greatest |motor torque| over c .. e")
+    peak_speed: tuple[float, ...] = joint_figure(
+        "rad/s", "greatest |joint speed|, averaged over 10 ms, over c .. e"
+    )
+    torque_margin: tuple[float, ...] = joint_figure(
+        "1",
+        "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
+        "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
+        "negative beyond it, where a motor gives more than the model of its drive",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,77 +374,39 @@ class JumpFigures:
     """The robot fell, at any time of the run."""
     upright: bool = False
     """There was a jump, and 2 s after d the robot stood, tilted by 30 degrees at most."""
-
-    height: float = number("m", "max z - min z over c .. e (paper E5)")
-    apex_gain: float = number(
-        "m", "max z over l .. d-1, less the height of the trunk in the default pose"
+    # Paper E5.
+    height: float = figure("m", "max z - min z over c .. e")
+    flights: float = figure("1", "flight phases that lift off from c to c + 1.5 s")
+    high_flights: float = figure("1", "those of them that are 60 ms or longer and high")
+    flight: FlightFigures = field(default_factory=FlightFigures, metadata={"part": FlightFigures})
+    approach: ApproachFigures = field(
+        default_factory=ApproachFigures, metadata={"part": ApproachFigures}
     )
-    rise: float = number("m", "max z over l .. d-1, less z_l")
-    ballistic: float = number("m", "v_z^2 / 2g with v_z at l: the rise of a ballistic flight")
-    clearance: float = number(
-        "m",
-        "max over l .. d-1 of min over the feet of (height of f_i - r): all feet are this high at "
-        "once",
-    )
-    clearance_half: float = number(
-        "m",
-        "min over the middle half of l .. d-1 of min over the feet of (height of f_i - r): no foot "
-        "is lower for half of the flight",
-    )
-    distance: float = number("m", "|p_d - p_l| in the plane (paper E6, reading A17)")
-    along: float = number("m", "(p_d - p_l) along the commanded direction, heading at l")
-    distance_minima: float = number(
-        "m",
-        "|p_b - p_a| in the plane, z_a the least over c .. l and z_b the least over d .. e "
-        "(the other reading of A17)",
-    )
-    gap: float = number(
-        "m",
-        "min over the feet of f_i . u at its first contact from d on, less max over the feet of "
-        "f_i . u at its last contact before l (reading A16)",
-    )
-    lift_off_velocity: float = number("m/s", "v_z at l (reading A6)")
-    horizontal_velocity: float = number("m/s", "|v_xy| at l")
-    delay: float = number("s", "time from c to l")
-    duration: float = number("s", "time from l to d")
-    flights: float = number("1", "flight phases that lift off from c to c + 1.5 s")
-    high_flights: float = number("1", "those of them that are 60 ms or longer and high")
-    speed: float = number(
-        "m/s", "mean velocity along the command and the heading, from 1 s after it to c"
-    )
-    roll_rate_rms: float = number("rad/s", "root mean square of the roll rate while accelerating")
-    roll_rate_peak: float = number("rad/s", "greatest |roll rate| while accelerating")
-    pitch_rate_rms: float = number("rad/s", "root mean square of the pitch rate while accelerating")
-    pitch_rate_peak: float = number("rad/s", "greatest |pitch rate| while accelerating")
-    energy: float = number(
-        "J", "electrical energy over c .. e, what comes back into the battery taken off"
-    )
-    cost_of_transport: float = number(
-        "1", "electrical energy / (m g |p_c - p_b|) from b, 1 s after the command to run, to c"
-    )
-    peak_torque: tuple[float, ...] = number(
-        "N m", "greatest |motor torque| over c .. e", joints=True
-    )
-    peak_speed: tuple[float, ...] = number(
-        "rad/s", "greatest |joint speed|, averaged over 10 ms, over c .. e", joints=True
-    )
-    torque_margin: tuple[float, ...] = number(
-        "1",
-        "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
-        "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
-        "negative beyond it, where a motor gives more than the model of its drive",
-        joints=True,
-    )
+    loads: LoadFigures = field(default_factory=LoadFigures, metadata={"part": LoadFigures})
 
     @property
     def success(self) -> bool:
-        """The landing: upright 2 s later, and nothing but feet touched the ground."""
+        """Whether it landed: upright 2 s later, and nothing but feet touched the ground."""
         return self.upright and not self.non_foot_contact
 
 
 def figures_of(kind: type[Any]) -> dict[str, Figure]:
-    """Return every figure that is a number, by name, of a dataclass of figures."""
-    return {one.name: Figure(name=one.name, **one.metadata) for one in fields(kind) if one.metadata}
+    """Return the figures of a dataclass, and of the parts it has, by name."""
+    figures = {}
+    for entry in fields(kind):
+        if "part" in entry.metadata:
+            for inner_entry in fields(entry.metadata["part"]):
+                figures[inner_entry.name] = Figure(
+                    name=inner_entry.name, part=entry.name, **inner_entry.metadata
+                )
+        elif entry.metadata:
+            figures[entry.name] = Figure(name=entry.name, **entry.metadata)
+    return figures
+
+
+def flags_of(kind: type[Any]) -> list[str]:
+    """Return the names of the fields of a dataclass of figures that are flags or texts."""
+    return [entry.name for entry in fields(kind) if not entry.metadata]
 
 
 FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
@@ -319,7 +415,7 @@ FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
 # ---- figures of a capture ----
 
 
-def measure(
+def measure_jump(
     capture: Capture,
     script: Script,
     robot: RobotSpec,
@@ -329,45 +425,53 @@ def measure(
 ) -> JumpFigures:
     """Return the figures of one run.
 
-    `began` is when the policy took over, on the capture's clock [s]; `rules` are those of the robot
-    if None.
+    Args:
+        capture: The recorded motion.
+        script: The commands of the run.
+        robot: The robot, for its mass, feet and drives.
+        began: When the policy took over, on the capture's clock [s].
+        rules: Times and heights of the definitions; those of the robot if None.
     """
-    rules, body = rules or JumpRules.of(robot), legged(robot.source)
-    run, on = (sample_at(capture, began + t) for t in (script.start, script.on))
+    rules = rules or JumpRules.of(robot)
+    body = legged(robot.source)
+    run = sample_at(capture, began + script.start)
+    on = sample_at(capture, began + script.on)
     count = fallen_at(capture)
     fell = count < len(capture.time)
     if on >= count:
         return JumpFigures(standing=False, fell=fell)
-    found = jump_flights(capture, on, rules, count)
-    main = found.main
-    seconds = rules.search_s if main is None else rules.tail_s
-    last = (on if main is None else main.touchdown) + steps(capture, seconds)
-    end = min(last, count - 1)
-    settled = (main.touchdown + steps(capture, rules.upright_s)) if main else end
-    figures: dict[str, Any] = {
-        **_rates(capture, run, on),
-        **_run(capture, script, run + steps(capture, SETTLE_S), on, mass=body.total_mass),
-        **_loads(capture, robot, on, end),
-    }
-    if main is not None:
-        figures |= _flight(capture, script, on, main, end, rules, body.foot_radius)
+    phases = jump_flights(capture, on, rules, count)
+    main = phases.main
+    if main is None:
+        last = on + steps(capture, rules.search_s)
+        end = min(last, count - 1)
+        settled = end
+        flight = FlightFigures()
+        upright = False
+    else:
+        last = main.touchdown + steps(capture, rules.tail_s)
+        end = min(last, count - 1)
+        settled = main.touchdown + steps(capture, rules.upright_s)
+        flight = _measure_flight(capture, script, on, main, end, rules, body.foot_radius)
+        upright = settled < count and bool(
+            cosine_of_tilt(capture.orientation[settled]) >= rules.upright_cosine
+        )
     return JumpFigures(
         standing=True,
-        fell=fell,
         found=main is not None,
-        flights=float(len(found.all)),
-        high_flights=float(len(found.high)),
-        upright=main is not None
-        and settled < count
-        and bool(cosine_of_tilt(capture.orientation[settled]) >= rules.upright_cosine),
-        height=float(np.ptp(capture.position[on : end + 1, 2])),
         non_foot_contact=bool(capture.other_contact[on : settled + 1].any()),
-        energy=float(capture.electrical_power[on : end + 1].sum() * capture.dt),
-        **figures,
+        fell=fell,
+        upright=upright,
+        height=float(np.ptp(capture.position[on : end + 1, 2])),
+        flights=float(len(phases.commanded)),
+        high_flights=float(len(phases.high)),
+        flight=flight,
+        approach=_measure_approach(capture, script, run, on, mass=body.total_mass),
+        loads=_measure_loads(capture, robot, on, end),
     )
 
 
-def _flight(
+def _measure_flight(
     capture: Capture,
     script: Script,
     on: int,
@@ -375,94 +479,112 @@ def _flight(
     end: int,
     rules: JumpRules,
     foot_radius: float,
-) -> dict[str, float]:
-    """The figures of the main flight."""
-    up, down = main
-    plane, z = capture.position[:, :2], capture.position[:, 2]
-    displacement, vertical = plane[down] - plane[up], float(capture.velocity[up, 2])
-    before, after = on + int(np.argmin(z[on : up + 1])), down + int(np.argmin(z[down : end + 1]))
-    apex = float(z[up:down].max())
-    low = capture.foot_position[up:down, :, 2].min(axis=1) - foot_radius
-    quarter = len(low) // 4
-    figures = {
-        "apex_gain": apex - rules.standing_height,
-        "rise": float(apex - z[up]),
-        "ballistic": vertical**2 / (2.0 * GRAVITY),
-        "clearance": float(low.max()),
-        "clearance_half": float(low[quarter : len(low) - quarter].min()),
-        "distance": float(np.hypot(*displacement)),
-        "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
-        "gap": _gap(capture, main),
-        "lift_off_velocity": vertical,
-        "horizontal_velocity": float(np.hypot(*capture.velocity[up, :2])),
-        "delay": (up - on) * capture.dt,
-        "duration": main.samples * capture.dt,
-    }
+) -> FlightFigures:
+    """Return the figures of the main flight, samples `on` .. `end` being those of the jump."""
+    liftoff, touchdown = main
+    place = capture.position[:, :2]
+    height = capture.position[:, 2]
+    displacement = place[touchdown] - place[liftoff]
+    vertical = float(capture.velocity[liftoff, 2])
+    lowest_before = on + int(np.argmin(height[on : liftoff + 1]))
+    lowest_after = touchdown + int(np.argmin(height[touchdown : end + 1]))
+    apex = float(height[liftoff:touchdown].max())
+    foot_height = capture.foot_position[liftoff:touchdown, :, 2].min(axis=1) - foot_radius
+    quarter = len(foot_height) // 4
+    middle_half = foot_height[quarter : len(foot_height) - quarter]
+    along_command = math.nan
     if any(script.command[:2]):
-        figures["along"] = float(along(displacement, capture.orientation[up], script.command))
-    return figures
+        along_command = float(along(displacement, capture.orientation[liftoff], script.command))
+    return FlightFigures(
+        apex_gain=apex - rules.standing_height,
+        rise=float(apex - height[liftoff]),
+        ballistic=vertical**2 / (2.0 * GRAVITY),
+        clearance=float(foot_height.max()),
+        clearance_half=float(middle_half.min()),
+        distance=float(np.hypot(*displacement)),
+        along=along_command,
+        distance_minima=float(np.hypot(*(place[lowest_after] - place[lowest_before]))),
+        gap=_measure_gap(capture, main),
+        lift_off_velocity=vertical,
+        horizontal_velocity=float(np.hypot(*capture.velocity[liftoff, :2])),
+        delay=(liftoff - on) * capture.dt,
+        duration=main.samples * capture.dt,
+    )
 
 
-def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
-    """Roll and pitch rates in the trunk's frame while the robot accelerates (R7)."""
-    rates = capture.angular_velocity[start:on, :2]
-    if not len(rates):
-        return {}
-    rms, peak = np.sqrt(np.mean(rates**2, axis=0)), np.abs(rates).max(axis=0)
-    return {
-        f"{axis}_rate_{what}": float(values[i])
-        for i, axis in enumerate(("roll", "pitch"))
-        for what, values in (("rms", rms), ("peak", peak))
-    }
+def _measure_gap(capture: Capture, flight: Flight) -> float:
+    """Return the widest gap across the way of travel without a foothold [m].
 
-
-def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) -> dict[str, float]:
-    """Speed and cost of transport of the steady run before the jump."""
-    if start >= on:
-        return {}
-    travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[start, :2])))
-    work = float(capture.electrical_power[start:on].sum() * capture.dt)
-    figures = {"cost_of_transport": work / (mass * GRAVITY * travelled)} if travelled else {}
-    if any(script.command[:2]):
-        speed = along(capture.velocity[start:on], capture.orientation[start:on], script.command)
-        figures["speed"] = float(speed.mean())
-    return figures
-
-
-def _loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> dict[str, tuple[float, ...]]:
-    """Peaks of each joint, and how near to its torque-speed curve they come."""
-    # Links ring on their belts at 100 Hz and more; what the motors turn at is the average.
-    samples, half = np.arange(on, end + 1), max(1, round(0.5 * AVERAGE_S / capture.dt))
-    late, early = np.minimum(samples + half, len(capture.time) - 1), np.maximum(samples - half, 0)
-    turned = capture.joint_position[late] - capture.joint_position[early]
-    speed = turned / (capture.time[late] - capture.time[early])[:, None]
-    torque = capture.torque[on : end + 1]
-    margins = []
-    for i, motor in enumerate(joint.drive for joint in robot.joints):
-        limits = (motor.stall_torque, motor.no_load_speed, motor.effort_limit)
-        low, high = drive.torque_limits(speed[:, i], *limits)
-        least = np.minimum(high - torque[:, i], torque[:, i] - low).min()
-        margins.append(float(least) / motor.effort_limit)
-    return {
-        "peak_torque": tuple(np.abs(torque).max(axis=0).tolist()),
-        "peak_speed": tuple(np.abs(speed).max(axis=0).tolist()),
-        "torque_margin": tuple(margins),
-    }
-
-
-def _gap(capture: Capture, flight: Flight) -> float:
-    """Widest gap across the way of travel without a foothold (reading A16) [m].
-
-    NaN if a foot never stood before or never touches again, or nothing was travelled.
+    It is NaN if a foot never stood before or never touches again, or nothing was travelled.
     """
-    up, down = flight
-    displacement = capture.position[down, :2] - capture.position[up, :2]
+    liftoff, touchdown = flight
+    displacement = capture.position[touchdown, :2] - capture.position[liftoff, :2]
     length = float(np.hypot(*displacement))
-    before, after = capture.contact[:up], capture.contact[down:]
+    before = capture.contact[:liftoff]
+    after = capture.contact[touchdown:]
     if length == 0.0 or not (before.any(axis=0).all() and after.any(axis=0).all()):
         return math.nan
     travelled = capture.foot_position[:, :, :2] @ (displacement / length)
     feet = np.arange(travelled.shape[1])
-    left = travelled[up - 1 - before[::-1].argmax(axis=0), feet]
-    met = travelled[down + after.argmax(axis=0), feet]
-    return float(met.min() - left.max())
+    last_stance = liftoff - 1 - before[::-1].argmax(axis=0)
+    first_stance = touchdown + after.argmax(axis=0)
+    return float(travelled[first_stance, feet].min() - travelled[last_stance, feet].max())
+
+
+def _measure_approach(
+    capture: Capture, script: Script, run: int, on: int, *, mass: float
+) -> ApproachFigures:
+    """Return the figures of the run, from sample `run` with its command to `on` with the jump's.
+
+    Rates in the trunk's frame count from the command on (paper R7), speed and energy once the robot
+    has had time to reach the velocity.
+    """
+    roll_rms = pitch_rms = roll_peak = pitch_peak = math.nan
+    rates = capture.angular_velocity[run:on, :2]
+    if len(rates):
+        roll_rms, pitch_rms = np.sqrt(np.mean(rates**2, axis=0)).tolist()
+        roll_peak, pitch_peak = np.abs(rates).max(axis=0).tolist()
+    speed = math.nan
+    cost_of_transport = math.nan
+    settled = run + steps(capture, SETTLE_S)
+    if settled < on:
+        travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[settled, :2])))
+        work = float(capture.electrical_power[settled:on].sum() * capture.dt)
+        if travelled:
+            cost_of_transport = work / (mass * GRAVITY * travelled)
+        if any(script.command[:2]):
+            orientation = capture.orientation[settled:on]
+            speed = float(along(capture.velocity[settled:on], orientation, script.command).mean())
+    return ApproachFigures(
+        speed=speed,
+        roll_rate_rms=roll_rms,
+        roll_rate_peak=roll_peak,
+        pitch_rate_rms=pitch_rms,
+        pitch_rate_peak=pitch_peak,
+        cost_of_transport=cost_of_transport,
+    )
+
+
+def _measure_loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> LoadFigures:
+    """Return energy, peaks of each joint, and how near to its torque-speed curve they come."""
+    samples = np.arange(on, end + 1)
+    half_window = max(1, round(0.5 * AVERAGE_S / capture.dt))
+    late = np.minimum(samples + half_window, len(capture.time) - 1)
+    early = np.maximum(samples - half_window, 0)
+    turned = capture.joint_position[late] - capture.joint_position[early]
+    speed = turned / (capture.time[late] - capture.time[early])[:, None]
+    torque = capture.torque[on : end + 1]
+    margins = []
+    for index, joint in enumerate(robot.joints):
+        drive = joint.drive
+        low, high = torque_limits(
+            speed[:, index], drive.stall_torque, drive.no_load_speed, drive.effort_limit
+        )
+        margin = np.minimum(high - torque[:, index], torque[:, index] - low).min()
+        margins.append(float(margin) / drive.effort_limit)
+    return LoadFigures(
+        energy=float(capture.electrical_power[on : end + 1].sum() * capture.dt),
+        peak_torque=tuple(np.abs(torque).max(axis=0).tolist()),
+        peak_speed=tuple(np.abs(speed).max(axis=0).tolist()),
+        torque_margin=tuple(margins),
+    )

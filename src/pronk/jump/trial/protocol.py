@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pronk.errors import PronkError
 from pronk.policy.script import STILL, Velocity
 
-Pair = tuple[float, float]
+MeanStd = tuple[float, float]
 """Mean and standard deviation."""
 
 
@@ -29,10 +29,14 @@ _COMMANDS: Mapping[str, Velocity] = {
     "forward 3": (3.0, 0.0, 0.0),
     "back 2": (-2.0, 0.0, 0.0),
     "back 3": (-3.0, 0.0, 0.0),
-    **dict.fromkeys(("side +1", "left 1"), (0.0, 1.0, 0.0)),
-    **dict.fromkeys(("side -1", "right 1"), (0.0, -1.0, 0.0)),
-    **dict.fromkeys(("turn +2", "yaw 2"), (0.0, 0.0, 2.0)),
-    **dict.fromkeys(("turn -2", "yaw -2"), (0.0, 0.0, -2.0)),
+    "side +1": (0.0, 1.0, 0.0),
+    "left 1": (0.0, 1.0, 0.0),
+    "side -1": (0.0, -1.0, 0.0),
+    "right 1": (0.0, -1.0, 0.0),
+    "turn +2": (0.0, 0.0, 2.0),
+    "yaw 2": (0.0, 0.0, 2.0),
+    "turn -2": (0.0, 0.0, -2.0),
+    "yaw -2": (0.0, 0.0, -2.0),
     "stand": STILL,
 }
 
@@ -47,51 +51,77 @@ def named(*names: str) -> tuple[Case, ...]:
 
 PAPER_COMMANDS = named("forward 1", "forward 2", "side -1", "side +1", "back 2")
 """The jumps of Table III of the paper."""
-(RATES,) = named("forward 2.25")
-"""Of the paper's figure of roll and pitch rates (R7)."""
+# Paper R7.
+RATES = Case(name="forward 2.25", command=_COMMANDS["forward 2.25"])
+"""The command of the paper's figure of roll and pitch rates."""
 
 
 def parse_cases(texts: Iterable[str]) -> tuple[Case, ...]:
     """Return the cases of several commands, in their order; `paper` stands for the paper's five."""
-    return tuple(
-        case
-        for text in texts
-        for case in (PAPER_COMMANDS if text.strip() == "paper" else (parse_case(text),))
-    )
+    cases: list[Case] = []
+    for text in texts:
+        if text.strip() == "paper":
+            cases += PAPER_COMMANDS
+        else:
+            cases.append(parse_case(text))
+    return tuple(cases)
 
 
 def parse_case(text: str) -> Case:
     """Return the case of a command as `1,0` or `1,0,0`; one of the paper's keeps its name."""
     try:
         values = [float(part) for part in text.split(",")]
-        if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
-            raise ValueError
     except ValueError:
+        values = []
+    if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
         raise PronkError(
             f"command {text!r}; expected two or three numbers between commas, forward and left "
             'velocity [m/s] and yaw rate [rad/s], as in "1,0,0".'
-        ) from None
-    forward, left, yaw = (*values, 0.0)[:3]
-    command = (forward, left, yaw)
-    known = [case for case in (*PAPER_COMMANDS, RATES) if case.command == command]
-    return known[0] if known else Case(name=",".join(f"{v:g}" for v in command), command=command)
+        )
+    yaw_rate = values[2] if len(values) == 3 else 0.0
+    command = (values[0], values[1], yaw_rate)
+    for case in (*PAPER_COMMANDS, RATES):
+        if case.command == command:
+            return case
+    return Case(name=",".join(f"{value:g}" for value in command), command=command)
 
 
-_ROWS = {
-    "forward 1": ((0.332, 0.008), (0.318, 0.014), (0.690, 0.076), (0.597, 0.042)),
-    "forward 2": ((0.246, 0.022), (0.244, 0.013), (0.944, 0.030), (0.969, 0.026)),
-    "side -1": ((0.304, 0.061), (0.374, 0.016), (0.636, 0.092), (0.587, 0.054)),
-    "side +1": ((0.249, 0.041), (0.366, 0.052), (0.701, 0.183), (0.542, 0.051)),
-    "back 2": ((0.346, 0.031), (0.381, 0.015), (0.944, 0.030), (0.932, 0.025)),
-}
-_COLUMNS = [(figure, gains) for figure in ("height", "distance") for gains in ("naive", "matched")]
-TABLE_III: Mapping[tuple[str, str], Mapping[str, Pair]] = {
-    column: {case: row[i] for case, row in _ROWS.items()} for i, column in enumerate(_COLUMNS)
+TABLE_III: Mapping[tuple[str, str], Mapping[str, MeanStd]] = {
+    ("height", "naive"): {
+        "forward 1": (0.332, 0.008),
+        "forward 2": (0.246, 0.022),
+        "side -1": (0.304, 0.061),
+        "side +1": (0.249, 0.041),
+        "back 2": (0.346, 0.031),
+    },
+    ("height", "matched"): {
+        "forward 1": (0.318, 0.014),
+        "forward 2": (0.244, 0.013),
+        "side -1": (0.374, 0.016),
+        "side +1": (0.366, 0.052),
+        "back 2": (0.381, 0.015),
+    },
+    ("distance", "naive"): {
+        "forward 1": (0.690, 0.076),
+        "forward 2": (0.944, 0.030),
+        "side -1": (0.636, 0.092),
+        "side +1": (0.701, 0.183),
+        "back 2": (0.944, 0.030),
+    },
+    ("distance", "matched"): {
+        "forward 1": (0.597, 0.042),
+        "forward 2": (0.969, 0.026),
+        "side -1": (0.587, 0.054),
+        "side +1": (0.542, 0.051),
+        "back 2": (0.932, 0.025),
+    },
 }
 """arXiv 2404.15096, Table III: mean and standard deviation of five jumps [m], by figure and gains,
-then by command; for comparison, never fitted to. Its naive distance with `back 2` is
-that with `forward 2`, digit by digit: most likely an error of the table (reading A4)."""
+then by command; for comparison, never fitted to. The naive distance of `back 2` is that of
+`forward 2`, digit by digit: most likely an error of the table (reading A4)."""
 
+PAPER_GAPS = {"forward 2": 0.55, "back 2": 0.5, "side -1": 0.4, "side +1": 0.4}
+"""Widest gaps by command, read off the paper's video (R3) [m]; of which policy is not stated."""
 PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
 """Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text has
 2.30 for the distance (reading A4)."""

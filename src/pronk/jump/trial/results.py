@@ -1,8 +1,8 @@
 """The results of a trial: a JSON file with what was run, every run and sums, and a CSV table.
 
-Jumps, walks, varied robots and crossings differ by their `Kind`. Unknown numbers are NaN, in CSV an
-empty cell, in JSON null. pronk reads the runs in the JSON file; its sums, and the table with one
-row a run, are for other readers.
+Jumps, walks and crossings differ by their `RunKind`. Unknown numbers are NaN, in CSV an empty cell,
+in JSON null. pronk reads the runs in the JSON file; its sums, and the table with one row a run, are
+for other readers.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -26,93 +26,137 @@ from numpy.typing import ArrayLike
 from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.files import write_text
-from pronk.jump.trial.jumps import JumpFigures, figures_of, measure
+from pronk.jump.trial.jumps import JumpFigures, figures_of, flags_of, measure_jump
 from pronk.jump.trial.protocol import PAPER_COMMANDS, Case
 from pronk.policy.script import Script
 
 RESAMPLES = 4999
-"""Of a bootstrap."""
+"""Number of resamples of a bootstrap."""
 FEWEST = 5
-"""Jumps, the paper's number, below which the bootstrap gives no interval: a resample is too often
-one jump alone, which does not scatter."""
+"""Fewest jumps, the paper's number, with which the bootstrap gives an interval. With fewer, a
+resample is too often one jump alone, which does not scatter."""
+
+
+class MeasuredRun(Protocol):
+    """What the figures of every kind of runs have in common."""
+
+    @property
+    def standing(self) -> bool:
+        """Whether the robot had not fallen before what was to be measured."""
+
+    @property
+    def found(self) -> bool:
+        """Whether there was something to measure."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the run ended as it should."""
+
+    @property
+    def fell(self) -> bool:
+        """Whether the robot fell."""
+
+    @property
+    def non_foot_contact(self) -> bool:
+        """Whether something but a foot touched the ground."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
+class RunKind:
     """A kind of runs: how one is measured, and the files of its results."""
 
     table: str
+    """Name of the CSV file."""
     summary: str
+    """Name of the JSON file."""
     schema: str
+    """Schema of the JSON file."""
     writer: str
-    """The command that writes it."""
+    """Command that writes them."""
     figures: type[Any] = JumpFigures
     """Dataclass of one run's figures: flags, texts, and numbers with `Figure` metadata."""
-    measure: Callable[..., Any] = measure
-    """From capture to figures; a function of a module."""
+    measure: Callable[..., Any] = measure_jump
+    """Function of a module that makes the figures of a capture."""
     compared: tuple[str, ...] = ()
     """Figures whose scatter is compared between policies."""
     jump: bool = True
     """The policies need the jump input."""
 
 
-JUMPS = Kind(
+JUMPS = RunKind(
     table="trials.csv",
     summary="summary.json",
-    schema="pronk/trial/4",
+    schema="pronk/trial/5",
     writer="pronk trial POLICY --out FOLDER",
     compared=(
-        *("height", "apex_gain", "lift_off_velocity", "distance", "along"),
-        *("distance_minima", "gap"),
+        "height",
+        "apex_gain",
+        "lift_off_velocity",
+        "distance",
+        "along",
+        "distance_minima",
+        "gap",
     ),
 )
-TABLE, SUMMARY = JUMPS.table, JUMPS.summary
+TABLE = JUMPS.table
+SUMMARY = JUMPS.summary
 
 
-def extra_kind(name: str, **fields: Any) -> Kind:
-    """Return the kind of an option of `pronk trial`, which names its files."""
-    return Kind(
+def study_kind(
+    name: str, figures: type[Any], measure: Callable[..., Any], *, jump: bool = True
+) -> RunKind:
+    """Return the kind of a study beside the jumps.
+
+    Args:
+        name: The option of `pronk trial` that asks for it, which names its files.
+        figures: Dataclass of one run's figures.
+        measure: Function that makes them of a capture.
+        jump: Whether the policies need the jump input.
+    """
+    return RunKind(
         table=f"{name}.csv",
         summary=f"{name}.json",
-        schema=f"pronk/trial-{name}/4",
+        schema=f"pronk/trial-{name}/5",
         writer=f"pronk trial POLICY --{name}",
-        **fields,
+        figures=figures,
+        measure=measure,
+        jump=jump,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class TriedPolicy:
     """A policy under trial."""
 
     name: str
     path: str
+    """Path of its file."""
     sha256: str
+    """Hash of its file."""
     contract: Mapping[str, Any]
-    """Robot, gains with their hash, rates, delays, ranges."""
+    """Robot, gains with their hash, rates, delays and ranges that it was trained for."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
-    """One run."""
+class TrialRun:
+    """One run of one policy with one command."""
 
     policy: str
+    """Name of the policy."""
     case: str
     """Name of the command."""
     number: int
-    """0 for the first run with this command."""
+    """Number of the run, 0 for the first with this command."""
     seed: int
-    """Of the virtual robot's noise."""
+    """Seed of the virtual robot's noise."""
     script: Script
-    """With the time of this run's jump input."""
+    """Commands over time, with the time of this run's jump input."""
     figures: Any = None
-    """Of the kind's class, `JumpFigures` for jumps; None before the run."""
+    """Figures of the kind's class, `JumpFigures` for jumps; None before the run."""
     capture: str = ""
-    """The capture's file beside the table; empty if it was not kept."""
+    """File of the capture beside the table; empty if it was not kept."""
     began: float = 0.0
     """When the policy took over, on the capture's clock [s]."""
-    parameter: str = ""
-    """Of the body, that is varied; empty for none."""
-    value: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +165,7 @@ class Spread:
 
     mean: float = math.nan
     std: float = math.nan
-    """With n - 1; NaN for one."""
+    """Standard deviation with n - 1; NaN for one run."""
     least: float = math.nan
     p05: float = math.nan
     p50: float = math.nan
@@ -132,89 +176,103 @@ class Spread:
     @classmethod
     def of(cls, values: ArrayLike) -> Self:
         """Sum up one value a run; unknown ones are left out."""
-        known = np.asarray(values, dtype=float)
-        known = known[np.isfinite(known)]
-        if not len(known):
+        numbers = np.asarray(values, dtype=float)
+        numbers = numbers[np.isfinite(numbers)]
+        if not len(numbers):
             return cls()
-        quantiles = np.quantile(known, [0.0, 0.05, 0.5, 0.95, 1.0]).tolist()
+        least, p05, p50, p95, most = np.quantile(numbers, [0.0, 0.05, 0.5, 0.95, 1.0]).tolist()
         return cls(
-            **dict(zip(("least", "p05", "p50", "p95", "most"), quantiles, strict=True)),
-            mean=float(known.mean()),
-            std=float(known.std(ddof=1)) if len(known) > 1 else math.nan,
-            n=len(known),
+            mean=float(numbers.mean()),
+            std=float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan,
+            least=least,
+            p05=p05,
+            p50=p50,
+            p95=p95,
+            most=most,
+            n=len(numbers),
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
-    """The runs of one policy with one command, and of one varied body if there are any."""
+class RunCell:
+    """The runs of one policy with one command."""
 
     policy: str
     case: str
-    parameter: str
-    value: float
+    """Name of the command."""
     n: int
+    """Number of runs."""
     standing: int
-    """Robots that had not fallen when the jump input came."""
+    """Number of robots that had not fallen when the jump input came."""
     found: int
-    """Jumps there were."""
+    """Number of jumps that there were."""
     succeeded: int
+    """Number of landings; of another kind, of runs that ended as they should."""
     success: float
-    """Share of all n."""
+    """Share of those of all runs [1]."""
     success_ci95: tuple[float, float]
-    """Wilson's interval of it."""
+    """Wilson's 95 % interval of that share [1]."""
     fell: int
+    """Number of runs in which the robot fell."""
     non_foot_contact: int
+    """Number of runs in which something but a foot touched the ground."""
     figures: Mapping[str, Spread]
-    """Over the runs with a jump; over all runs of another kind."""
+    """Figures over the runs with a jump; over all runs of another kind."""
     joints: Mapping[str, Mapping[str, Spread]]
-    """By figure, then by joint."""
+    """Figures of each joint, by figure, then by joint."""
 
 
-@dataclass(frozen=True)
-class Ratio:
+@dataclass(frozen=True, kw_only=True)
+class ScatterRatio:
     """Scatter of another policy over that of the first."""
 
     figure: str
     case: str | None
-    """None: sums of the standard deviations over the paper's commands, which is the ratio of their
-    means (reading A4); over all commands if none of the paper's was run."""
+    """Name of the command. None: ratio of the sums of the standard deviations over the paper's
+    commands, which is that of their means; over all commands if none of the paper's was run."""
     policy: str
+    """Name of the first policy."""
     other: str
+    """Name of the other policy."""
     value: float
-    """Standard deviation of the other over that of the first."""
+    """Standard deviation of the other over that of the first [1]."""
     low: float
+    """Lower end of the 95 % bootstrap interval; NaN with fewer than `FEWEST` jumps of either policy
+    in a command [1]."""
     high: float
-    """95 % bootstrap interval; NaN with fewer than `FEWEST` jumps of either policy in a command."""
+    """Upper end of that interval [1]."""
     n: tuple[int, int]
-    """Jumps of the first and of the other."""
+    """Number of jumps of the first and of the other."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Results:
+class TrialResults:
     """The runs of one kind, and what was run."""
 
-    kind: Kind = JUMPS
-    rows: tuple[Row, ...] = ()
-    """By policy, then command, then number."""
+    kind: RunKind = JUMPS
+    rows: tuple[TrialRun, ...] = ()
+    """Runs by policy, then command, then number."""
     robot: str
+    """Name of the robot."""
     virtual: bool = True
     """Measured on pronk's virtual robot."""
-    subjects: tuple[Subject, ...]
+    subjects: tuple[TriedPolicy, ...]
     cases: tuple[Case, ...]
     joint_names: tuple[str, ...] = ()
     seed: int
+    """Seed of all draws."""
     sim_params: Mapping[str, Any]
-    """The virtual robot's parameters: their file and its hash."""
+    """File of the virtual robot's parameters, and its hash."""
     script: Script
-    """Without the spread of the jump input's time."""
+    """Times of all runs, without the spread of the jump input's time."""
     spread_s: float = 0.0
+    """Time by which the jump input rises later at most [s]."""
     rules: Mapping[str, float] = field(default_factory=dict)
     """`JumpRules` of the definitions."""
     mass: float = 0.0
-    """Of the robot, for the cost of transport [kg]; 0 where there is none."""
+    """Mass of the robot, for the cost of transport [kg]; 0 where there is none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """What else belongs to the kind."""
+    """Further settings of the kind."""
     versions: Mapping[str, str] = field(default_factory=dict)
     timing: Mapping[str, float] = field(default_factory=dict)
     """Wall seconds, simulated seconds, processes: the only numbers that a repeat changes."""
@@ -225,75 +283,99 @@ class Results:
         paper = tuple(case.name for case in self.cases if case in PAPER_COMMANDS)
         return paper or tuple(case.name for case in self.cases)
 
-    def of(self, policy: str, case: str) -> tuple[Row, ...]:
+    def of(self, policy: str, case: str) -> tuple[TrialRun, ...]:
         """Return the runs of one policy with one command."""
-        return tuple(row for row in self.rows if (row.policy, row.case) == (policy, case))
+        return tuple(row for row in self.rows if row.policy == policy and row.case == case)
 
     def values(self, policy: str, case: str, figure: str) -> Array:
-        """Return the known values of one figure, of the jumps that were found."""
-        rows = [row.figures for row in self.of(policy, case) if getattr(row.figures, "found", True)]
-        known: Array = np.array([getattr(figures, figure) for figures in rows], dtype=float)
-        return known[np.isfinite(known)]
+        """Return the finite values of one figure, of the jumps that there were. (n,)."""
+        definition = figures_of(self.kind.figures)[figure]
+        values = []
+        for row in self.of(policy, case):
+            if row.figures.found:
+                values.append(definition.value(row.figures))
+        numbers: Array = np.array(values, dtype=float)
+        return numbers[np.isfinite(numbers)]
 
     @cached_property
-    def cells(self) -> tuple[Cell, ...]:
-        """Every policy with every command, on every varied body."""
-        groups: dict[tuple[str, ...], list[Row]] = {}
+    def cells(self) -> tuple[RunCell, ...]:
+        """Sums of every policy with every command."""
+        groups: dict[tuple[str, str], list[TrialRun]] = {}
         for row in self.rows:
-            # The value as text: NaN is equal to nothing.
-            key = (row.parameter, str(row.value), row.policy, row.case)
-            groups.setdefault(key, []).append(row)
-        return tuple(self._cell(rows) for rows in groups.values())
+            groups.setdefault((row.policy, row.case), []).append(row)
+        return tuple(self._sum_up(rows) for rows in groups.values())
 
-    def cell(self, policy: str, case: str) -> Cell:
-        """Return one of `cells`."""
-        return next(c for c in self.cells if (c.policy, c.case) == (policy, case))
+    def cell(self, policy: str, case: str) -> RunCell:
+        """Return the sums of one policy with one command."""
+        for cell in self.cells:
+            if cell.policy == policy and cell.case == case:
+                return cell
+        raise KeyError(f"{policy}, {case}")
 
-    def _cell(self, rows: Sequence[Row]) -> Cell:
-        every = [row.figures for row in rows]
-        found = [each for each in every if getattr(each, "found", True)]
-        succeeded, figures, joints = sum(each.success for each in every), {}, {}
-        for name, figure in figures_of(self.kind.figures).items():
-            values = [getattr(each, name) for each in found]
-            if figure.joints:
-                known = [value for value in values if value]
-                columns = zip(*known, strict=True) if known else [()] * len(self.joint_names)
-                joints[name] = dict(zip(self.joint_names, map(Spread.of, columns), strict=True))
-            else:
-                figures[name] = Spread.of(values)
-        head = {name: getattr(rows[0], name) for name in ("policy", "case", "parameter", "value")}
-        flags = ("standing", "fell", "non_foot_contact")
-        counts = {k: sum(getattr(each, k, k == "standing") for each in every) for k in flags}
-        return Cell(
-            **head,
-            **counts,
+    def _sum_up(self, rows: Sequence[TrialRun]) -> RunCell:
+        all_figures: list[MeasuredRun] = [row.figures for row in rows]
+        with_jump = [figures for figures in all_figures if figures.found]
+        spreads: dict[str, Spread] = {}
+        joint_spreads: dict[str, dict[str, Spread]] = {}
+        for name, definition in figures_of(self.kind.figures).items():
+            values = [definition.value(figures) for figures in with_jump]
+            if not definition.joints:
+                spreads[name] = Spread.of(values)
+                continue
+            by_joint = {}
+            joint_values = [value for value in values if value]
+            if any(len(value) != len(self.joint_names) for value in joint_values):
+                raise ValueError(f"{name} has not one number for each joint")
+            for index, joint in enumerate(self.joint_names):
+                by_joint[joint] = Spread.of([value[index] for value in joint_values])
+            joint_spreads[name] = by_joint
+        succeeded = len([figures for figures in all_figures if figures.success])
+        return RunCell(
+            policy=rows[0].policy,
+            case=rows[0].case,
             n=len(rows),
-            found=len(found),
+            standing=len([figures for figures in all_figures if figures.standing]),
+            found=len(with_jump),
             succeeded=succeeded,
             success=succeeded / len(rows),
             success_ci95=share_interval(succeeded, len(rows)),
-            figures=figures,
-            joints=joints,
+            fell=len([figures for figures in all_figures if figures.fell]),
+            non_foot_contact=len([figures for figures in all_figures if figures.non_foot_contact]),
+            figures=spreads,
+            joints=joint_spreads,
         )
 
     @cached_property
-    def ratios(self) -> tuple[Ratio, ...]:
-        """Scatter of every other policy over that of the first, by command and altogether."""
-        first, found = self.subjects[0].name, []
-        for other in (subject.name for subject in self.subjects[1:]):
+    def ratios(self) -> tuple[ScatterRatio, ...]:
+        """Scatter of every other policy over that of the first, altogether and by command."""
+        ratios = []
+        for other in self.subjects[1:]:
             for figure in self.kind.compared:
-                for case in (None, *(case.name for case in self.cases)):
-                    cases = self.pooled if case is None else (case,)
-                    own = [self.values(first, each, figure) for each in cases]
-                    others = [self.values(other, each, figure) for each in cases]
-                    scatter = ratio_of_scatter(own, others, seed=self.seed)
-                    n = (sum(map(len, own)), sum(map(len, others)))
-                    found.append(Ratio(figure, case, first, other, *scatter, n))
-        return tuple(found)
+                ratios.append(self._ratio(other.name, figure, None))
+                for case in self.cases:
+                    ratios.append(self._ratio(other.name, figure, case.name))
+        return tuple(ratios)
+
+    def _ratio(self, other: str, figure: str, case: str | None) -> ScatterRatio:
+        policy = self.subjects[0].name
+        cases = self.pooled if case is None else (case,)
+        samples = [self.values(policy, name, figure) for name in cases]
+        other_samples = [self.values(other, name, figure) for name in cases]
+        value, low, high = ratio_of_scatter(samples, other_samples, seed=self.seed)
+        return ScatterRatio(
+            figure=figure,
+            case=case,
+            policy=policy,
+            other=other,
+            value=value,
+            low=low,
+            high=high,
+            n=(sum(map(len, samples)), sum(map(len, other_samples))),
+        )
 
 
 def share_interval(count: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
+    """Return Wilson's 95 % interval of a share `count` / `n`."""
     from scipy.stats import binomtest
 
     low, high = binomtest(count, n).proportion_ci(0.95, method="wilson")
@@ -301,35 +383,56 @@ def share_interval(count: int, n: int) -> tuple[float, float]:
 
 
 def ratio_of_scatter(
-    own: Sequence[Array], others: Sequence[Array], *, seed: int, resamples: int = RESAMPLES
+    samples: Sequence[Array],
+    other_samples: Sequence[Array],
+    *,
+    seed: int,
+    resamples: int = RESAMPLES,
 ) -> tuple[float, float, float]:
-    """Sum of the standard deviations of `others` over that of `own`, and its 95 % interval.
+    """Compare the scatter of two policies.
 
-    One sample of a figure for each command. The interval is of the percentile bootstrap, every
-    sample resampled by itself. All NaN where a sample has fewer than two values or `own` does not
-    scatter; with fewer than `FEWEST` values in a sample the interval alone is NaN.
+    Args:
+        samples: A figure of the first policy's jumps, one array (n,) for each command.
+        other_samples: The same of the other policy.
+        seed: Seed of the resamples.
+        resamples: Number of resamples of the percentile bootstrap, each sample by itself.
+
+    Returns:
+        Sum of the standard deviations of the other policy over that of the first, and its 95 %
+        interval. All NaN where a sample has fewer than two values or the first does not scatter;
+        the interval alone with fewer than `FEWEST` values in a sample.
     """
     from scipy.stats import DegenerateDataWarning, bootstrap
 
-    least = 1e-9 * max((float(np.abs(each).max()) for each in own if len(each)), default=0.0)
+    largest = max((float(np.abs(sample).max()) for sample in samples if len(sample)), default=0.0)
+    # A resample of one value alone scatters by rounding only.
+    least = 1e-9 * largest
 
-    def ratio(*samples: Array, axis: int = -1) -> Array:
-        spreads = [np.std(sample, axis=axis, ddof=1) for sample in samples]
-        above, below = sum(spreads[len(own) :]), sum(spreads[: len(own)])
-        # A resample of one value alone scatters by rounding only.
-        out = np.full(np.shape(below), np.nan)
-        share: Array = np.divide(above, below, out=out, where=np.asarray(below) > least)
-        return share
+    def ratio(*resampled: Array, axis: int = -1) -> Array:
+        stds = [np.std(sample, axis=axis, ddof=1) for sample in resampled]
+        below = np.asarray(sum(stds[: len(samples)]))
+        above = np.asarray(sum(stds[len(samples) :]))
+        unknown = np.full(below.shape, np.nan)
+        quotient: Array = np.divide(above, below, out=unknown, where=below > least)
+        return quotient
 
-    samples = (*own, *others)
-    value = float(ratio(*samples)) if min(map(len, samples)) > 1 else math.nan
-    if not math.isfinite(value) or min(map(len, samples)) < FEWEST:
+    all_samples = (*samples, *other_samples)
+    fewest = min(len(sample) for sample in all_samples)
+    value = float(ratio(*all_samples)) if fewest > 1 else math.nan
+    if not math.isfinite(value) or fewest < FEWEST:
         return value, math.nan, math.nan
-    how: Any = {"n_resamples": resamples, "method": "percentile", "vectorized": True, "batch": 1000}
     with warnings.catch_warnings():
-        # Of resamples without scatter, which the quantiles below leave out.
+        # About resamples without scatter, which the quantiles below leave out.
         warnings.simplefilter("ignore", DegenerateDataWarning)
-        drawn = bootstrap(samples, ratio, rng=np.random.default_rng(seed), **how)
+        drawn = bootstrap(
+            all_samples,
+            ratio,
+            rng=np.random.default_rng(seed),
+            n_resamples=resamples,
+            method="percentile",
+            vectorized=True,
+            batch=1000,
+        )
     low, high = np.nanquantile(drawn.bootstrap_distribution, [0.025, 0.975])
     return value, float(low), float(high)
 
@@ -337,36 +440,56 @@ def ratio_of_scatter(
 # ---- files ----
 
 
-def to_csv(results: Results) -> str:
-    """One row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
-    figures, table = figures_of(results.kind.figures), []
-    varied = any(row.parameter for row in results.rows)
-    for row in results.rows:
-        cells: dict[str, Any] = {"policy": row.policy, "command": row.case}
-        cells |= {"parameter": row.parameter, "value": row.value} if varied else {}
-        cells |= {"number": row.number, "seed": row.seed, "capture": row.capture}
-        cells |= {"success": row.figures.success, "run_s": row.script.run_s, "began_s": row.began}
-        for name, value in vars(row.figures).items():
-            column = figures[name].column if name in figures else name
-            if name in figures and figures[name].joints:
-                unit = column.removeprefix(name)
-                values = value or [math.nan] * len(results.joint_names)
-                columns = [f"{name}_{joint}{unit}" for joint in results.joint_names]
-                cells |= dict(zip(columns, values, strict=True))
-            else:
-                cells[column] = value
-        table.append({k: int(v) if isinstance(v, bool) else v for k, v in cells.items()})
+def to_csv(results: TrialResults) -> str:
+    """Return one row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
+    rows = [_csv_row(results, row) for row in results.rows]
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(table[0]) if table else [], lineterminator="\n")
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()
-    writer.writerows({k: "" if v != v else v for k, v in cells.items()} for cells in table)
+    writer.writerows(rows)
     return text.getvalue()
 
 
-def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
-    """Write a body of dataclasses and plain values as JSON, whole or not at all; return the path.
+def _csv_row(results: TrialResults, row: TrialRun) -> dict[str, Any]:
+    """Return the cells of one run by their headings."""
+    cells: dict[str, Any] = {
+        "policy": row.policy,
+        "command": row.case,
+        "number": row.number,
+        "seed": row.seed,
+        "capture": row.capture,
+        "success": row.figures.success,
+        "run_s": row.script.run_s,
+        "began_s": row.began,
+    }
+    for name in flags_of(results.kind.figures):
+        cells[name] = getattr(row.figures, name)
+    for name, definition in figures_of(results.kind.figures).items():
+        value = definition.value(row.figures)
+        if not definition.joints:
+            cells[definition.column] = value
+            continue
+        unit = definition.column.removeprefix(name)
+        for index, joint in enumerate(results.joint_names):
+            cells[f"{name}_{joint}{unit}"] = value[index] if value else math.nan
+    for heading, value in cells.items():
+        if isinstance(value, bool):
+            cells[heading] = int(value)
+        elif isinstance(value, float) and math.isnan(value):
+            cells[heading] = ""
+    return cells
 
-    NaN becomes null.
+
+def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
+    """Write a body of dataclasses and plain values as JSON, whole or not at all.
+
+    Args:
+        path: The file.
+        schema: Its first entry.
+        body: Its other entries; NaN becomes null.
+
+    Returns:
+        The path.
     """
     text = msgspec.json.format(msgspec.json.encode({"schema": schema, **body}), indent=2)
     write_text(path, text.decode() + "\n")
@@ -375,17 +498,27 @@ def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
 
 @contextmanager
 def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
-    """Read a JSON file of one schema; errors of the block count as damage of the file."""
+    """Read a JSON file of one schema; errors of the block count as damage of the file.
+
+    Args:
+        path: The file.
+        schema: The schema it must have.
+        writer: Command that writes such files, for the messages.
+
+    Raises:
+        ArtefactError: The file is missing, of another schema or damaged.
+    """
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ArtefactError(f"{path}: no such file; `{writer}` writes it.") from None
     except (OSError, ValueError, RecursionError) as error:
         raise ArtefactError(f"{path}: cannot be read ({type(error).__name__}).") from None
-    found = body.get("schema") if isinstance(body, dict) else None
-    if found != schema:
+    stored_schema = body.get("schema") if isinstance(body, dict) else None
+    if stored_schema != schema:
         raise ArtefactError(
-            f"{path}: schema {found!r}; this pronk reads {schema!r}. `{writer}` writes it anew."
+            f"{path}: schema {stored_schema!r}; this pronk reads {schema!r}. `{writer}` writes it "
+            "anew."
         )
     try:
         yield body
@@ -395,35 +528,65 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
         ) from error
 
 
-def save(folder: Path, results: Results) -> tuple[Path, Path]:
+def save_results(folder: Path, results: TrialResults) -> tuple[Path, Path]:
     """Write table and summary, each whole or not at all, the summary last; return the files."""
     kind = results.kind
     table = folder / kind.table
     write_text(table, to_csv(results))
-    head = {name: getattr(results, name) for name in _STORED}
-    sums = {"cells": results.cells, "ratios": results.ratios}
-    body = {**head, "definitions": figures_of(kind.figures), **sums}
+    body = {
+        "rows": results.rows,
+        "robot": results.robot,
+        "virtual": results.virtual,
+        "subjects": results.subjects,
+        "cases": results.cases,
+        "joint_names": results.joint_names,
+        "seed": results.seed,
+        "sim_params": results.sim_params,
+        "script": results.script,
+        "spread_s": results.spread_s,
+        "rules": results.rules,
+        "mass": results.mass,
+        "settings": results.settings,
+        "versions": results.versions,
+        "timing": results.timing,
+        "definitions": figures_of(kind.figures),
+        "cells": results.cells,
+        "ratios": results.ratios,
+    }
     return table, save_json(folder / kind.summary, kind.schema, body)
 
 
-_STORED = [entry.name for entry in fields(Results) if entry.name != "kind"]
+def load_results(folder: Path, kind: RunKind = JUMPS) -> TrialResults:
+    """Read the summary that `save_results` wrote; the table is for other readers.
 
-
-def load(folder: Path, kind: Kind = JUMPS) -> Results:
-    """Read the summary that `save` wrote; the table is for other readers."""
+    Raises:
+        ArtefactError: The summary is missing, of another schema or damaged.
+    """
     with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
-        stored = {name: body[name] for name in _STORED}
-        stored["rows"] = [
-            _known(row) | {"figures": msgspec.convert(_known(row["figures"]), kind.figures)}
-            for row in stored["rows"]
-        ]
-        results = replace(msgspec.convert(stored, Results), kind=kind)
-        counts = [(cell["policy"], cell["case"], cell["n"]) for cell in body["cells"]]
+        rows = tuple(load_run(stored, kind.figures) for stored in body.pop("rows"))
+        sums = body.pop("cells")
+        for name in ("schema", "definitions", "ratios"):
+            del body[name]
+        results = replace(msgspec.convert(body, TrialResults), kind=kind, rows=rows)
+        counts = [(cell["policy"], cell["case"], cell["n"]) for cell in sums]
         if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
             raise ValueError("runs and sums do not fit together")
         return results
 
 
-def _known(entry: Mapping[str, Any]) -> dict[str, Any]:
+def load_run(stored: Mapping[str, Any], kind: type[Any]) -> TrialRun:
+    """Return a run of a JSON file, whose figures are of a class of figures."""
+    figures = msgspec.convert(_without_nulls(stored["figures"]), kind)
+    run = msgspec.convert({**stored, "figures": None}, TrialRun)
+    return replace(run, figures=figures)
+
+
+def _without_nulls(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Leave out what is null: the default, NaN, means unknown as well."""
-    return {name: value for name, value in entry.items() if value is not None}
+    entries: dict[str, Any] = {}
+    for name, value in entry.items():
+        if isinstance(value, dict):
+            entries[name] = _without_nulls(value)
+        elif value is not None:
+            entries[name] = value
+    return entries

@@ -1,4 +1,4 @@
-"""Tables of a trial as text, for the terminal and the page; a dash where nothing was measured."""
+"""Tables of a trial, for the terminal and the page; a dash where nothing was measured."""
 
 from __future__ import annotations
 
@@ -7,13 +7,488 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pronk.jump.trial.criteria import JUMPS, Check, trial_checks
+from pronk.jump.trial.condition_trial import ConditionResults
+from pronk.jump.trial.criteria import CRITERIA_JUMPS, Check, trial_checks
+from pronk.jump.trial.crossing import Climb, climbs
 from pronk.jump.trial.jumps import FIGURES, SYMBOLS, Figure
-from pronk.jump.trial.protocol import PAPER_RATIOS, TABLE_III, in_paper_order
-from pronk.jump.trial.results import FEWEST, Cell, Ratio, Results, Spread
+from pronk.jump.trial.protocol import (
+    PAPER_GAPS,
+    PAPER_RATIOS,
+    TABLE_III,
+    in_paper_order,
+)
+from pronk.jump.trial.results import FEWEST, RunCell, ScatterRatio, Spread, TrialResults
+from pronk.jump.trial.walk import SETTLE_S, WALK_FIGURES
+from pronk.tables import NOT_MEASURED, Cell, Column, Table, number
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
+_ELSEWHERE = ("height", "distance", "flights", "high_flights")
+"""Figures of a jump that have a table of their own."""
+_WALK_TABLE = (
+    "lasted",
+    "forward",
+    "left",
+    "yaw_rate",
+    "speed_error",
+    "speed_error_averaged",
+    "yaw_error_averaged",
+    "roll_rate_rms",
+    "pitch_rate_rms",
+    "power",
+    "cost_of_transport",
+)
+"""Figures of a walk, in the order of its table."""
+_OBSTACLES = {"gap": "gap", "up": "step up", "down": "step down"}
+
+
+# ---- cells ----
+
+
+def spread_text(spread: Spread, digits: int = 3) -> str:
+    """Return mean and standard deviation; of one run its value, without any a dash."""
+    mean = number(spread.mean, digits)
+    if spread.n < 2:
+        return mean
+    return f"{mean} +- {number(spread.std, digits)}"
+
+
+def ratio_text(ratio: ScatterRatio) -> str:
+    """Return a ratio and its interval."""
+    if not math.isfinite(ratio.value):
+        return NOT_MEASURED
+    interval = "too few"
+    if math.isfinite(ratio.low):
+        interval = f"{ratio.low:.2f} to {ratio.high:.2f}"
+    return f"{ratio.value:.2f} ({interval})"
+
+
+def interval_text(interval: tuple[float, float]) -> str:
+    """Return the interval of a share, in percent without a decimal."""
+    low, high = interval
+    return f"{100.0 * low:.0f} to {100.0 * high:.0f}"
+
+
+def place_words(virtual: bool) -> str:
+    """Return where results were measured, in words."""
+    return "virtual robot" if virtual else "robot"
+
+
+def origin_note(trial: TrialResults) -> str:
+    """Return a note that says where the numbers come from."""
+    machine = "pronk's virtual robot, not a real one" if trial.virtual else "the real robot"
+    params = str(trial.sim_params.get("sha256", NOT_MEASURED))[:12]
+    return f"ours: {machine}; seed {trial.seed}, sim_params {params}."
+
+
+# ---- tables of a trial ----
+
+
+def trial_tables(trial: TrialResults) -> list[Table]:
+    """Return all tables of a trial, in the order in which they are read."""
+    tables = [paper_table(trial, "height"), paper_table(trial, "distance"), landings(trial)]
+    for subject in trial.subjects:
+        tables.append(other_figures(trial, subject.name))
+    tables.append(drive_loads(trial))
+    for subject in trial.subjects[1:]:
+        tables.append(scatter_table(trial, subject.name))
+    tables.append(criteria_table(trial))
+    tables.append(definitions())
+    return tables
+
+
+def paper_table(trial: TrialResults, figure: str) -> Table:
+    """Return the paper's Table III beside ours, for `height` or `distance`.
+
+    Its last row is the mean of the standard deviations over the pooled commands.
+    """
+    columns = [Column(heading="command")]
+    columns_of_cells: list[dict[str, str]] = []
+    mean_scatter: list[float] = []
+    for gains in ("naive", "matched"):
+        columns.append(Column(heading=f"paper, {gains}"))
+        cells = {}
+        stds = []
+        for command, (mean, std) in TABLE_III[figure, gains].items():
+            cells[command] = f"{mean:.3f} +- {std:.3f}"
+            stds.append(std)
+        columns_of_cells.append(cells)
+        mean_scatter.append(sum(stds) / len(stds))
+    for policy in in_paper_order(subject.name for subject in trial.subjects):
+        columns.append(Column(heading=f"{policy}, {place_words(trial.virtual)}"))
+        cells = {}
+        for case in trial.cases:
+            cell = trial.cell(policy, case.name)
+            cells[case.name] = f"{spread_text(cell.figures[figure])} ({cell.found}/{cell.n})"
+        columns_of_cells.append(cells)
+        stds = [trial.cell(policy, command).figures[figure].std for command in trial.pooled]
+        mean_scatter.append(sum(stds) / len(stds))
+    rows: list[tuple[Cell, ...]] = []
+    for case in trial.cases:
+        cells_of_command = [cells.get(case.name, NOT_MEASURED) for cells in columns_of_cells]
+        rows.append((case.name, *cells_of_command))
+    scatter_cells = []
+    for std in mean_scatter:
+        scatter_cells.append(f"+- {std:.3f}" if math.isfinite(std) else NOT_MEASURED)
+    rows.append(("mean scatter", *scatter_cells))
+    return Table(
+        title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
+        columns=tuple(columns),
+        rows=tuple(rows),
+        notes=(
+            f"{figure}: {FIGURES[figure].equation}.",
+            f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
+            # Paper E2; that each column is of one policy is reading A21.
+            "paper: five jumps a cell on the real robot, of one policy each.",
+            origin_note(trial),
+        ),
+    )
+
+
+def landings(trial: TrialResults) -> Table:
+    """Return the outcome of every commanded jump."""
+    rows: list[tuple[Cell, ...]] = []
+    for cell in trial.cells:
+        rows.append(
+            (
+                f"{cell.policy}: {cell.case}",
+                cell.n,
+                cell.standing,
+                cell.found,
+                cell.succeeded,
+                f"{100.0 * cell.success:.0f} ({interval_text(cell.success_ci95)})",
+                cell.fell,
+                spread_text(cell.figures["high_flights"], 2),
+            )
+        )
+    return Table(
+        title="Landings",
+        columns=(
+            Column(heading="policy: command"),
+            Column(heading="commanded"),
+            Column(heading="standing"),
+            Column(heading="jumped"),
+            Column(heading="landed"),
+            Column(heading="success [%] (95 %)"),
+            Column(heading="fell"),
+            Column(heading="high flights"),
+        ),
+        rows=tuple(rows),
+        notes=(
+            "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
+            "commanded. fell: at any time of the run.",
+        ),
+    )
+
+
+def other_figures(trial: TrialResults, policy: str) -> Table:
+    """Return the figures of one policy that have no table of their own, with every command."""
+    figures = []
+    for name, figure in FIGURES.items():
+        if not figure.joints and name not in _ELSEWHERE:
+            figures.append(figure)
+    cells = [cell for cell in trial.cells if cell.policy == policy]
+    return Table(
+        title=f"Every other figure of {policy}: mean +- standard deviation",
+        columns=_command_columns(cells),
+        rows=_figure_rows(figures, cells),
+        notes=(origin_note(trial),),
+    )
+
+
+def _command_columns(cells: Sequence[RunCell]) -> tuple[Column, ...]:
+    columns = [Column(heading="figure")]
+    for cell in cells:
+        columns.append(Column(heading=cell.case))
+    return tuple(columns)
+
+
+def _figure_rows(
+    figures: Iterable[Figure], cells: Sequence[RunCell], digits: int = 3
+) -> tuple[tuple[Cell, ...], ...]:
+    """Return a row for each figure, with its unit and its spread in each cell."""
+    rows: list[tuple[Cell, ...]] = []
+    for figure in figures:
+        spreads = [spread_text(cell.figures[figure.name], digits) for cell in cells]
+        rows.append((f"{figure.name.replace('_', ' ')} [{figure.unit}]", *spreads))
+    return tuple(rows)
+
+
+def drive_loads(trial: TrialResults) -> Table:
+    """Return the largest loads of the drives over all jumps, by policy and joint."""
+    rows: list[tuple[Cell, ...]] = []
+    for subject in trial.subjects:
+        cells = [cell for cell in trial.cells if cell.policy == subject.name and cell.found]
+        for joint in trial.joint_names:
+            torques = [cell.joints["peak_torque"][joint].most for cell in cells]
+            speeds = [cell.joints["peak_speed"][joint].most for cell in cells]
+            margins = [cell.joints["torque_margin"][joint].least for cell in cells]
+            rows.append(
+                (
+                    f"{subject.name}: {joint}",
+                    max(torques, default=None),
+                    max(speeds, default=None),
+                    min(margins, default=None),
+                )
+            )
+    return Table(
+        title="Drives: the greatest of all jumps",
+        columns=(
+            Column(heading="policy: joint"),
+            Column(heading="torque", unit="N m", digits=1),
+            Column(heading="speed", unit="rad/s", digits=1),
+            Column(heading="margin", unit="1"),
+        ),
+        rows=tuple(rows),
+        notes=(f"margin: {FIGURES['torque_margin'].equation}.",),
+    )
+
+
+def check_table(title: str, checks: Sequence[Check], notes: Sequence[str] = ()) -> Table:
+    """Return number, limit and outcome of every check; PASSED in a note becomes their count."""
+    rows: list[tuple[Cell, ...]] = []
+    passed_count = 0
+    for check in checks:
+        measured = NOT_MEASURED
+        if math.isfinite(check.value):
+            measured = f"{check.value:.4f} {check.unit}".strip()
+        limit = f"{check.sense} {check.limit:g} {check.unit}".strip()
+        rows.append((check.what, measured, limit, "yes" if check.passed else "NO"))
+        if check.passed:
+            passed_count += 1
+    passed = f"{passed_count} of {len(checks)} acceptance criteria passed"
+    return Table(
+        title=title,
+        columns=(
+            Column(heading="what"),
+            Column(heading="measured"),
+            Column(heading="limit"),
+            Column(heading="passed"),
+        ),
+        rows=tuple(rows),
+        notes=tuple(note.replace("PASSED", passed) for note in notes),
+    )
+
+
+def criteria_table(trial: TrialResults) -> Table:
+    """Return the acceptance criteria of the first policy."""
+    policy = trial.subjects[0].name
+    notes = ["PASSED."]
+    fewest = min(trial.cell(policy, command).n for command in trial.pooled)
+    if fewest < CRITERIA_JUMPS:
+        notes.append(
+            f"The criteria are meant for {CRITERIA_JUMPS} jumps with each command; these are of "
+            f"{fewest}."
+        )
+    title = f"Acceptance criteria of {policy}: the paper's matched column, and more"
+    return check_table(title, trial_checks(trial), notes)
+
+
+def definitions() -> Table:
+    """Return unit and equation of every figure of a jump."""
+    rows: list[tuple[Cell, ...]] = []
+    for figure in FIGURES.values():
+        rows.append((figure.name, figure.unit, figure.equation))
+    return Table(
+        title=DEFINITIONS,
+        columns=(Column(heading="figure"), Column(heading="unit"), Column(heading="equation")),
+        rows=tuple(rows),
+        notes=(SYMBOLS,),
+    )
+
+
+def scatter_table(trial: TrialResults, other: str) -> Table:
+    """Return the standard deviations of another policy over those of the first."""
+    policy = trial.subjects[0].name
+    ratios = [ratio for ratio in trial.ratios if ratio.other == other]
+    commands: list[str] = []
+    for ratio in ratios:
+        command = ratio.case or "all"
+        if command not in commands:
+            commands.append(command)
+    rows: list[tuple[Cell, ...]] = []
+    for figure in trial.kind.compared:
+        texts = []
+        for ratio in ratios:
+            if ratio.figure == figure:
+                texts.append(ratio_text(ratio).replace(" to ", "-"))
+        rows.append((figure, *texts, number(PAPER_RATIOS.get(figure, math.nan), 2)))
+    columns = [Column(heading="figure")]
+    for command in commands:
+        columns.append(Column(heading=command))
+    columns.append(Column(heading="paper, all"))
+    return Table(
+        title=f"Standard deviations, {other} over {policy}, with 95 % bootstrap intervals",
+        columns=tuple(columns),
+        rows=tuple(rows),
+        notes=(
+            f"all: ratio of the means over {', '.join(trial.pooled)}.",
+            # Reading A4: the table's own numbers are taken.
+            "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30.",
+            scatter_verdict(trial, other),
+        ),
+    )
+
+
+def scatter_verdict(trial: TrialResults, other: str) -> str:
+    """Return one sentence on whether another policy scatters more than the first."""
+    policy = trial.subjects[0].name
+    overall = {}
+    for ratio in trial.ratios:
+        if ratio.case is None and ratio.other == other:
+            overall[ratio.figure] = ratio
+    sentences = []
+    repeated_better = []
+    is_known = True
+    for figure in ("distance", "height"):
+        ratio = overall[figure]
+        if not math.isfinite(ratio.value):
+            is_known = False
+            sentences.append(f"in {figure} could not be measured")
+        elif not math.isfinite(ratio.low):
+            is_known = False
+            sentences.append(
+                f"in {figure} {ratio.value:.2f} times as much, with fewer than {FEWEST} jumps in a "
+                "command, too few for an interval"
+            )
+        else:
+            sentences.append(_compared_with_paper(ratio, PAPER_RATIOS[figure]))
+            if ratio.low > 1.0:
+                repeated_better.append(figure)
+    if repeated_better:
+        end = f"so {policy} repeats its jumps better in {' and '.join(repeated_better)}"
+    elif is_known:
+        end = f"so {policy} does not repeat its jumps better here"
+    else:
+        end = "undecided"
+    place = place_words(trial.virtual)
+    return f"scatter of {other} against {policy} on the {place}: {'; '.join(sentences)}; {end}."
+
+
+def _compared_with_paper(ratio: ScatterRatio, claim: float) -> str:
+    """Return how a ratio with its interval compares with 1 and with the paper's."""
+    if ratio.low > 1.0:
+        outcome = "more"
+    elif ratio.high < 1.0:
+        outcome = "less"
+    else:
+        outcome = "no clear difference"
+    if claim > ratio.high:
+        position = "above"
+    elif claim < ratio.low:
+        position = "below"
+    else:
+        position = "within"
+    return (
+        f"in {ratio.figure} {outcome}, {ratio_text(ratio)} times, and the paper's {claim:g} is "
+        f"{position} that interval"
+    )
+
+
+# ---- tables of walks, crossings and conditions ----
+
+
+def walk_table(walks: TrialResults, policy: str) -> Table:
+    """Return the figures of one policy's walks by velocity."""
+    cells = [cell for cell in walks.cells if cell.policy == policy]
+    rows: list[tuple[Cell, ...]] = [
+        ("walks", *(cell.n for cell in cells)),
+        ("fell", *(cell.fell for cell in cells)),
+        ("non-foot contact", *(cell.non_foot_contact for cell in cells)),
+    ]
+    figures = [WALK_FIGURES[name] for name in _WALK_TABLE]
+    rows += _figure_rows(figures, cells, digits=2)
+    return Table(
+        title=f"{_capital_place(walks)}, walking, {policy}: mean +- standard deviation",
+        columns=_command_columns(cells),
+        rows=tuple(rows),
+        notes=(
+            "non-foot contact: walks in which something but a foot touched the ground. The first "
+            f"{SETTLE_S:g} s after the command are left out.",
+        ),
+    )
+
+
+def crossing_table(crossings: TrialResults) -> Table:
+    """Return the largest obstacles that were crossed, and why larger ones were not."""
+    settings = crossings.settings
+    notes = [
+        f"crossed: in {settings['enough']} or more of {settings['runs']} runs, as were all smaller "
+        "ones. ever crossed: in any run. The paper's gaps were judged from video of jumps over "
+        "flat floor."
+    ]
+    rows: list[tuple[Cell, ...]] = []
+    for climb in climbs(crossings):
+        obstacle = f"{climb.policy}: {_OBSTACLES.get(climb.kind, climb.kind)}, {climb.case}"
+        published = PAPER_GAPS.get(climb.case) if climb.kind == "gap" else None
+        failed_at = _failed_at(climb)
+        rows.append((obstacle, climb.largest, climb.ever, published, failed_at))
+        if failed_at is not None:
+            reasons = sorted(climb.rungs[-1].reasons.items(), key=lambda item: -item[1])
+            words = "; ".join(f"{reason} ({count})" for reason, count in reasons)
+            notes.append(f"{obstacle}, {failed_at:.2f} m: {words}.")
+    return Table(
+        title=f"{_capital_place(crossings)}, crossing: largest obstacles [m]",
+        columns=(
+            Column(heading="policy: obstacle"),
+            Column(heading="crossed", digits=2),
+            Column(heading="ever crossed", digits=2),
+            Column(heading="paper, from video", digits=2),
+            Column(heading="failed at", digits=2),
+        ),
+        rows=tuple(rows),
+        notes=tuple(notes),
+    )
+
+
+def _failed_at(climb: Climb) -> float | None:
+    """Return the size at which a climb ended [m]; None if it ended with the sizes."""
+    if climb.rungs and climb.rungs[-1].size > climb.largest:
+        return climb.rungs[-1].size
+    return None
+
+
+def _capital_place(trial: TrialResults) -> str:
+    return place_words(trial.virtual).capitalize()
+
+
+def condition_table(results: ConditionResults) -> Table:
+    """Return landings, height, distance and velocity error under every condition."""
+    rows: list[tuple[Cell, ...]] = []
+    for cell in results.cells:
+        rows.append(
+            (
+                f"{cell.condition}: {cell.policy}",
+                f"{cell.landed}/{cell.jumps}",
+                interval_text(cell.landed_interval),
+                cell.fell,
+                spread_text(cell.height),
+                spread_text(cell.distance),
+                spread_text(cell.velocity_error),
+            )
+        )
+    return Table(
+        title=f"{place_words(results.virtual).capitalize()} under conditions, all commands",
+        columns=(
+            Column(heading="condition: policy"),
+            Column(heading="landed"),
+            Column(heading="95 % interval", unit="%"),
+            Column(heading="fell"),
+            Column(heading="height", unit="m"),
+            Column(heading="distance", unit="m"),
+            Column(heading="velocity error", unit="m/s"),
+        ),
+        rows=tuple(rows),
+        notes=(
+            f"Commands: {', '.join(results.commands)}; {results.jumps} jumps with each, seed "
+            f"{results.seed}. Mean +- standard deviation over all jumps.",
+            "velocity error: difference of mean and commanded velocity along the command before "
+            "the jump input.",
+        ),
+    )
+
+
+# ---- tables of text, until their last callers have changed to `pronk.tables` ----
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,258 +502,15 @@ class Sheet:
 
 
 def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
-    """Return a table; without a row it is left out of the page.
-
-    Headers in `columns` have ` | ` between them; `;2` behind one sets the digits of its numbers, 3
-    without it. Cells are text, numbers, and intervals as pairs of numbers; `held` for an empty one.
-    """
-    heads = [head.partition(";") for head in columns.split(" | ")]
-    cells = tuple(
-        tuple(_cell(cell, int(head[2] or 3)) for cell, head in zip(row, heads, strict=True))
-        for row in rows
-    )
-    return Sheet(title=title, columns=tuple(head[0] for head in heads), rows=cells, notes=notes)
-
-
-# ---- cells ----
-
-
-def _cell(value: Any, digits: int) -> str:
-    if isinstance(value, str | int):
-        return str(value)
-    if isinstance(value, tuple):
-        same = value[0] == value[1]
-        return "held" if same else " to ".join(_cell(one, digits) for one in value)
-    return "-" if value is None else number(value, digits)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Format a number; a dash where it is unknown."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
-
-
-def percent(share: float) -> str:
-    """Format a share in percent."""
-    return number(100.0 * share, 1)
-
-
-def spread(figure: Spread, digits: int = 3) -> str:
-    """Format mean and standard deviation; of one run the value; without any a dash."""
-    average = number(figure.mean, digits)
-    return f"{average} +- {number(figure.std, digits)}" if figure.n > 1 else average
-
-
-def interval(ratio: Ratio) -> str:
-    """Format a ratio and its interval."""
-    if not math.isfinite(ratio.value):
-        return "-"
-    known = math.isfinite(ratio.low)
-    return f"{ratio.value:.2f} ({f'{ratio.low:.2f} to {ratio.high:.2f}' if known else 'too few'})"
-
-
-def tally(cells: Iterable[Cell]) -> tuple[int, int]:
-    """Count the landings, and all runs."""
-    succeeded, n = zip(*((cell.succeeded, cell.n) for cell in cells), strict=True)
-    return sum(succeeded), sum(n)
-
-
-def landed(cells: Iterable[Cell]) -> str:
-    """Format the count of landings among all runs."""
-    return "{}/{}".format(*tally(cells))
-
-
-def place(trial: Any) -> str:
-    """Where results, or bodies, were measured, in words."""
-    return "virtual robot" if trial.virtual else "robot"
-
-
-def virtual_note(trial: Results) -> str:
-    """Where the numbers come from."""
-    where = "pronk's virtual robot, not a real one" if trial.virtual else "the real robot"
-    params = str(trial.sim_params.get("sha256", "-"))[:12]
-    return f"ours: {where}; seed {trial.seed}, sim_params {params}."
-
-
-# ---- tables of a trial ----
-
-
-def sheets(trial: Results) -> tuple[Sheet, ...]:
-    """Return all tables, in the order in which they are read."""
-    return (
-        *(table_iii(trial, figure) for figure in ("height", "distance")),
-        landings(trial),
-        *(more(trial, subject.name) for subject in trial.subjects),
-        drives(trial),
-        *(scatter(trial, other.name) for other in trial.subjects[1:]),
-        criteria(trial),
-        definitions(),
-    )
-
-
-def table_iii(trial: Results, figure: str) -> Sheet:
-    """The paper's Table III beside ours, for `height` or `distance`."""
-    columns: dict[str, tuple[dict[str, str], list[float]]] = {}
-    for gains in ("naive", "matched"):
-        paper = TABLE_III[figure, gains]
-        cells = {case: f"{mean:.3f} +- {std:.3f}" for case, (mean, std) in paper.items()}
-        columns[f"paper, {gains}"] = cells, [std for _, std in paper.values()]
-    for name in in_paper_order(subject.name for subject in trial.subjects):
-        found = {case.name: trial.cell(name, case.name) for case in trial.cases}
-        cells = {k: f"{spread(c.figures[figure])} ({c.found}/{c.n})" for k, c in found.items()}
-        stds = [found[case].figures[figure].std for case in trial.pooled]
-        columns[f"{name}, {place(trial)}"] = cells, stds
-    rows = [
-        (case.name, *(cells.get(case.name, "-") for cells, _ in columns.values()))
-        for case in trial.cases
-    ]
-    means = [number(sum(stds) / len(stds)) for _, stds in columns.values()]
-    scattered = (mean if mean == "-" else f"+- {mean}" for mean in means)
-    return Sheet(
-        title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
-        columns=("command", *columns),
-        rows=(*rows, ("mean scatter", *scattered)),
-        notes=(
-            f"{figure}: {FIGURES[figure].says}.",
-            f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
-            "paper: five jumps a cell on the real robot, of one policy each (E2, A21).",
-            virtual_note(trial),
-        ),
-    )
-
-
-def landings(trial: Results) -> Sheet:
-    """The outcome of every commanded jump."""
-    rows = []
-    for cell in trial.cells:
-        shares = (100.0 * share for share in (cell.success, *cell.success_ci95))
-        row = (f"{cell.policy}: {cell.case}", cell.n, cell.standing, cell.found, cell.succeeded)
-        success, flights = "{:.0f} ({:.0f} to {:.0f})".format(*shares), cell.figures["high_flights"]
-        rows.append((*row, success, cell.fell, spread(flights, 2)))
-    return table(
-        "policy: command | commanded | standing | jumped | landed | success [%] (95 %) | fell"
-        " | high flights",
-        rows,
-        "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
-        "commanded. fell: at any time of the run.",
-        title="Landings",
-    )
-
-
-def more(trial: Results, policy: str) -> Sheet:
-    """Every other figure of one policy, with every command."""
-    elsewhere = ("height", "distance", "flights", "high_flights")
-    own = [f for name, f in FIGURES.items() if not f.joints and name not in elsewhere]
-    cells = [cell for cell in trial.cells if policy == cell.policy]
-    title = f"Every other figure of {policy}: mean +- standard deviation"
-    return of_figures(own, cells, virtual_note(trial), title=title)
-
-
-def of_figures(
-    figures: Iterable[Figure], cells: Sequence[Cell], *notes: str, title: str, digits: int = 3
-) -> Sheet:
-    """A row a figure with its unit: the spread of every cell, headed by its command."""
-    rows = (
-        (
-            f"{one.name.replace('_', ' ')} [{one.unit}]",
-            *(spread(cell.figures[one.name], digits) for cell in cells),
+    """Return a table of text; headers have ` | ` between them, `;2` behind one sets its digits."""
+    headings = []
+    for heading in columns.split(" | "):
+        name, _, digits = heading.partition(";")
+        headings.append(Column(heading=name, digits=int(digits or 3)))
+    text_rows = []
+    for row in rows:
+        text_rows.append(
+            tuple(column.text(cell) for column, cell in zip(headings, row, strict=True))
         )
-        for one in figures
-    )
-    columns = ("figure", *(cell.case for cell in cells))
-    return Sheet(title=title, columns=columns, rows=tuple(rows), notes=notes)
-
-
-def drives(trial: Results) -> Sheet:
-    """The largest loads of the drives over all jumps, by joint."""
-    rows = []
-    for policy in (subject.name for subject in trial.subjects):
-        loads = [cell.joints for cell in trial.cells if cell.policy == policy and cell.found]
-        for joint in trial.joint_names:
-            torque, speed = (
-                max((own[name][joint].most for own in loads), default=math.nan)
-                for name in ("peak_torque", "peak_speed")
-            )
-            margin = min((own["torque_margin"][joint].least for own in loads), default=math.nan)
-            rows.append((f"{policy}: {joint}", torque, speed, margin))
-    columns = "policy: joint | torque [N m];1 | speed [rad/s];1 | margin [1]"
-    note = f"margin: {FIGURES['torque_margin'].says}."
-    return table(columns, rows, note, title="Drives: the greatest of all jumps")
-
-
-def check_sheet(title: str, checks: Sequence[Check], *notes: str) -> Sheet:
-    """Number, limit, and whether it passed, of every check; PASSED in a note counts them."""
-    rows = []
-    for check in checks:
-        known = math.isfinite(check.value)
-        measured = f"{check.value:.4f} {check.unit}".strip() if known else "-"
-        limit = f"{check.sense} {check.limit:g} {check.unit}".strip()
-        rows.append((check.what, measured, limit, "yes" if check.passed else "NO"))
-    passed = f"{sum(check.passed for check in checks)} of {len(checks)} acceptance criteria passed"
-    notes = tuple(note.replace("PASSED", passed) for note in notes)
-    return table("what | measured | limit | passed", rows, *notes, title=title)
-
-
-def criteria(trial: Results) -> Sheet:
-    """The acceptance criteria of the first policy."""
-    first = trial.subjects[0].name
-    title = f"Acceptance criteria of {first}: the paper's matched column, and more"
-    least = min(trial.cell(first, case).n for case in trial.pooled)
-    few = (f"The criteria are meant for {JUMPS} jumps with each command; these are of {least}.",)
-    return check_sheet(title, trial_checks(trial), "PASSED.", *few * (least < JUMPS))
-
-
-def definitions(figures: Iterable[Figure] | None = None) -> Sheet:
-    """The equation of every figure; of those of a jump if None."""
-    rows = ((one.name, one.unit, one.says) for one in figures or FIGURES.values())
-    notes = [SYMBOLS] * (figures is None)
-    return table("figure | unit | equation", rows, *notes, title=DEFINITIONS)
-
-
-def scatter(trial: Results, other: str | None = None) -> Sheet:
-    """Standard deviations of another policy, the second if None, over those of the first."""
-    first, other = trial.subjects[0].name, other or trial.subjects[1].name
-    ratios = [ratio for ratio in trial.ratios if ratio.other == other]
-    rows = []
-    for figure in trial.kind.compared:
-        cells = [interval(r).replace(" to ", "-") for r in ratios if r.figure == figure]
-        rows.append((figure, *cells, number(PAPER_RATIOS.get(figure, math.nan), 2)))
-    cases = dict.fromkeys(ratio.case or "all" for ratio in ratios)
-    return Sheet(
-        title=f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
-        columns=("figure", *cases, "paper, all"),
-        rows=tuple(rows),
-        notes=(
-            f"all: ratio of the means over {', '.join(trial.pooled)}.",
-            "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30 "
-            "(reading A4).",
-            verdict(trial, other),
-        ),
-    )
-
-
-def verdict(trial: Results, other: str) -> str:
-    """One sentence on whether another policy scatters more than the first, as the paper claims."""
-    first, parts, more_alike, unknown = trial.subjects[0].name, [], [], False
-    overall = {r.figure: r for r in trial.ratios if r.case is None and r.other == other}
-    for figure in ("distance", "height"):
-        ratio, claim = overall[figure], PAPER_RATIOS[figure]
-        if not math.isfinite(ratio.low):
-            unknown = True
-            parts.append(
-                f"in {figure} {ratio.value:.2f} times as much, with fewer than {FEWEST} jumps in a "
-                "command, too few for an interval"
-                if math.isfinite(ratio.value)
-                else f"in {figure} could not be measured"
-            )
-            continue
-        how = "more" if ratio.low > 1.0 else "less" if ratio.high < 1.0 else "no clear difference"
-        more_alike += [figure] * (ratio.low > 1.0)
-        where = "above" if claim > ratio.high else "below" if claim < ratio.low else "within"
-        parts.append(
-            f"in {figure} {how}, {interval(ratio)} times, and the paper's {claim:g} is {where} "
-            "that interval"
-        )
-    end = "undecided" if unknown else f"so {first} does not repeat its jumps better here"
-    if more_alike:
-        end = f"so {first} repeats its jumps better in {' and '.join(more_alike)}"
-    return f"scatter of {other} against {first} on the {place(trial)}: {'; '.join(parts)}; {end}."
+    names = tuple(column.heading for column in headings)
+    return Sheet(title=title, columns=names, rows=tuple(text_rows), notes=notes)

@@ -1,10 +1,10 @@
 """Many jumps of the virtual robot: every policy with every command, each jump from its own start.
 
-    results = run_trial([Path("policy.onnx")], Plan(), setup_of(Path("policy.onnx"), out))
+    results = run_trial([Path("policy.onnx")], TrialPlan(), setup_of(Path("policy.onnx"), out))
 
 Each jump has a new virtual robot with its own heading, joint offsets and noise, and a jump input
 that rises up to `spread_s` later, so that it meets every phase of the gait. All of it is drawn from
-seed, command and number of the jump alone. Walks, crossings and varied robots run the same way.
+seed, command and number of the jump alone. Walks and crossings run the same way.
 
     summary.json, trials.csv    what was run, every jump and the sums; a table of the jumps
     captures/, videos/          recorded runs, and films of them
@@ -21,19 +21,26 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-import pronk
 from pronk.errors import ArtefactError, HardwareError, PronkError
 from pronk.files import sha256
 from pronk.jump.trial.jumps import JumpRules
 from pronk.jump.trial.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.jump.trial.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
+from pronk.jump.trial.results import (
+    JUMPS,
+    SUMMARY,
+    TABLE,
+    RunKind,
+    TrialResults,
+    TrialRun,
+    TriedPolicy,
+    save_results,
+)
 from pronk.jump.virtual import capture as captures
 from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot
@@ -46,45 +53,51 @@ from pronk.processes import in_processes
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
+from pronk.version import VERSION
 
-CAPTURES, VIDEOS = "captures", "videos"
-"""Folders beside the table."""
+CAPTURES = "captures"
+"""Folder of captures beside the table."""
+VIDEOS = "videos"
+"""Folder of films beside the table."""
 OFFSET = 0.05
 """Half-width of the joints' offsets from the default pose at the start [rad]. With drives this soft
 it tilts the trunk by 5 degrees, by 13 at most; 0.1 may tip the robot over."""
-_OFFSETS = (1.0, 0.5, 0.0)
-"""Shares of the drawn joint offsets that are tried until the robot stands."""
+_OFFSET_SHARES = (1.0, 0.5, 0.0)
+"""Shares of the drawn joint offsets that are tried until the robot stands [1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
+class TrialSetup:
     """What every kind of trial runs on."""
 
     robot: RobotSpec
-    """Of the policies."""
+    """Robot of the policies."""
     sim_params: SimParams
-    """Of the virtual robot; its ground is the terrain."""
+    """Parameters of the virtual robot; their ground is the terrain."""
     out: Path
+    """Folder of the results."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Source of the parameters, kept with the results."""
     processes: int = 1
-    """Runs at once; no number depends on it."""
+    """Number of runs at once; no number depends on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class TrialPlan:
     """The commands and draws of a trial."""
 
     cases: tuple[Case, ...] = PAPER_COMMANDS
     jumps: int = 20
-    """With each command."""
+    """Number of jumps with each command."""
+    # Paper R7.
     rates: int = 0
-    """Jumps at `RATES` besides, for the paper's figure of roll and pitch rates (R7)."""
+    """Number of jumps at `RATES` besides, for the paper's figure of roll and pitch rates."""
     seed: int = 0
+    """Seed of all draws."""
     script: Script = field(default_factory=lambda: Script(command=STILL))
-    """Times; the command is each case's."""
+    """Times of every run; the command is each case's."""
     spread_s: float = 0.5
-    """The jump input rises up to this much later, uniformly, in policy steps [s]."""
+    """Time by which the jump input rises later at most, uniformly, in policy steps [s]."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan or a negative seed."""
@@ -94,8 +107,8 @@ class Plan:
             raise PronkError(f"seed {self.seed}; expected 0 or more.")
         names = [case.name for case in self.tried]
         if not names or len(set(names)) != len(names):
-            given = ", ".join(names) or "none"
-            raise PronkError(f"the commands are {given}; expected one or more, all different.")
+            commands = ", ".join(names) or "none"
+            raise PronkError(f"the commands are {commands}; expected one or more, all different.")
 
     @property
     def tried(self) -> tuple[Case, ...]:
@@ -109,204 +122,243 @@ def case_rng(seed: int, case: Case, number: int) -> np.random.Generator:
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little"), number])
 
 
-def draw(plan: Plan, case: Case, number: int, robot: RobotSpec) -> tuple[Script, Start, int]:
+@dataclass(frozen=True, kw_only=True)
+class DrawnRun:
+    """What is drawn for one run."""
+
+    script: Script
+    """Commands over time, with the time of the jump input."""
+    start: Start
+    """Heading and joint offsets at the start."""
+    seed: int
+    """Seed of the virtual robot's noise."""
+
+
+def draw_run(plan: TrialPlan, case: Case, number: int, robot: RobotSpec) -> DrawnRun:
     """Draw the script, the start and the noise seed of one jump, numbered from 0."""
     rng = case_rng(plan.seed, case, number)
-    ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
-    later = plan.script.run_s + ticks / robot.policy_rate_hz
-    script = replace(plan.script, command=case.command, run_s=later)
+    later_ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
+    run_s = plan.script.run_s + later_ticks / robot.policy_rate_hz
     yaw = float(rng.uniform(-math.pi, math.pi))
     offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
-    start = Start(yaw=yaw, joint_offset=tuple(offset.tolist()))
-    return script, start, int(rng.integers(2**31))
+    return DrawnRun(
+        script=replace(plan.script, command=case.command, run_s=run_s),
+        start=Start(yaw=yaw, joint_offset=tuple(offset.tolist())),
+        seed=int(rng.integers(2**31)),
+    )
 
 
 # ---- one run ----
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class TrialJob:
     """One run with all that it depends on, so that every process runs it alike."""
 
-    row: Row
+    row: TrialRun
     """The run, without figures."""
-    subject: Subject
-    setup: Setup
+    subject: TriedPolicy
+    setup: TrialSetup
     start: Start
-    kind: Kind
+    kind: RunKind
 
     def build(self, share: float = 1.0) -> VirtualRobot:
         """Build the virtual robot, not connected, at a share of the joint offsets."""
-        offset = tuple(share * each for each in self.start.joint_offset or ())
+        joint_offset = None
+        if self.start.joint_offset:
+            joint_offset = tuple(share * offset for offset in self.start.joint_offset)
         return VirtualRobot(
             self.setup.robot,
             self.setup.sim_params,
             seed=self.row.seed,
             base="ground",
-            start=replace(self.start, joint_offset=offset or None),
+            start=replace(self.start, joint_offset=joint_offset),
         )
 
     def set_down(self) -> VirtualRobot:
-        """Return the virtual robot, standing, held by its drives alone.
+        """Return the virtual robot, standing, with its drives alone holding it.
 
-        A robot that tips over, as a heavier one may, is set down again nearer to the default pose;
-        one that does not stand even in it raises a `HardwareError`.
+        A robot that tips over, as a heavier one may, is set down again nearer to the default pose.
+
+        Raises:
+            HardwareError: The robot does not stand even in the default pose.
         """
-        for share in _OFFSETS:
+        for share in _OFFSET_SHARES:
             machine = self.build(share)
             machine.connect()
             try:
                 check_standing(self.setup.robot, machine.latest())
                 break
             except HardwareError:
-                if share == _OFFSETS[-1]:
+                if share == _OFFSET_SHARES[-1]:
                     raise
         return machine
 
     def policy(self) -> Policy:
         """Return the policy, which each process opens once."""
-        return _opened(self.subject.path, self.subject.sha256)
+        return _open_policy(self.subject.path, self.subject.sha256)
 
 
 @lru_cache(maxsize=4)
-def _opened(path: str, sha256: str) -> Policy:
+def _open_policy(path: str, expected_sha256: str) -> Policy:
     policy = load_policy(Path(path))
-    if policy.sha256 != sha256:
+    if policy.sha256 != expected_sha256:
         raise ArtefactError(f"{path}: was changed while the trial ran; run the trial again.")
     return policy
 
 
-def run_job(job: Job) -> Row:
+def run_job(job: TrialJob) -> TrialRun:
     """Run one job and measure it."""
-    machine, robot, script = job.set_down(), job.setup.robot, job.row.script
+    machine = job.set_down()
+    robot = job.setup.robot
+    script = job.row.script
     began = machine.now()
-    if not list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds)):
+    steps = list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds))
+    if not steps:
         raise HardwareError("the policy made no step; let it run for one tick or more.")
-    recorded = machine.capture()
-    figures = job.kind.measure(recorded, script, robot, began=began)
+    capture = machine.capture()
+    figures = job.kind.measure(capture, script, robot, began=began)
     if job.row.capture:
-        captures.save(job.setup.out / job.row.capture, recorded)
+        captures.save(job.setup.out / job.row.capture, capture)
     return replace(job.row, figures=figures, began=began)
 
 
-def _timed(job: Job) -> tuple[Row, float, float]:
-    """The run, its wall time and its processor time [s]."""
-    begun, begun_cpu = time.perf_counter(), time.process_time()
-    return run_job(job), time.perf_counter() - begun, time.process_time() - begun_cpu
+@dataclass(frozen=True, kw_only=True)
+class _TimedRun:
+    """A run and what it took."""
+
+    row: TrialRun
+    wall_s: float
+    """Wall time [s]."""
+    cpu_s: float
+    """Processor time [s]."""
+
+
+def _run_timed(job: TrialJob) -> _TimedRun:
+    begun = time.perf_counter()
+    begun_cpu = time.process_time()
+    row = run_job(job)
+    return _TimedRun(
+        row=row, wall_s=time.perf_counter() - begun, cpu_s=time.process_time() - begun_cpu
+    )
 
 
 # ---- many runs ----
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    some = getattr(os, "sched_getaffinity", None)  # not on every system
-    return len(some(0)) if some else os.cpu_count() or 1
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on every system
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def plan_jobs(
-    subjects: Sequence[Subject],
-    plan: Plan,
-    setup: Setup,
-    kind: Kind = JUMPS,
+    subjects: Sequence[TriedPolicy],
+    plan: TrialPlan,
+    setup: TrialSetup,
+    kind: RunKind = JUMPS,
     *,
-    keep: Callable[[Case, int], bool] = lambda case, number: False,
-) -> list[Job]:
-    """Return every run of a plan; captures are kept of those that `keep` says."""
-    found: list[Job] = []
-    for subject, case in product(subjects, plan.tried):
-        for number in range(plan.jumps if case in plan.cases else plan.rates):
-            script, start, seed = draw(plan, case, number, setup.robot)
-            stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-            row = Row(
-                policy=subject.name,
-                case=case.name,
-                number=number,
-                seed=seed,
-                script=script,
-                capture=f"{CAPTURES}/{stem}.npz" if keep(case, number) else "",
-            )
-            found.append(Job(row=row, subject=subject, setup=setup, start=start, kind=kind))
-    return found
+    keeps_capture: Callable[[Case, int], bool] = lambda case, number: False,
+) -> list[TrialJob]:
+    """Return every run of a plan.
+
+    Args:
+        subjects: The policies.
+        plan: Commands, numbers of runs and seed.
+        setup: What the runs are on.
+        kind: What is measured.
+        keeps_capture: Called with command and number of a run; whether its capture is kept.
+    """
+    jobs = []
+    for subject in subjects:
+        for case in plan.tried:
+            count = plan.jumps if case in plan.cases else plan.rates
+            for number in range(count):
+                drawn = draw_run(plan, case, number, setup.robot)
+                capture = ""
+                if keeps_capture(case, number):
+                    stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
+                    capture = f"{CAPTURES}/{stem}.npz"
+                row = TrialRun(
+                    policy=subject.name,
+                    case=case.name,
+                    number=number,
+                    seed=drawn.seed,
+                    script=drawn.script,
+                    capture=capture,
+                )
+                jobs.append(
+                    TrialJob(row=row, subject=subject, setup=setup, start=drawn.start, kind=kind)
+                )
+    return jobs
 
 
 def run_trial(
     policies: Sequence[Path],
-    plan: Plan,
-    setup: Setup,
+    plan: TrialPlan,
+    setup: TrialSetup,
     *,
-    kind: Kind = JUMPS,
-    varied: Sequence[tuple[str, float, SimParams]] = (),
-    settings: Mapping[str, Any] | None = None,
+    kind: RunKind = JUMPS,
     keep_captures: bool = False,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
-) -> Results:
-    """Run policies on the virtual robot, measure and save; scatter is compared with the first's.
+) -> TrialResults:
+    """Run policies on the virtual robot, measure and save.
 
-    Of jumps the captures of the first with each command and of those at `RATES` are kept, with
-    `keep_captures` all, and `overwrite` replaces a trial in the folder; other kinds are added to
-    it. `varied` has parameter, value and body of every body, if there are more than that of
-    `setup`. Impossible policies, parameters and folders are refused before the first step.
-    `progress` is called with the share done, 0 to 1.
+    Args:
+        policies: Files of the policies; scatter is compared with that of the first.
+        plan: Commands, numbers of runs and seed.
+        setup: What the runs are on.
+        kind: What is measured. Jumps make a new folder, other kinds are added to it.
+        keep_captures: Keep the captures of all jumps, not only of the first with each command and
+            of those at `RATES`.
+        overwrite: Replace a trial in the folder.
+        progress: Called with the share of the runs that are done, 0 to 1.
+
+    Raises:
+        PronkError: A policy, parameter or folder is impossible; nothing was run then.
     """
-    robot, jobs = setup.robot, []
+    robot = setup.robot
     subjects = load_subjects(policies, robot, jump=kind.jump)
 
-    def keep(case: Case, number: int) -> bool:
-        some = number == 0 or case not in plan.cases
-        return kind is JUMPS and (keep_captures or some)
+    def keeps_capture(case: Case, number: int) -> bool:
+        return kind is JUMPS and (keep_captures or number == 0 or case not in plan.cases)
 
-    for parameter, value, params in varied or [("", math.nan, setup.sim_params)]:
-        made = plan_jobs(subjects, plan, replace(setup, sim_params=params), kind, keep=keep)
-        made[0].build()  # refuses impossible parameters
-        jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
+    jobs = plan_jobs(subjects, plan, setup, kind, keeps_capture=keeps_capture)
+    jobs[0].build()  # refuses impossible parameters
     if kind is JUMPS:
-        prepare(setup.out, overwrite=overwrite)
+        prepare_folder(setup.out, overwrite=overwrite)
     begun = time.perf_counter()
-    done = in_processes(_timed, jobs, processes=setup.processes, progress=progress)
-    rows, seconds, cpu_s = zip(*done, strict=True)
-    simulated = sum(row.script.seconds for row in rows)
-    timing = {
-        "seconds": time.perf_counter() - begun,
-        "simulated_s": simulated,
-        "processes": setup.processes,
-        "cores": os.cpu_count() or 1,
-        "simulated_s_per_s_and_process": simulated / sum(seconds),
-        # Does not depend on other work on the machine.
-        "simulated_s_per_cpu_s": simulated / sum(cpu_s),
-    }
-    return finished(
-        kind,
-        subjects,
-        rows,
-        setup,
+    timed_runs = in_processes(_run_timed, jobs, processes=setup.processes, progress=progress)
+    seconds = time.perf_counter() - begun
+    rows = tuple(run.row for run in timed_runs)
+    simulated_s = sum(row.script.seconds for row in rows)
+    results = TrialResults(
+        kind=kind,
+        rows=rows,
+        robot=robot.name,
+        subjects=subjects,
         cases=plan.tried,
         joint_names=robot.joint_names,
         seed=plan.seed,
+        sim_params=setup.about,
         script=plan.script,
         spread_s=plan.spread_s,
         rules=asdict(JumpRules.of(robot)),
         mass=legged(robot.source).total_mass,
-        settings=dict(settings or {}),
-        timing=timing,
+        versions=software_versions(),
+        timing={
+            "seconds": seconds,
+            "simulated_s": simulated_s,
+            "processes": setup.processes,
+            "cores": os.cpu_count() or 1,
+            "simulated_s_per_s_and_process": simulated_s / sum(run.wall_s for run in timed_runs),
+            # Does not depend on other work on the machine.
+            "simulated_s_per_cpu_s": simulated_s / sum(run.cpu_s for run in timed_runs),
+        },
     )
-
-
-def finished(
-    kind: Kind, subjects: tuple[Subject, ...], rows: Sequence[Row], setup: Setup, **rest: Any
-) -> Results:
-    """Save and return the results of runs; `rest` are further fields of `Results`."""
-    results = Results(
-        kind=kind,
-        robot=setup.robot.name,
-        subjects=subjects,
-        rows=tuple(rows),
-        sim_params=setup.about,
-        versions=versions(),
-        **rest,
-    )
-    save(setup.out, results)
+    save_results(setup.out, results)
     return results
 
 
@@ -317,33 +369,55 @@ def setup_of(
     robot: str | None = None,
     *,
     processes: int | None = None,
-) -> Setup:
-    """Return what a trial of a policy runs on: its robot, on as many processes as there are cores.
+) -> TrialSetup:
+    """Return what a trial of a policy runs on.
 
-    Without a file of parameters they are those that ship with pronk, or derived from the robot.
+    Args:
+        policy: File of the policy.
+        out: Folder of the results.
+        sim_params: File of the virtual robot's parameters. None: those that ship with pronk, or
+            derived from the robot.
+        robot: Name or path of the robot; that of the policy if None.
+        processes: Number of runs at once; as many as there are cores if None.
     """
-    known = load_robot(robot or load_policy(policy).contract.robot)
-    file = sim_params or (SHIPPED if known.name == SHIPPED_ROBOT else None)
-    source = "shipped with pronk" if file else f"derived from the model of {known.name}"
-    return Setup(
-        robot=known,
-        sim_params=load_sim_params(sim_params, known),
+    spec = load_robot(robot or load_policy(policy).contract.robot)
+    file = sim_params
+    if file is None and spec.name == SHIPPED_ROBOT:
+        file = SHIPPED
+    if sim_params is not None:
+        source = str(sim_params)
+    elif file is not None:
+        source = "shipped with pronk"
+    else:
+        source = f"derived from the model of {spec.name}"
+    return TrialSetup(
+        robot=spec,
+        sim_params=load_sim_params(sim_params, spec),
         out=out,
-        about={"file": str(sim_params or source), "sha256": sha256(file) if file else ""},
-        processes=cores() if processes is None else processes,
+        about={"file": source, "sha256": "" if file is None else sha256(file)},
+        processes=usable_cores() if processes is None else processes,
     )
 
 
 def load_subjects(
     paths: Sequence[Path], robot: RobotSpec, *, jump: bool = True
-) -> tuple[Subject, ...]:
+) -> tuple[TriedPolicy, ...]:
     """Open, check and name policies.
 
-    A policy is named after the gains of its training; two of a kind, after their files. With `jump`
-    it needs the jump input. The same policy twice is refused.
+    A policy is named after the gains of its training; two of a kind, after their files.
+
+    Args:
+        paths: Files of the policies.
+        robot: Robot that they must be for.
+        jump: Whether they need the jump input.
+
+    Raises:
+        ArtefactError: A policy is damaged, or not for this robot.
+        PronkError: One policy is there twice.
     """
-    policies = [load_policy(path) for path in paths]
-    for path, policy in zip(paths, policies, strict=True):
+    policies = []
+    for path in paths:
+        policy = load_policy(path)
         try:
             check(policy.contract, robot)
         except ArtefactError as error:
@@ -353,27 +427,40 @@ def load_subjects(
                 f"{path}: this policy was trained to walk only and has no jump input; "
                 "`pronk train jump` adds it."
             )
+        policies.append(policy)
     if len({policy.sha256 for policy in policies}) != len(policies):
         raise PronkError(
             f"{', '.join(map(str, paths))}: the same policy twice; give each policy once."
         )
-    gains = [policy.contract.gains for policy in policies]
-    choices = (gains, [path.stem for path in paths], [path.parent.name for path in paths])
-    numbered = [f"{name} {i}" for i, name in enumerate(gains, start=1)]
-    distinct = (names for names in choices if len(set(names)) == len(names) and all(names))
-    names, found = next(distinct, numbered), []
+    names = _subject_names(paths, [policy.contract.gains for policy in policies])
+    subjects = []
     for name, path, policy in zip(names, paths, policies, strict=True):
         contract = msgspec.to_builtins(policy.contract)
         for unused in ("schema", "observation", "provenance"):
             contract.pop(unused, None)
-        found.append(Subject(name=name, path=str(path), sha256=policy.sha256, contract=contract))
-    return tuple(found)
+        subjects.append(
+            TriedPolicy(name=name, path=str(path), sha256=policy.sha256, contract=contract)
+        )
+    return tuple(subjects)
 
 
-def prepare(out: Path, *, overwrite: bool = False) -> None:
+def _subject_names(paths: Sequence[Path], gains: Sequence[str]) -> list[str]:
+    """Return distinct names: by gains, files or folders, whichever tells the policies apart."""
+    for names in (list(gains), [path.stem for path in paths], [path.parent.name for path in paths]):
+        if len(set(names)) == len(names) and all(names):
+            return names
+    return [f"{name} {number}" for number, name in enumerate(gains, start=1)]
+
+
+def prepare_folder(out: Path, *, overwrite: bool = False) -> None:
     """Make the folder of a trial, before anything is computed.
 
-    With `overwrite` a folder that holds a trial is taken, and that trial's own files are deleted.
+    Args:
+        out: The folder.
+        overwrite: Take a folder that holds a trial, and delete that trial's own files.
+
+    Raises:
+        PronkError: The folder cannot be taken or written to.
     """
     if out.exists() and not out.is_dir():
         raise PronkError(f"--out {out}: a file; expected the name of a folder.")
@@ -393,8 +480,10 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
         # Fails now, not after an hour, if the folder cannot be written to.
         with tempfile.NamedTemporaryFile(dir=out):
             pass
-        films = [f"{VIDEOS}/*.{kind}" for kind in ("mp4", "gif", "png")]
-        for pattern in (SUMMARY, TABLE, f"{CAPTURES}/*.npz", *films):
+        patterns = [SUMMARY, TABLE, f"{CAPTURES}/*.npz"]
+        for ending in ("mp4", "gif", "png"):
+            patterns.append(f"{VIDEOS}/*.{ending}")
+        for pattern in patterns:
             for path in out.glob(pattern):
                 path.unlink()
     except OSError as error:
@@ -403,12 +492,17 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
         ) from None
 
 
-def versions() -> dict[str, str]:
-    """Versions of the software that a trial is computed with."""
+def software_versions() -> dict[str, str]:
+    """Return the versions of the software that a trial is computed with."""
     import mujoco
     import onnxruntime
     import scipy
 
-    modules = (pronk, mujoco, np, scipy, onnxruntime)
-    found = {module.__name__: str(module.__version__) for module in modules}
-    return {"python": platform.python_version()} | found
+    return {
+        "python": platform.python_version(),
+        "pronk": VERSION,
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "onnxruntime": onnxruntime.__version__,
+    }

@@ -1,4 +1,4 @@
-"""Walks of the virtual robot: one velocity for a long time (paper R4), many times, measured.
+"""Walks of the virtual robot: one velocity for a long time, many times, measured (paper R4).
 
 With v the trunk's horizontal velocity and w its yaw rate, both in the trunk's frame, c and r the
 commanded ones, and means over the samples from `SETTLE_S` after the command to its end (or to the
@@ -9,26 +9,27 @@ comes back into the battery is taken off.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pronk.arrays import Array
 from pronk.jump.trial.jumps import (
     GRAVITY,
     JumpRules,
     fallen_at,
+    figure,
     figures_of,
-    number,
     sample_at,
     uncommanded_height,
 )
 from pronk.jump.trial.protocol import Case, named
-from pronk.jump.trial.results import Results, extra_kind
-from pronk.jump.trial.trial import Plan, Setup, run_trial
+from pronk.jump.trial.results import TrialResults, study_kind
+from pronk.jump.trial.trial import TrialPlan, TrialSetup, run_trial
 from pronk.jump.virtual.capture import Capture
 from pronk.policy.script import STILL, Script, Velocity
 from pronk.robots.legged import legged
@@ -43,7 +44,7 @@ NO_PATH = 0.5
 WALK_S = 20.0
 """Length of a walk [s]."""
 WALKS = named("forward 2", "back 2", "side +1", "side -1", "turn +2", "turn -2", "stand")
-"""The paper's R4, turning at the ends of the trained range (C3), and standing."""
+"""The paper's walks (R4), turning at the ends of the trained range (C3), and standing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,27 +56,37 @@ class WalkFigures:
     non_foot_contact: bool
     """Something but a foot touched the ground meanwhile."""
 
-    lasted: float = number("s", "time from the command to the fall, or to its end")
-    speed_error: float = number("m/s", "mean |v - c|")
-    speed_error_averaged: float = number("m/s", "mean |mean of v over the last 0.5 s - c|")
-    yaw_error: float = number("rad/s", "mean |w - r|")
-    yaw_error_averaged: float = number("rad/s", "mean |mean of w over the last 0.5 s - r|")
-    forward: float = number("m/s", "mean of v forward")
-    left: float = number("m/s", "mean of v to the left")
-    yaw_rate: float = number("rad/s", "mean of w")
-    roll_rate_rms: float = number("rad/s", "root mean square of the roll rate")
-    pitch_rate_rms: float = number("rad/s", "root mean square of the pitch rate")
-    power: float = number("W", "mean electrical power, what comes back taken off")
-    cost_of_transport: float = number(
+    lasted: float = figure("s", "time from the command to the fall, or to its end")
+    speed_error: float = figure("m/s", "mean |v - c|")
+    speed_error_averaged: float = figure("m/s", "mean |mean of v over the last 0.5 s - c|")
+    yaw_error: float = figure("rad/s", "mean |w - r|")
+    yaw_error_averaged: float = figure("rad/s", "mean |mean of w over the last 0.5 s - r|")
+    forward: float = figure("m/s", "mean of v forward")
+    left: float = figure("m/s", "mean of v to the left")
+    yaw_rate: float = figure("rad/s", "mean of w")
+    roll_rate_rms: float = figure("rad/s", "root mean square of the roll rate")
+    pitch_rate_rms: float = figure("rad/s", "root mean square of the pitch rate")
+    power: float = figure("W", "mean electrical power, what comes back taken off")
+    cost_of_transport: float = figure(
         "1", "electrical energy / (m g path); no value where no speed is commanded"
     )
-    uncommanded: float = number(
+    uncommanded: float = figure(
         "m", "highest trunk over ground in a flight phase; no value without one"
     )
 
     @property
+    def standing(self) -> bool:
+        """Whether there was a walk to measure, which is always so."""
+        return True
+
+    @property
+    def found(self) -> bool:
+        """Whether there was a walk to measure, which is always so."""
+        return True
+
+    @property
     def success(self) -> bool:
-        """The robot did not fall."""
+        """Whether the robot did not fall."""
         return not self.fell
 
 
@@ -91,65 +102,108 @@ def measure_walk(
     rules: JumpRules | None = None,
     settle_s: float = SETTLE_S,
 ) -> WalkFigures:
-    """Return the figures of one walk; arguments as of `pronk.jump.trial.jumps.measure`."""
-    dt, down = capture.dt, fallen_at(capture)
-    start, end = (
-        min(sample_at(capture, began + t), len(capture.time)) for t in (script.start, script.stop)
-    )
-    first, last = start + round(settle_s / dt), min(down, end)
-    figures: dict[str, Any] = {
-        "fell": down < end,
-        "non_foot_contact": bool(capture.other_contact[start:last].any()),
-        "lasted": max(0, last - start) * dt,
-        "uncommanded": uncommanded_height(capture, None, rules or JumpRules.of(robot)),
-    }
+    """Return the figures of one walk.
+
+    Args:
+        capture: The recorded motion.
+        script: The command of the walk.
+        robot: The robot, for its mass.
+        began: When the policy took over, on the capture's clock [s].
+        rules: Times and heights by which a flight counts; those of the robot if None.
+        settle_s: Time to reach the velocity, left out of the figures [s].
+    """
+    dt = capture.dt
+    count = len(capture.time)
+    down = fallen_at(capture)
+    start = min(sample_at(capture, began + script.start), count)
+    end = min(sample_at(capture, began + script.stop), count)
+    first = start + round(settle_s / dt)
+    last = min(down, end)
+    fell = down < end
+    non_foot_contact = bool(capture.other_contact[start:last].any())
+    lasted = max(0, last - start) * dt
+    uncommanded = uncommanded_height(capture, None, rules or JumpRules.of(robot))
     if first >= last:
-        return WalkFigures(**figures)
+        return WalkFigures(
+            fell=fell, non_foot_contact=non_foot_contact, lasted=lasted, uncommanded=uncommanded
+        )
+    # Forward and left velocity and yaw rate, in the trunk's frame.
     turns = Rotation.from_quat(capture.orientation[:last], scalar_first=True)
-    own = turns.apply(capture.velocity[:last], inverse=True)
-    own[:, 2] = capture.angular_velocity[:last, 2]
-    total, window = np.cumsum(own, axis=0), round(AVERAGE_S / dt)
-    total[window:] -= total[:-window].copy()
-    counts = np.minimum(np.arange(1, last + 1), window)
-    averaged = (total / counts[:, None])[first:]
-    for name, values in (("", own[first:]), ("_averaged", averaged)):
-        error = values - np.asarray(script.command)
-        figures[f"speed_error{name}"] = float(np.hypot(error[:, 0], error[:, 1]).mean())
-        figures[f"yaw_error{name}"] = float(np.abs(error[:, 2]).mean())
-    means = own[first:].mean(axis=0).tolist()
-    figures |= dict(zip(("forward", "left", "yaw_rate"), means, strict=True))
-    rates = np.sqrt(np.mean(capture.angular_velocity[first:last, :2] ** 2, axis=0)).tolist()
+    motion = turns.apply(capture.velocity[:last], inverse=True)
+    motion[:, 2] = capture.angular_velocity[:last, 2]
+    averaged = _moving_average(motion, round(AVERAGE_S / dt))[first:]
+    motion = motion[first:]
+    error = motion - np.asarray(script.command)
+    averaged_error = averaged - np.asarray(script.command)
+    forward, left, yaw_rate = motion.mean(axis=0).tolist()
+    rates = capture.angular_velocity[first:last, :2]
+    roll_rate_rms, pitch_rate_rms = np.sqrt(np.mean(rates**2, axis=0)).tolist()
     power = float(capture.electrical_power[first:last].mean())
-    figures |= {"roll_rate_rms": rates[0], "pitch_rate_rms": rates[1], "power": power}
     path = float(np.hypot(averaged[:, 0], averaged[:, 1]).sum() * dt)
+    cost_of_transport = math.nan
     if path > NO_PATH and any(script.command[:2]):
         weight = legged(robot.source).total_mass * GRAVITY
-        figures["cost_of_transport"] = power * (last - first) * dt / (weight * path)
-    return WalkFigures(**figures)
+        cost_of_transport = power * (last - first) * dt / (weight * path)
+    return WalkFigures(
+        fell=fell,
+        non_foot_contact=non_foot_contact,
+        lasted=lasted,
+        speed_error=float(np.hypot(error[:, 0], error[:, 1]).mean()),
+        speed_error_averaged=float(np.hypot(averaged_error[:, 0], averaged_error[:, 1]).mean()),
+        yaw_error=float(np.abs(error[:, 2]).mean()),
+        yaw_error_averaged=float(np.abs(averaged_error[:, 2]).mean()),
+        forward=forward,
+        left=left,
+        yaw_rate=yaw_rate,
+        roll_rate_rms=roll_rate_rms,
+        pitch_rate_rms=pitch_rate_rms,
+        power=power,
+        cost_of_transport=cost_of_transport,
+        uncommanded=uncommanded,
+    )
 
 
-WALK = extra_kind("walk", figures=WalkFigures, measure=measure_walk, jump=False)
+def _moving_average(values: Array, window: int) -> Array:
+    """Return means over the last `window` samples, fewer at the beginning. (T, n)."""
+    total = np.cumsum(values, axis=0)
+    total[window:] -= total[:-window].copy()
+    counts = np.minimum(np.arange(1, len(values) + 1), window)
+    averaged: Array = total / counts[:, None]
+    return averaged
+
+
+WALK = study_kind("walk", WalkFigures, measure_walk, jump=False)
 
 
 def walk_script(command: Velocity, *, seconds: float = WALK_S) -> Script:
-    """Stand for a moment, then the velocity for `seconds`; no jump, no stop."""
+    """Return a script that stands for a moment, then has the velocity; no jump, no stop."""
     return Script(command=command, run_s=seconds, jump_s=0.0, keep_s=0.0, stop_s=0.0)
 
 
 def add_walks(
     policies: Sequence[Path],
-    setup: Setup,
+    setup: TrialSetup,
     *,
     cases: tuple[Case, ...] = WALKS,
     runs: int = 20,
     seconds: float = WALK_S,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> Results:
+) -> TrialResults:
     """Let policies walk on the virtual robot and write `walk.csv` and `walk.json`.
 
-    Arguments and errors as of `run_trial`; `runs` walks of `seconds` with each of `cases`.
+    Args:
+        policies: Files of the policies.
+        setup: What the walks are on.
+        cases: Velocities.
+        runs: Number of walks with each velocity.
+        seconds: Length of each walk [s].
+        seed: Seed of all draws.
+        progress: Called with the share of the walks that are done, 0 to 1.
+
+    Raises:
+        PronkError: A policy or parameter is impossible; nothing was run then.
     """
     script = walk_script(STILL, seconds=seconds)
-    plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
+    plan = TrialPlan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
     return run_trial(policies, plan, setup, kind=WALK, progress=progress)

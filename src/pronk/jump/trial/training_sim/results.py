@@ -9,8 +9,9 @@ from pathlib import Path
 from pronk.errors import ArtefactError
 from pronk.jump.trial.criteria import evaluation_checks
 from pronk.jump.trial.results import load_json, save_json
-from pronk.jump.trial.tables import Sheet, check_sheet, number, percent, spread, table
+from pronk.jump.trial.tables import Sheet, check_table, spread_text, table
 from pronk.jump.trial.training_sim.evaluation import Evaluation
+from pronk.tables import Table, number, percent
 
 SCHEMA = "pronk/trial/3"
 
@@ -33,7 +34,7 @@ def load_speed_errors(path: Path) -> dict[str, float]:
     return errors
 
 
-def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
+def sheets(evaluation: Evaluation) -> tuple[Sheet | Table, ...]:
     """The tables of an evaluation."""
     walks = []
     for walk in evaluation.walks:
@@ -47,8 +48,8 @@ def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
     jumps = [
         (
             jump.name,
-            spread(jump["height"]),
-            *(spread(jump[name], 2) for name in ("distance", "lift_off_velocity", "delay")),
+            spread_text(jump["height"]),
+            *(spread_text(jump[name], 2) for name in ("distance", "lift_off_velocity", "delay")),
             *(jump[name].mean for name in ("along", "flights", "high_flights")),
             *(percent(jump[n].mean) for n in ("single", "found", "upright", "non_foot_contact")),
         )
@@ -82,6 +83,6 @@ def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
             "touchdown; a trial counts no such jump as a success.",
             title="Jumping: mean +- standard deviation over robots",
         ),
-        check_sheet("Acceptance criteria", evaluation_checks(evaluation), *notes),
+        check_table("Acceptance criteria", evaluation_checks(evaluation), notes),
     )
     return tuple(one for one in found if one.rows)

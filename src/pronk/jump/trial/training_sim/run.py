@@ -26,7 +26,15 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.trial.jumps import fallen_at, measure, sample_at, uncommanded_height
+from pronk.jump.trial.jumps import (
+    FIGURES,
+    JumpFigures,
+    fallen_at,
+    flags_of,
+    measure_jump,
+    sample_at,
+    uncommanded_height,
+)
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.results import Spread
 from pronk.jump.trial.training_sim.evaluation import NEVER, CommandResult, Evaluation, Plan
@@ -256,9 +264,12 @@ def _jump(capture: Capture, case: Case, plan: Plan, *, on: float) -> dict[str, f
     """The figures of a robot that jumps; its jump input rises at `on` [s]."""
     rules, run_s = plan.jump_rules, on - plan.script.start
     script = replace(plan.script, command=case.command, run_s=run_s)
-    found = measure(capture, script, plan.robot, began=0.0, rules=rules)
+    found = measure_jump(capture, script, plan.robot, began=0.0, rules=rules)
     rise = sample_at(capture, on) if found.standing else None
-    figures = {name: value for name, value in vars(found).items() if not isinstance(value, tuple)}
+    figures = {name: getattr(found, name) for name in flags_of(JumpFigures)}
+    for name, figure in FIGURES.items():
+        if not figure.joints:
+            figures[name] = figure.value(found)
     return figures | {
         "uncommanded": uncommanded_height(capture, rise, rules) - rules.standing_height,
         "single": float(found.high_flights == 1.0) if found.standing else math.nan,

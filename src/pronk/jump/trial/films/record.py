@@ -23,7 +23,7 @@ from pronk import opengl
 from pronk.errors import PronkError
 from pronk.files import save_artefact
 from pronk.jump.trial.films.film import SCHEMA, Film, JumpEvents, plan
-from pronk.jump.trial.results import Results
+from pronk.jump.trial.results import TrialResults
 from pronk.jump.virtual import capture as captures
 from pronk.robots.robot import RobotSpec
 
@@ -91,7 +91,7 @@ def environment(backend: str) -> dict[str, str]:
     return {"LP_NUM_THREADS": "1"} | kept | ({"MUJOCO_GL": backend} if backend else {})
 
 
-def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
+def record_film(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
     """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, each whole, and return them.
 
     `warn` is called with one sentence about what this machine lacks, but for OpenGL: see `find_gl`.
@@ -119,7 +119,12 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 
 
 def films_of(
-    found: Results, folder: Path, *, robot: RobotSpec, cases: Container[str], slow: float = SLOW
+    found: TrialResults,
+    folder: Path,
+    *,
+    robot: RobotSpec,
+    cases: Container[str],
+    slow: float = SLOW,
 ) -> dict[str, Film]:
     """Plan a film of the first run of each subject with each command of `cases`, by file name.
 
@@ -133,8 +138,8 @@ def films_of(
         on = row.began + row.script.on
         events, span = None, (on - _BEFORE_S, on + _AFTER_S)
         if row.figures.found:
-            up = on + row.figures.delay
-            down = up + row.figures.duration
+            up = on + row.figures.flight.delay
+            down = up + row.figures.flight.duration
             events = JumpEvents(on=on, off=row.began + row.script.off, liftoff=up, touchdown=down)
             span = (up - _BEFORE_JUMP_S, down + _AFTER_JUMP_S)
         # The name is without what a shell or a link would trip over.
@@ -150,8 +155,8 @@ def films_of(
     return films
 
 
-def record_all(
-    found: Results,
+def record_trial(
+    found: TrialResults,
     folder: Path,
     out: Path,
     *,
@@ -175,7 +180,7 @@ def record_all(
     warnings: dict[str, None] = {}
     files: list[Path] = []
     with ThreadPoolExecutor(max(1, at_once)) as threads:
-        work = partial(record, warn=warnings.setdefault)
+        work = partial(record_film, warn=warnings.setdefault)
         stems = [out / name for name in planned]
         for count, written in enumerate(threads.map(work, planned.values(), stems), start=1):
             files += written
