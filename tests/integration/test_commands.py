@@ -18,6 +18,7 @@ from torch import Tensor
 
 import training_env
 from pronk.jump.train.mdp.commands import MotionCommand, motion_command
+from pronk.jump.train.mdp.jump import JumpInputs
 from pronk.jump.train.mdp.speed_ranges import STEPS
 from training_env import N
 
@@ -194,16 +195,21 @@ def test_target_velocity_in_jump_mode(
 
 def received(
     env: Any, monkeypatch: Patch, yaw: float, pitch: float, velocity: Vector
-) -> dict[str, Tensor]:
+) -> JumpInputs:
     """What the jump state receives of robots with that attitude [deg] and velocity [m/s]."""
-    command, given = motion_command(env), {}
-    monkeypatch.setattr(command.state, "advance", given.update)
+    command = motion_command(env)
+    received_inputs: list[JumpInputs] = []
+
+    def advance(inputs: JumpInputs, dt: float) -> None:
+        received_inputs.append(inputs)
+
+    monkeypatch.setattr(command.state, "advance", advance)
     attitude = Rotation.from_euler("ZY", (yaw, pitch), degrees=True)
     env.sim.data.qpos[:, 3:7] = torch.tensor(attitude.as_quat(scalar_first=True))
     env.sim.data.qvel[:, :3] = torch.tensor(velocity)
     env.common_step_counter += 1
     assert command.motion is command.motion
-    return given
+    return received_inputs[0]
 
 
 @pytest.mark.parametrize("pitch", [0.0, 50.0])
@@ -221,9 +227,9 @@ def test_direction_of_a_jump_in_the_world(
     env: Any, monkeypatch: Patch, yaw: float, pitch: float, velocity: Vector, direction: Vector
 ) -> None:
     motion_command(env).velocity[:] = torch.tensor(velocity)
-    given = received(env, monkeypatch, yaw, pitch, (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(given["direction"], [direction] * N, atol=1e-5)
-    assert given["feet"] is motion_command(env).motion.foot_position
+    inputs = received(env, monkeypatch, yaw, pitch, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(inputs.direction, [direction] * N, atol=1e-5)
+    assert inputs.feet is motion_command(env).motion.legs.foot_position
 
 
 @pytest.mark.parametrize(
@@ -253,6 +259,6 @@ def test_speed_along_the_command(
     monkeypatch.setattr(command.cfg, "jump_speed_added", 0.25)
     command.state.mode[:] = jumps
     command.velocity[:] = torch.tensor((*given, 1.5))
-    motion = received(env, monkeypatch, 0.0, pitch, moves)
-    found = [motion[name].tolist() for name in ("along", "excess", "velocity_error")]
-    np.testing.assert_allclose(np.transpose(found), [expected] * N, atol=1e-5)
+    inputs = received(env, monkeypatch, 0.0, pitch, moves)
+    speeds = torch.stack([inputs.along, inputs.excess, inputs.velocity_error], dim=1)
+    np.testing.assert_allclose(speeds, [expected] * N, atol=1e-5)

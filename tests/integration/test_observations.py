@@ -108,6 +108,7 @@ def test_motion_is_that_of_mujoco(env: Any) -> None:
     qpos, qvel = state(env)
     env.step(torch.rand(N, 12))
     motion = motion_command(env).motion
+    legs = motion.legs
     sites, balls = ids(env, "site", "foot"), ids(env, "geom", "foot_collision")
     knees, hips = ids(env, "joint", "knee"), ids(env, "joint", "hip_pitch")
     before = references(env, qpos, qvel, data.ctrl.numpy())
@@ -122,34 +123,30 @@ def test_motion_is_that_of_mujoco(env: Any) -> None:
             mujoco.mj_objectVelocity(model, reference, mujoco.mjtObj.mjOBJ_SITE, site, twist, 0)
             speed.append(twist[3:].copy())
         size = np.linalg.norm(force, axis=1)
-        np.testing.assert_array_equal(motion.contact[i], size > 0.0)
-        np.testing.assert_allclose(motion.force[i], size, rtol=0.02, atol=0.5)
-        close(motion.foot_height[i], reference.site_xpos[sites, 2] - 0.0175)
-        close(motion.foot_position[i], reference.site_xpos[sites, :2])
-        close(motion.knee_height[i], reference.xanchor[knees, 2])
-        close(motion.foot_velocity[i], speed, atol=1e-4)
-        close(motion.torque[i], reference.qfrc_actuator[6:], atol=1e-4)
-    assert 0.0 < motion.contact.float().mean() < 1.0
+        np.testing.assert_array_equal(legs.contact[i], size > 0.0)
+        np.testing.assert_allclose(legs.force[i], size, rtol=0.02, atol=0.5)
+        close(legs.foot_height[i], reference.site_xpos[sites, 2] - 0.0175)
+        close(legs.foot_position[i], reference.site_xpos[sites, :2])
+        close(legs.knee_height[i], reference.xanchor[knees, 2])
+        close(legs.foot_velocity[i], speed, atol=1e-4)
+        close(motion.joints.torque[i], reference.qfrc_actuator[6:], atol=1e-4)
+    assert 0.0 < legs.contact.float().mean() < 1.0
     qpos, qvel = state(env)
     trunk = rotations(qpos)
     x, y, _ = trunk.apply([1.0, 0.0, 0.0]).T
     heading = Rotation.from_euler("z", np.arctan2(y, x)[:, None])
-    expected = {
-        "position": qpos[:, 7:],
-        "velocity": qvel[:, 6:],
-        "height": qpos[:, 2],
-        "velocity_world": qvel[:, :3],
-        "velocity_heading": heading.inv().apply(qvel[:, :3])[:, :2],
-        "angular_velocity": qvel[:, 3:6],
-        "gravity": trunk.inv().apply([0.0, 0.0, -1.0]),
-        "heading": heading.apply([1.0, 0.0, 0.0])[:, :2],
-    }
-    for name, value in expected.items():
-        close(getattr(motion, name), value)
+    close(motion.joints.position, qpos[:, 7:])
+    close(motion.joints.velocity, qvel[:, 6:])
+    close(motion.trunk.height, qpos[:, 2])
+    close(motion.trunk.velocity_world, qvel[:, :3])
+    close(motion.trunk.velocity_heading, heading.inv().apply(qvel[:, :3])[:, :2])
+    close(motion.trunk.angular_velocity, qvel[:, 3:6])
+    close(motion.trunk.gravity, trunk.inv().apply([0.0, 0.0, -1.0]))
+    close(motion.trunk.heading, heading.apply([1.0, 0.0, 0.0])[:, :2])
     # In the leg's plane: the foot is beside it by as much as the knee.
     for i, reference in enumerate(references(env, qpos, qvel)):
         far = np.linalg.norm(reference.site_xpos[sites] - reference.xanchor[hips], axis=1)
-        close(motion.leg_length[i], np.sqrt(far**2 - 0.004**2))
+        close(legs.length[i], np.sqrt(far**2 - 0.004**2))
 
 
 def test_changes_are_since_the_step_before(env: Any) -> None:
@@ -159,18 +156,28 @@ def test_changes_are_since_the_step_before(env: Any) -> None:
     for _ in range(2):
         env.step(2.0 * torch.rand(N, 12) - 1.0)
     before = command.motion
-    copied = kept(vars(before))
+    torque = before.joints.torque.clone()
+    foot_velocity = before.legs.foot_velocity.clone()
+    unchanged = [
+        before.trunk.height,
+        before.trunk.gravity,
+        before.legs.foot_position,
+        before.legs.knee_height,
+        before.legs.length,
+    ]
+    copies = [value.clone() for value in unchanged]
     assert command.motion is before
     assert command.state.since.tolist() == pytest.approx([0.04] * N)
     env.reset(env_ids=torch.tensor([2]))
     env.step(2.0 * torch.rand(N, 12) - 1.0)
     after = command.motion
-    for name in ("torque", "foot_velocity"):
-        last = copied[name]
-        last[2] = 0.0
-        assert torch.equal(getattr(after, f"{name}_change"), getattr(after, name) - last)
-    for name in ("height", "gravity", "foot_position", "knee_height", "leg_length"):
-        assert torch.equal(getattr(before, name), copied[name]), "a copy"
+    torque[2] = 0.0
+    foot_velocity[2] = 0.0
+    assert torch.equal(after.joints.torque_change, after.joints.torque - torque)
+    velocity_change = after.legs.foot_velocity - foot_velocity
+    assert torch.equal(after.legs.foot_velocity_change, velocity_change)
+    for value, copy in zip(unchanged, copies, strict=True):
+        assert torch.equal(value, copy), "a copy"
 
 
 def test_non_foot_contacts_are_counted(env: Any) -> None:

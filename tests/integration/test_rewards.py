@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor
 import training_env
 from pronk.jump.train.mdp import commands
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.train.mdp.motion import Motion
+from pronk.jump.train.mdp.motion import JointMotion, LegMotion, StepMotion, TrunkMotion
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.tasks.reward_weights import reward_weights
 from training_env import N
@@ -44,33 +45,85 @@ def v(*values: float) -> Tensor:
 
 
 def at(values: dict[int, float]) -> Tensor:
-    """Twelve zeros but for some."""
+    """Return twelve zeros but for some."""
     return torch.tensor([values.get(i, 0.0) for i in range(12)])
 
 
 def feet(*rows: tuple[float, float, float]) -> Tensor:
-    """Vectors of some feet, zeros of the rest."""
-    return torch.tensor([*rows, *[(0.0, 0.0, 0.0)] * (4 - len(rows))])
+    """Return vectors of some feet, and zeros of the others."""
+    zeros = [(0.0, 0.0, 0.0)] * (4 - len(rows))
+    return torch.tensor([*rows, *zeros])
 
 
-def pretend(env: Any, **fields: Tensor) -> Any:
-    """All robots stand still in the default pose, but for some fields of `Motion`, of one robot.
+STILL = {
+    "velocity": torch.zeros(12),
+    "torque": torch.zeros(12),
+    "torque_change": torch.zeros(12),
+    "height": torch.tensor(STANDING),
+    "velocity_world": torch.zeros(3),
+    "velocity_heading": torch.zeros(2),
+    "angular_velocity": torch.zeros(3),
+    "gravity": v(0.0, 0.0, -1.0),
+    "heading": v(1.0, 0.0),
+    "contact": torch.ones(4, dtype=torch.bool),
+    "force": torch.full((4,), 30.0),
+    "foot_position": torch.zeros(4, 2),
+    "foot_height": torch.zeros(4),
+    "foot_velocity": torch.zeros(4, 3),
+    "foot_velocity_change": torch.zeros(4, 3),
+    "knee_height": torch.full((4,), KNEE),
+    "leg_length": torch.full((4,), 0.28),
+    "non_foot_contacts": torch.zeros(()),
+}
+"""Motion of a robot that stands still."""
 
-    `command` is the velocity command; `offset` is added to the default joint positions.
+
+def motion_of(position: Tensor, fields: dict[str, Tensor]) -> StepMotion:
+    """Let all robots stand still with joints at `position`, but for some fields of one robot."""
+    robot = {"position": position, **STILL, **fields}
+    robots = {}
+    for name, value in robot.items():
+        robots[name] = value.expand(N, *value.shape).clone()
+    return StepMotion(
+        joints=JointMotion(
+            position=robots["position"],
+            velocity=robots["velocity"],
+            torque=robots["torque"],
+            torque_change=robots["torque_change"],
+        ),
+        trunk=TrunkMotion(
+            height=robots["height"],
+            velocity_world=robots["velocity_world"],
+            velocity_heading=robots["velocity_heading"],
+            angular_velocity=robots["angular_velocity"],
+            gravity=robots["gravity"],
+            heading=robots["heading"],
+        ),
+        legs=LegMotion(
+            contact=robots["contact"],
+            force=robots["force"],
+            foot_position=robots["foot_position"],
+            foot_height=robots["foot_height"],
+            foot_velocity=robots["foot_velocity"],
+            foot_velocity_change=robots["foot_velocity_change"],
+            knee_height=robots["knee_height"],
+            length=robots["leg_length"],
+        ),
+        non_foot_contacts=robots["non_foot_contacts"],
+    )
+
+
+def pretend(env: Any, fields: dict[str, Tensor] | None = None) -> Any:
+    """Let all robots stand still in the default pose, but for some fields of their motion.
+
+    `fields` are of one robot; `command` among them is the velocity command, `offset` is added to
+    the default joint positions.
     """
+    fields = dict(fields or {})
     command = motion_command(env)
-    still = {name: torch.zeros(12) for name in ("velocity", "torque", "torque_change")}
-    still |= {name: torch.zeros(4, 3) for name in ("foot_velocity", "foot_velocity_change")}
-    still |= {"velocity_world": torch.zeros(3), "velocity_heading": torch.zeros(2)}
-    still |= {"angular_velocity": torch.zeros(3), "gravity": v(0.0, 0.0, -1.0)}
-    still |= {"heading": v(1.0, 0.0), "foot_position": torch.zeros(4, 2), "height": v(STANDING)[0]}
-    still |= {"contact": torch.ones(4, dtype=torch.bool), "force": torch.full((4,), 30.0)}
-    still |= {"foot_height": torch.zeros(4), "knee_height": torch.full((4,), KNEE)}
-    still |= {"leg_length": torch.full((4,), 0.28), "non_foot_contacts": torch.zeros(())}
-    still["position"] = command.default_position[0] + fields.pop("offset", torch.zeros(12))
+    position = command.default_position[0] + fields.pop("offset", torch.zeros(12))
     command.velocity[:] = fields.pop("command", torch.zeros(3))
-    one = still | fields
-    motion = Motion(**{k: value.expand(N, *value.shape).clone() for k, value in one.items()})
+    motion = motion_of(position, fields)
     env.common_step_counter += 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands, "measure_motion", lambda *_: motion)
@@ -80,9 +133,9 @@ def pretend(env: Any, **fields: Tensor) -> Any:
 
 
 def value(env: Any, name: str) -> Tensor:
+    """Compute a term of all robots."""
     term = ROWS[name]
-    found: Tensor = term.func(env, **term.params)
-    return found
+    return term.func(env, **term.params)
 
 
 STRAY = {"foot_height": v(0.10, 0.12, 0.14, 0.04)}
@@ -166,7 +219,7 @@ def test_term_by_hand(
     env: Any, name: str, walking: float, jumping: float | None, fields: dict[str, Tensor]
 ) -> None:
     """None: the same in jump mode, times the term's factor there."""
-    pretend(env, **fields)
+    pretend(env, fields)
     expected = torch.full((N,), walking)
     scale = ROWS[name].params.get("jump_scale", 1.0)
     expected[JUMPER] = scale * (walking if jumping is None else jumping)
@@ -180,17 +233,20 @@ EVENTS = {
     "clearance_gap": "gap_gain",
     "hop": "hop",
 }
+"""Quantity of the jump's state that each event pays for."""
 
 
 @pytest.mark.parametrize("decimation", [2, 6])
 @pytest.mark.parametrize("name", EVENTS)
-def test_events_earn_their_weight_once(env: Any, name: str, decimation: int) -> None:
+def test_events_earn_their_weight_once(
+    env: Any, monkeypatch: pytest.MonkeyPatch, name: str, decimation: int
+) -> None:
     """However long the policy step is (D1)."""
     command = pretend(env)
     env.cfg.decimation = decimation
-    setattr(command.state, EVENTS[name], torch.arange(N) / 4)
-    found = value(env, name) * env.step_dt
-    assert found.tolist() == pytest.approx([i / 4 for i in range(N)])
+    monkeypatch.setattr(command.state, EVENTS[name], torch.arange(N) / 4)
+    earned = value(env, name) * env.step_dt
+    assert earned.tolist() == pytest.approx([i / 4 for i in range(N)])
 
 
 def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:
@@ -209,10 +265,11 @@ def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:
 def test_landing_after_a_jump(env: Any) -> None:
     """5 cm too low: on the ground, in jump mode and after a lift-off."""
     low = ROWS["landing"].params["height"] - 0.05
-    command = pretend(env, height=torch.tensor(low))
+    command = pretend(env, {"height": torch.tensor(low)})
     assert not value(env, "landing").any(), "a crouch"
     command.state.liftoffs = torch.ones(N)
-    expected = [0.05 * (i == JUMPER) for i in range(N)]
+    expected = [0.0] * N
+    expected[JUMPER] = 0.05
     assert value(env, "landing").tolist() == pytest.approx(expected)
     command.state.airborne = torch.ones(N, dtype=torch.bool)
     assert not value(env, "landing").any()
@@ -223,26 +280,40 @@ def test_terms_of_actions_and_of_similarity(env: Any) -> None:
     command.state.similarity = torch.full((N,), 0.5)
     assert value(env, "countermovement").tolist() == [0.5] * N
     env.action_manager.process_action(torch.full((N, 12), 0.5))
-    second = torch.full((N, 12), 0.5)
-    second[0, 3], second[JUMPER, :2] = -0.5, v(1.0, 0.25)
-    env.action_manager.process_action(second)
+    second_action = torch.full((N, 12), 0.5)
+    second_action[0, 3] = -0.5
+    second_action[JUMPER, :2] = v(1.0, 0.25)
+    env.action_manager.process_action(second_action)
     assert value(env, "action_rate").tolist() == pytest.approx([1.0, 0.3125 / 4] + [0.0] * 6)
     # Targets are .35 * 4 = 1.4 rad off: 17 * 1.4 = 23.8 N m, 6.8 over the hip's.
     env.action_manager.process_action(at({3: 4.0}).expand(N, 12))
     assert float(value(env, "torque_limits")[0]) == pytest.approx(6.8, rel=1e-5)
 
 
+def change_one_robot(motion: StepMotion, robot: int) -> None:
+    """Change everything in the motion of one robot."""
+    parts = [motion.joints, motion.trunk, motion.legs]
+    tensors = [motion.non_foot_contacts]
+    for part in parts:
+        tensors += [getattr(part, field.name) for field in dataclasses.fields(part)]
+    for tensor in tensors:
+        if tensor.dtype == torch.bool:
+            tensor[robot] = ~tensor[robot]
+        else:
+            tensor[robot] += 2.0
+
+
 def test_every_term_is_tested_and_of_one_robot_each(env: Any) -> None:
-    others = {"termination", "landing", "countermovement", "action_rate"}
-    assert {case[0] for case in CASES} | set(EVENTS) | others == set(ROWS)
-    command = pretend(env, command=v(1.0, 0.0, 0.0))
+    tested = {case[0] for case in CASES} | set(EVENTS)
+    tested |= {"termination", "landing", "countermovement", "action_rate"}
+    assert tested == set(ROWS)
+    command = pretend(env, {"command": v(1.0, 0.0, 0.0)})
     before = {name: value(env, name).clone() for name in ROWS}
-    for field in vars(command.motion).values():
-        field[2] = ~field[2] if field.dtype == torch.bool else field[2] + 2.0
-    rest = torch.arange(N) != 2
-    for name, old in before.items():
+    change_one_robot(command.motion, 2)
+    other_robots = torch.arange(N) != 2
+    for name, value_before in before.items():
         assert value(env, name).shape == (N,)
-        assert torch.equal(value(env, name)[rest], old[rest]), name
+        assert torch.equal(value(env, name)[other_robots], value_before[other_robots]), name
 
 
 @pytest.mark.parametrize("by_dt", [True, False])
@@ -250,20 +321,21 @@ def test_the_stacked_sum_is_that_of_mjlab(
     env: Any, monkeypatch: pytest.MonkeyPatch, by_dt: bool
 ) -> None:
     """Step by step, with jumps, a fall and physics gone wrong; and in the log of episodes."""
-    managers = [
-        kind(env.cfg.rewards, env, scale_by_dt=by_dt)
-        for kind in (RewardManager, StackedRewardManager)
-    ]
-    monkeypatch.setattr(env, "reward_manager", managers[0])
-    seen = []
+    plain = RewardManager(env.cfg.rewards, env, scale_by_dt=by_dt)
+    stacked = StackedRewardManager(env.cfg.rewards, env, scale_by_dt=by_dt)
+    monkeypatch.setattr(env, "reward_manager", plain)
+    compute_plain = plain.compute
+    plain_rewards = []
+    stacked_rewards = []
 
-    def both(dt: float) -> Tensor:
-        seen.append([type(manager).compute(manager, dt).clone() for manager in managers])
-        return seen[-1][0]
+    def compute_with_both(dt: float) -> Tensor:
+        plain_rewards.append(compute_plain(dt).clone())
+        stacked_rewards.append(stacked.compute(dt).clone())
+        return plain_rewards[-1]
 
-    monkeypatch.setattr(managers[0], "compute", both)
+    monkeypatch.setattr(plain, "compute", compute_with_both)
     for step in range(12):
-        for manager in managers:  # as a phase would
+        for manager in (plain, stacked):  # as a phase would
             manager.get_term_cfg("sparse_jump").weight = 8.0 + step
             manager.get_term_cfg("collision").params["jump_scale"] = 1.0 + step
         motion_command(env).jump[::2] = step > 2
@@ -271,20 +343,28 @@ def test_the_stacked_sum_is_that_of_mjlab(
             env.sim.data.qpos[3, 2:7] = v(0.3, 0.0, 1.0, 0.0, 0.0)
             env.sim.data.qvel[5] = math.nan
         env.step(2.0 * torch.rand(N, 12) - 1.0)
-    own, stacked = (torch.stack(each) for each in zip(*seen, strict=True))
-    assert torch.isfinite(own).all()
-    assert own.abs().min() > 0.0
-    torch.testing.assert_close(stacked, own, rtol=1e-5, atol=1e-5)
-    for index in range(N):
-        theirs, ours = ([*m.get_active_iterable_terms(index)] for m in managers)
-        assert [name for name, _ in ours] == [name for name, _ in theirs] == list(ROWS)
-        np.testing.assert_allclose([r for _, r in ours], [r for _, r in theirs], 1e-5, 1e-6)
+    expected = torch.stack(plain_rewards)
+    assert torch.isfinite(expected).all()
+    assert expected.abs().min() > 0.0
+    torch.testing.assert_close(torch.stack(stacked_rewards), expected, rtol=1e-5, atol=1e-5)
+    for robot in range(N):
+        plain_terms = dict(plain.get_active_iterable_terms(robot))
+        stacked_terms = dict(stacked.get_active_iterable_terms(robot))
+        assert list(stacked_terms) == list(plain_terms) == list(ROWS)
+        for name, rate in plain_terms.items():
+            np.testing.assert_allclose(stacked_terms[name], rate, 1e-5, 1e-6)
     # mjlab's manager has logged two robots' episodes as they ended.
-    ids = torch.tensor([1, 4])
-    logs = [{k: float(x) for k, x in m.reset(ids).items()} for m in managers]
-    assert logs[1] == pytest.approx(logs[0], rel=1e-5, abs=1e-7)
-    assert not any(managers[1].reset(ids).values())
+    robots = torch.tensor([1, 4])
+    plain_log = {name: float(mean) for name, mean in plain.reset(robots).items()}
+    stacked_log = {name: float(mean) for name, mean in stacked.reset(robots).items()}
+    assert stacked_log == pytest.approx(plain_log, rel=1e-5, abs=1e-7)
+    assert not any(stacked.reset(robots).values())
+
+
+def test_the_stacked_manager_is_installed_once(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(env, "reward_manager", RewardManager(env.cfg.rewards, env))
     StackedRewardManager.install(env)
-    first = env.reward_manager
+    installed = env.reward_manager
+    assert isinstance(installed, StackedRewardManager)
     StackedRewardManager.install(env)
-    assert env.reward_manager is first
+    assert env.reward_manager is installed

@@ -25,7 +25,7 @@ from scipy.signal import chirp
 
 from pronk.identify.simulators.command_trace import CommandTrace
 from pronk.jump.train.mdp.actions import NAME as ACTION
-from pronk.jump.train.mdp.actuators import actuators
+from pronk.jump.train.mdp.actuators import drive_cfgs
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import PronkRunner
 from pronk.robots.model import bench_spec
@@ -107,7 +107,7 @@ def on_the_bench(joint: str, delay: int) -> Any:
     chain = ROBOT.joint(joint).chain
     drives = [
         replace(drive, target_names_expr=own)
-        for drive in actuators(ROBOT, MATCHED)
+        for drive in drive_cfgs(ROBOT, MATCHED)
         if (own := tuple(name for name in drive.target_names_expr if name in chain))
     ]
     cfg = config(1, MATCHED)

@@ -20,7 +20,7 @@ import training_env
 from pronk.errors import PronkError, RobotError
 from pronk.identify.match.gains import GroupGains
 from pronk.jump.train.mdp.actions import DelayedJointPositionActionCfg
-from pronk.jump.train.mdp.actuators import PositionDrive, actuators
+from pronk.jump.train.mdp.actuators import PositionDrive, drive_cfgs
 from pronk.jump.train.mdp.events import check_ellipsoid, randomize_decimation, sample_gains
 from pronk.jump.train.tasks.jump_env_cfg import without_randomization
 from pronk.robots.motor import torque_limits
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.train
 
 
 def test_drives_of_every_group() -> None:
-    drives = actuators(ROBOT, MATCHED)
+    drives = drive_cfgs(ROBOT, MATCHED)
     assert [drive.target_names_expr for drive in drives] == [
         tuple(f"{leg}_{group}" for leg in ("FR", "FL", "HR", "HL")) for group in ROBOT.groups
     ]
@@ -41,17 +41,17 @@ def test_drives_of_every_group() -> None:
     found = (knee.armature, knee.effort_limit, knee.saturation_effort, knee.velocity_limit)
     assert found == pytest.approx((0.0062675, 26.435, 97.075, 25.723), rel=1e-4)
     with pytest.raises(PronkError, match="so101"):
-        actuators(ROBOT, replace(MATCHED, robot="so101"))
+        drive_cfgs(ROBOT, replace(MATCHED, robot="so101"))
     weak = replace(ROBOT.joint("FR_knee"), drive=ROBOT.joint("FR_hip_roll").drive)
     joints = tuple(weak if j.name == "FR_knee" else j for j in ROBOT.joints)
     with pytest.raises(RobotError, match="group knee"):
-        actuators(replace(ROBOT, joints=joints), MATCHED)
+        drive_cfgs(replace(ROBOT, joints=joints), MATCHED)
 
 
 @pytest.mark.parametrize("group", range(3))
 def test_law_of_the_drives_is_that_of_the_actuator_model(group: int) -> None:
     """Over more than twice the no-load speed and torques far beyond the limits."""
-    cfg = actuators(ROBOT, MATCHED)[group]
+    cfg = drive_cfgs(ROBOT, MATCHED)[group]
     draw = np.random.default_rng(group)
     target, position = draw.uniform(-4.0, 4.0, (2, 5000, 4))
     speed = draw.uniform(-60.0, 60.0, (5000, 4))

@@ -54,8 +54,10 @@ class Phase:
 
     def largest_noise(self, done: float) -> float:
         """Largest standard deviation of the actions when a fraction of the phase is over."""
-        first, last = self.noise
-        return math.inf if math.isinf(first) else first * (last / first) ** done**2
+        start, end = self.noise
+        if math.isinf(start):
+            return math.inf
+        return start * (end / start) ** done**2
 
 
 _JUMP_A = {
@@ -113,18 +115,26 @@ TASKS: Mapping[str, Mapping[str, int]] = {
 
 
 def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]:
-    """The phase of an iteration, counted from 0, and the fraction of it that is over before.
+    """Find the phase of an iteration.
 
-    Beyond the last iteration the last phase is over. PronkError without any phase.
+    Args:
+        iterations: Iterations of each phase.
+        iteration: Number of the iteration, counted from 0.
+
+    Returns:
+        The phase, and the fraction of it that is over before; 1 beyond the last iteration.
+
+    Raises:
+        PronkError: There is no phase with iterations.
     """
-    present = {name: count for name, count in iterations.items() if count > 0}
-    if not present:
+    phases = [name for name, count in iterations.items() if count > 0]
+    if not phases:
         raise PronkError("all phases have 0 iterations; expected 1 or more for one of them.")
-    for name, count in present.items():
-        if iteration < count:
-            return name, iteration / count
-        iteration -= count
-    return name, 1.0
+    for name in phases:
+        if iteration < iterations[name]:
+            return name, iteration / iterations[name]
+        iteration -= iterations[name]
+    return phases[-1], 1.0
 
 
 class Curriculum:
@@ -134,24 +144,47 @@ class Curriculum:
     """
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        """Remember the rewards' weights and parameters without any phase."""
         self.iterations = {name: cfg.params[name] for name in PHASES}
         self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
-        self._set = -1
-        self._initial = {
-            name: (term.weight, dict(term.params)) for name, term in env.cfg.rewards.items()
-        }
+        self._iteration = -1
+        self._weights: dict[str, float] = {}
+        self._params: dict[str, dict[str, Any]] = {}
+        for name, term in env.cfg.rewards.items():
+            self._weights[name] = term.weight
+            self._params[name] = dict(term.params)
 
     @property
     def total(self) -> int:
-        """Iterations of all phases."""
+        """Number of iterations of all phases."""
         return sum(self.iterations.values())
 
-    def __call__(self, env: ManagerBasedRlEnv, env_ids: Any, **_: int) -> dict[str, float]:
-        """Apply the phase, and return what is logged."""
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: Any,
+        walk: int,
+        jump_a: int,
+        jump_b: int,
+        steps_per_iteration: int,
+    ) -> dict[str, float]:
+        """Apply the phase.
+
+        Args:
+            env: The environment.
+            env_ids: Robots that reset; all robots have one phase.
+            walk: Iterations of that phase, read at the beginning.
+            jump_a: The same.
+            jump_b: The same.
+            steps_per_iteration: Policy steps of an iteration, read at the beginning.
+
+        Returns:
+            What is logged: number of the phase, and the fraction of it that is over.
+        """
         iteration = env.common_step_counter // self.steps_per_iteration
         name, done = phase_at(self.iterations, iteration)
-        if iteration != self._set:
-            self._set = iteration
+        if iteration != self._iteration:
+            self._iteration = iteration
             self.apply(env, PHASES[name], done)
         return {"phase": float(list(PHASES).index(name)), "done": done}
 
@@ -159,25 +192,29 @@ class Curriculum:
         """Set a phase of which a fraction is over, whatever the step counter."""
         from pronk.jump.train.mdp.commands import motion_command
 
-        for name, (weight, params) in self._initial.items():
+        for name, weight in self._weights.items():
             term = env.reward_manager.get_term_cfg(name)
-            term.weight = _between(phase.weights.get(name, (weight, weight)), done)
+            term.weight = weight
+            if name in phase.weights:
+                term.weight = _between(phase.weights[name], done)
+            term.params.update(self._params[name])
             if name in phase.jump_scales:
-                params = {**params, "jump_scale": _between(phase.jump_scales[name], done)}
-            term.params.update(params)
+                term.params["jump_scale"] = _between(phase.jump_scales[name], done)
         command = motion_command(env)
         command.state.liftoff_std = _between(phase.liftoff_std, done)
         command.cfg.jump_fraction = 0.5 if phase.jump else 0.0
-        first, last = phase.guidance
-        command.guidance_scale = last + (first - last) * (1.0 - done) ** 2
+        start, end = phase.guidance
+        command.guidance_scale = end + (start - end) * (1.0 - done) ** 2
 
 
 def curriculum(env: ManagerBasedRlEnv) -> Curriculum:
-    """The curriculum term of an environment."""
+    """Return the curriculum term of an environment."""
     term = env.curriculum_manager.get_term_cfg(NAME).func
     assert isinstance(term, Curriculum)
     return term
 
 
 def _between(span: Span, done: float) -> float:
-    return span[0] + (span[1] - span[0]) * done
+    """Return the value of a phase of which a fraction is over."""
+    start, end = span
+    return start + (end - start) * done

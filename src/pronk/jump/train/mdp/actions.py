@@ -55,6 +55,7 @@ class DelayedJointPositionAction(JointPositionAction):
     cfg: DelayedJointPositionActionCfg
 
     def __init__(self, cfg: DelayedJointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
+        """Begin with the default pose in force."""
         super().__init__(cfg, env)
         low, high = cfg.delay_steps
         self.lag = torch.full((self.num_envs, 1), low, device=self.device)
@@ -62,9 +63,11 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery = Battery(self._entity)
         self.guidance: Tensor | None = None
         """Added to the coming targets, if not None [rad]. (N, joints)"""
-        everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
-        # A slice costs a view where a list of indices costs a kernel.
-        self._joints: slice | Tensor = slice(None) if everything else self._target_ids
+        all_joints = list(range(self._entity.num_joints))
+        self._joints: slice | Tensor = self._target_ids
+        if self._target_ids.tolist() == all_joints:
+            # A slice costs a view where a list of indices costs a kernel.
+            self._joints = slice(None)
         self._default: Tensor = self._entity.data.default_joint_pos[:, self._joints]
         # With a policy step of at least one physics step no older target can be in force.
         count = high + 1
@@ -89,40 +92,47 @@ class DelayedJointPositionAction(JointPositionAction):
         """Give the drives the targets that are in force in the coming physics step."""
         low, high = self.cfg.delay_steps
         # A reset clears the drives' targets: the first physics step writes them in any case.
-        if self._ages[0] == 0 or any(low <= age <= high for age in self._ages):
+        changes = self._ages[0] == 0
+        for age in self._ages:
+            changes = changes or low <= age <= high
+        if changes:
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
         self.battery.advance()
 
     def _in_force(self) -> Tensor:
-        """Of each robot the newest target that is at least as old as its delay."""
+        """Return of each robot the newest target that is at least as old as its delay."""
         low, high = self.cfg.delay_steps
-        ring = [self._targets[self._newest - i] for i in range(len(self._ages))]
-        oldest = next(i for i, age in enumerate(self._ages) if age >= high)
-        target = ring[oldest]
-        for i in reversed(range(oldest)):
+        count = len(self._ages)
+        # The newest target that is old enough for every robot, then the newer ones.
+        index = 0
+        while self._ages[index] < high:
+            index += 1
+        target = self._targets[(self._newest - index) % count]
+        for i in reversed(range(index)):
             if self._ages[i] >= low:
-                target = torch.where(self.lag <= self._ages[i], ring[i], target)
+                newer_target = self._targets[(self._newest - i) % count]
+                target = torch.where(self.lag <= self._ages[i], newer_target, target)
         return target
 
     def reset(self, env_ids: Tensor | slice | None = None) -> None:
         """Draw the delays of new episodes; the default pose is in force until a target arrives."""
         super().reset(env_ids)
-        which = slice(None) if env_ids is None else env_ids
-        self.battery.reset(which)
+        robots = slice(None) if env_ids is None else env_ids
+        self.battery.reset(robots)
         if self.guidance is not None:
-            self.guidance[which] = 0.0
+            self.guidance[robots] = 0.0
         low, high = self.cfg.delay_steps
         if high == 0:
             return
-        self._targets[:, which] = self._default[which]
+        self._targets[:, robots] = self._default[robots]
         if low < high:
-            drawn = torch.randint(low, high + 1, self.lag.shape, device=self.device)
-            self.lag[which] = drawn[which]
+            delays = torch.randint(low, high + 1, self.lag.shape, device=self.device)
+            self.lag[robots] = delays[robots]
 
 
 def joint_position_action(env: ManagerBasedRlEnv) -> DelayedJointPositionAction:
-    """The action term of an environment."""
+    """Return the action term of an environment."""
     term = env.action_manager.get_term(NAME)
     assert isinstance(term, DelayedJointPositionAction)
     return term

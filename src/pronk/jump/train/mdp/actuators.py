@@ -75,26 +75,39 @@ class PositionDrive(DcMotorActuator[PositionDriveCfg]):
         return torch.addcmul(torque, back_emf, cmd.vel, value=-1.0).clamp(-limit, limit)
 
 
-def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
-    """One actuator for each joint group, in the robot's order of groups."""
+def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
+    """Configure one actuator for each joint group, in the robot's order of groups.
+
+    Args:
+        robot: The robot.
+        gains: Nominal gains of its joint groups.
+
+    Raises:
+        PronkError: Gains of another robot, or a group with different drives.
+    """
     if gains.robot != robot.name:
         raise PronkError(f"gains of {gains.robot} were given for the drives of {robot.name}.")
     cfgs = []
     for group in robot.groups:
-        joints, own = robot.group(group), gains.groups[group]
-        drive, fitted = joints[0].drive, own.frictionloss
-        if any(joint.drive != drive for joint in joints):
-            raise RobotError(
-                f"the joints of {robot.name}'s group {group} have different drives; expected one "
-                "drive for all joints of a group."
-            )
+        joints = robot.group(group)
+        group_gains = gains.groups[group]
+        drive = joints[0].drive
+        for joint in joints:
+            if joint.drive != drive:
+                raise RobotError(
+                    f"the joints of {robot.name}'s group {group} have different drives; expected "
+                    "one drive for all joints of a group."
+                )
+        frictionloss = group_gains.frictionloss
+        if math.isnan(frictionloss):
+            frictionloss = drive.frictionloss
         cfgs.append(
             PositionDriveCfg(
                 target_names_expr=tuple(joint.name for joint in joints),
-                stiffness=own.stiffness,
-                damping=own.damping,
+                stiffness=group_gains.stiffness,
+                damping=group_gains.damping,
                 armature=drive.armature,
-                frictionloss=drive.frictionloss if math.isnan(fitted) else fitted,
+                frictionloss=frictionloss,
                 viscous_damping=drive.viscous_damping,
                 effort_limit=drive.effort_limit,
                 saturation_effort=drive.stall_torque,

@@ -17,8 +17,8 @@ from torch import Tensor
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import guidance
-from pronk.jump.train.mdp.jump import JumpSettings, JumpState
-from pronk.jump.train.mdp.motion import Motion, measure_motion, standing_leg
+from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
+from pronk.jump.train.mdp.motion import StepMotion, measure_motion, standing_leg
 from pronk.jump.train.mdp.speed_ranges import SpeedRanges
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
@@ -45,7 +45,7 @@ class MotionCommandCfg(CommandTermCfg):
 
     They grow up to these, see `pronk.jump.train.mdp.speed_ranges`."""
     standing: float = 0.1
-    """Fraction of the draws that are zero."""
+    """Fraction of the velocity draws that are zero."""
     one_axis: float = 0.4
     """Fraction of the draws along one axis alone, as in the trials."""
     jump_fraction: float = 0.0
@@ -60,6 +60,7 @@ class MotionCommandCfg(CommandTermCfg):
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not rewarded."""
     settings: JumpSettings = field(default_factory=JumpSettings)
+    """Definition of a good jump."""
 
     def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
         """Build the term of an environment."""
@@ -73,8 +74,10 @@ class MotionCommand(CommandTerm):
     time_left: Tensor
 
     def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
+        """Begin with commands of zero."""
         super().__init__(cfg, env)
-        count, device = self.num_envs, self.device
+        count = self.num_envs
+        device = self.device
         self.body = legged(cfg.robot)
         self.velocity = torch.zeros(count, 3, device=device)
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. (N, 3)"""
@@ -82,49 +85,59 @@ class MotionCommand(CommandTerm):
         """Jump input. (N,)"""
         entity = env.scene["robot"]
         self.default_position: Tensor = entity.data.default_joint_pos
-        """[rad]. (N, 12)"""
+        """Joint angles of the default pose [rad]. (N, 12)"""
         self.position_limits: Tensor = entity.data.joint_pos_limits
-        """[rad]. (N, 12, 2)"""
-        joints = load_robot(cfg.robot).joints
-        pairs = [(joint.drive, cfg.gains.groups[joint.group]) for joint in joints]
-        numbers = [(own.stiffness, own.damping, drive.effort_limit) for drive, own in pairs]
-        self.stiffness, self.damping, self.effort_limit = torch.tensor(numbers).T.to(device)
+        """Lowest and highest joint angles [rad]. (N, 12, 2)"""
+        nominal = []
+        for joint in load_robot(cfg.robot).joints:
+            gains = cfg.gains.groups[joint.group]
+            nominal.append((gains.stiffness, gains.damping, joint.drive.effort_limit))
+        self.stiffness, self.damping, self.effort_limit = torch.tensor(nominal).T.to(device)
         """Nominal [N m/rad, N m s/rad], and of the drives [N m]. (12,)"""
         self.scripted = False
         """True: `velocity` and `jump` are set by the caller alone."""
         self.guidance_scale = 0.0
         """Fraction of the guidance that is added to the actions, 0 to 1; a phase sets it."""
-        gains = (self.stiffness, self.damping)
-        self._guidance = guidance(self.body, cfg.settings, *gains, env.step_dt)
+        self._guidance = guidance(
+            self.body, cfg.settings, self.stiffness, self.damping, env.step_dt
+        )
         self._standing_leg = standing_leg(self.body)
         self.state = JumpState(count, device, cfg.settings)
         self.ranges = SpeedRanges(device)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)
         moving = 1.0 - cfg.standing
-        kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
-        self._kinds = torch.tensor([*kinds, moving], device=device)
+        self._draw_ends = torch.tensor(
+            [
+                min(cfg.one_axis * 1 / 3, moving),
+                min(cfg.one_axis * 2 / 3, moving),
+                min(cfg.one_axis * 3 / 3, moving),
+                moving,
+            ],
+            device=device,
+        )
         """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
         self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
         """Axes that each kind of draw moves along."""
         spans = torch.tensor([cfg.resampling_time_range, cfg.jump_on_s, cfg.jump_off_s])
-        self._least, self._most = spans.to(device).T[:, :, None]
+        self._shortest, self._longest = spans.to(device).T[:, :, None]
         # The golden ratio spreads any fraction evenly over the robots.
         self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
         sites = [f"{leg}_foot" for leg in self.body.legs]
         feet, _ = entity.find_sites(sites, preserve_order=True)
         self.feet: Tensor = entity.indexing.site_ids[feet].long()
         """The foot sites' ids in the model. (4,)"""
-        geoms, _ = entity.find_geoms([f"{s}_collision" for s in sites], preserve_order=True)
+        collision_geoms = [f"{site}_collision" for site in sites]
+        geoms, _ = entity.find_geoms(collision_geoms, preserve_order=True)
         self.foot_geoms: Tensor = entity.indexing.geom_ids[geoms].long()
         """Ids of the feet's geoms. (4,)"""
-        self._motion: Motion | None = None
+        self._motion: StepMotion | None = None
         self._motion_step = -1
-        self._scales: dict[float, Tensor] = {}
+        self._jump_scales: dict[float, Tensor] = {}
 
     @property
     def command(self) -> Tensor:
-        """Velocity command, (N, 3)."""
+        """Velocity command. (N, 3)."""
         return self.velocity
 
     @property
@@ -150,7 +163,7 @@ class MotionCommand(CommandTerm):
 
     @property
     def standing(self) -> Tensor:
-        """Commanded to stand still: no velocity and no jump. Bool, (N,)."""
+        """Robots commanded to stand still: no velocity and no jump. Bool, (N,)."""
         return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.state.mode
 
     @property
@@ -159,44 +172,50 @@ class MotionCommand(CommandTerm):
         return joint_position_action(self._env)._processed_actions
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> StepMotion:
         """Motion in the step just simulated; measured once a step, on first use."""
         step = self._env.common_step_counter
         if self._motion is None or self._motion_step != step:
             self._motion = measure_motion(self._env, self.body, self.feet, self._motion)
             self._motion_step = step
-            self._scales.clear()
+            self._jump_scales.clear()
             self._advance_state(self._motion)
         return self._motion
 
-    def in_jump_mode(self, scale: float) -> Tensor:
-        """`scale` in jump mode, 1 outside. (N,)."""
-        if scale not in self._scales:
-            self._scales[scale] = torch.where(self.state.mode, scale, 1.0)
-        return self._scales[scale]
+    def scaled_in_jump_mode(self, value: Tensor, scale: float) -> Tensor:
+        """Multiply a reward of each robot, (N,), by `scale` where it is in jump mode."""
+        if scale == 1.0:
+            return value
+        if scale not in self._jump_scales:
+            self._jump_scales[scale] = torch.where(self.state.mode, scale, 1.0)
+        return value * self._jump_scales[scale]
 
-    def _advance_state(self, motion: Motion) -> None:
-        horizontal, target = motion.velocity_heading, self.target
+    def _advance_state(self, motion: StepMotion) -> None:
+        """Advance the state of the jumps and the ranges of the velocities by a step."""
+        trunk = motion.trunk
+        horizontal = trunk.velocity_heading
+        target = self.target
         commanded = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(commanded, dim=-1)
         # The part along the command, which `target` is parallel to; zero without one.
         along = (horizontal * commanded).sum(dim=-1) / speed.clamp_min(1e-6)
-        left = torch.stack((-motion.heading[:, 1], motion.heading[:, 0]), dim=-1)
-        way = commanded[:, :1] * motion.heading + commanded[:, 1:] * left
-        self.state.advance(
-            jump=self.jump,
-            contact=motion.contact,
-            height=motion.height,
-            vertical=motion.velocity_world[:, 2],
+        left = torch.stack((-trunk.heading[:, 1], trunk.heading[:, 0]), dim=-1)
+        way = commanded[:, :1] * trunk.heading + commanded[:, 1:] * left
+        way_norm = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+        inputs = JumpInputs(
+            command=self.jump,
+            contact=motion.legs.contact,
+            height=trunk.height,
+            vertical=trunk.velocity_world[:, 2],
             velocity_error=torch.linalg.vector_norm(horizontal - target, dim=-1),
-            turn=torch.linalg.vector_norm(motion.angular_velocity[:, :2], dim=-1),
+            turn=torch.linalg.vector_norm(trunk.angular_velocity[:, :2], dim=-1),
             along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
             excess=along - speed,
-            feet=motion.foot_position,
-            direction=way / torch.linalg.vector_norm(way, dim=-1, keepdim=True).clamp_min(1e-6),
-            extension=motion.leg_length - self._standing_leg,
-            dt=self._env.step_dt,
+            feet=motion.legs.foot_position,
+            direction=way / way_norm.clamp_min(1e-6),
+            extension=motion.legs.length - self._standing_leg,
         )
+        self.state.advance(inputs, self._env.step_dt)
         if not self.scripted:
             self.ranges.advance(horizontal - commanded, ~self.state.mode)
 
@@ -244,32 +263,36 @@ class MotionCommand(CommandTerm):
         if self.guidance_scale == 0.0:
             action.guidance = None
             return
-        state, last = self.state, len(self._guidance) - 1
+        state = self.state
+        last_step = len(self._guidance) - 1
         # The jump state learns of a new command at the end of the step that begins with it.
         begins = self.jump & ~state.commanded
-        steps = (state.since / self._env.step_dt).round().long().clamp_max(last)
+        steps = (state.since / self._env.step_dt).round().long().clamp_max(last_step)
         on_the_ground = state.mode & (state.liftoffs == 0.0)
-        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
+        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last_step))
         action.guidance = self.guidance_scale * self._guidance[steps]
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
-        drawn = torch.rand(7, count, device=self.device)
-        axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
-        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.fraction * self._limits) * axes
-        time, on, off = torch.lerp(self._least, self._most, drawn[4:])
+        """Draw velocities (count, 3), and times until the next, with jump and without it [s]."""
+        uniform = torch.rand(7, count, device=self.device)
+        axes = self._axes[torch.bucketize(uniform[3], self._draw_ends)]
+        widths = 2.0 * self.ranges.fraction * self._limits
+        velocity = (uniform[:3].T - 0.5) * widths * axes
+        time, on, off = torch.lerp(self._shortest, self._longest, uniform[4:])
         return velocity, time, on, off
 
     def _update_metrics(self) -> None:
-        """No-op, as the next two, which mjlab requires: see `compute` and `reset`."""
+        """Do nothing, as the next two, which mjlab requires: see `compute` and `reset`."""
 
-    def _resample_command(self, env_ids: Tensor) -> None: ...
+    def _resample_command(self, env_ids: Tensor) -> None:
+        """Do nothing."""
 
-    def _update_command(self, env_ids: Tensor | None) -> None: ...
+    def _update_command(self, env_ids: Tensor | None) -> None:
+        """Do nothing."""
 
 
 def motion_command(env: ManagerBasedRlEnv) -> MotionCommand:
-    """The command term of an environment."""
+    """Return the command term of an environment."""
     term = env.command_manager.get_term(NAME)
     assert isinstance(term, MotionCommand)
     return term

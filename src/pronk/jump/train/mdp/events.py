@@ -27,7 +27,7 @@ Shape = Literal["box", "ellipsoid"]
 
 
 class UniformNoise(UniformNoiseCfg):
-    """mjlab's, drawn in place: two operations instead of five, twenty times a step."""
+    """mjlab's uniform noise, drawn in place by two operations instead of five."""
 
     def apply(self, data: Tensor) -> Tensor:
         """Add noise to a measurement of any shape."""
@@ -35,49 +35,68 @@ class UniformNoise(UniformNoiseCfg):
 
 
 def _uniform(env: Any, span: Range, *shape: int) -> Tensor:
+    """Draw numbers that are uniform in `span`."""
     return torch.empty(shape, device=env.device).uniform_(*span)
 
 
 def randomize_gains(
     env: Any, env_ids: None, ranges: Mapping[str, GroupGains], shape: Shape
 ) -> None:
-    """Draw stiffness and damping of every joint independently (D3, D4); ranges by joint name."""
+    """Draw stiffness and damping of every joint independently (D3, D4).
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        ranges: Gains and their ranges by joint name.
+        shape: Whether they are drawn in the box or in the ellipsoid of their ranges.
+    """
     for drive in env.scene["robot"].actuators:
-        pairs = [
-            sample_gains(ranges[name], shape, env.num_envs, env.device)
-            for name in drive.target_names
-        ]
-        kp, kd = torch.stack(pairs, dim=-1).unbind(dim=1)
-        drive.set_gains(slice(None), kp=kp, kd=kd)
+        gains = []
+        for name in drive.target_names:
+            gains.append(sample_gains(ranges[name], shape, env.num_envs, env.device))
+        stiffness, damping = torch.stack(gains, dim=-1).unbind(dim=1)
+        drive.set_gains(slice(None), kp=stiffness, kd=damping)
 
 
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:
-    """Draws of (stiffness, damping), (n, 2).
+    """Draw pairs of gains.
 
     Box: uniform in nominal +- range. Ellipsoid, which `check_ellipsoid` accepts: uniform in
     {x : (x - c)^T E^-1 (x - c) <= 1}, as x = c + L u with L L^T = E, u uniform in the unit disc.
+
+    Args:
+        gains: Nominal gains and their ranges.
+        shape: Box or ellipsoid.
+        n: Number of pairs.
+        device: Device of the result.
+
+    Returns:
+        Stiffness [N m/rad] and damping [N m s/rad], (n, 2).
     """
     if shape == "box":
         nominal = torch.tensor([gains.stiffness, gains.damping], device=device)
-        half = torch.tensor([gains.stiffness_range, gains.damping_range], device=device)
-        return nominal + half * (2.0 * torch.rand(n, 2, device=device) - 1.0)
-    angle, area = torch.rand(2, n, device=device).unbind()
-    angle = 2.0 * torch.pi * angle
+        half_width = torch.tensor([gains.stiffness_range, gains.damping_range], device=device)
+        return nominal + half_width * (2.0 * torch.rand(n, 2, device=device) - 1.0)
+    turn, area = torch.rand(2, n, device=device).unbind()
+    angle = 2.0 * torch.pi * turn
     disc = area.sqrt() * torch.stack([angle.cos(), angle.sin()])
     root: Tensor = torch.linalg.cholesky(torch.tensor(gains.ellipsoid, device=device))
-    return torch.tensor(gains.ellipsoid_center, device=device) + (root @ disc).transpose(0, 1)
+    center = torch.tensor(gains.ellipsoid_center, device=device)
+    return center + (root @ disc).transpose(0, 1)
 
 
 def check_ellipsoid(gains: GroupGains) -> None:
-    """PronkError for gains without an ellipsoid, or whose ellipsoid reaches gains of 0 or less."""
+    """Refuse gains without an ellipsoid, or whose ellipsoid reaches gains of 0 or less."""
     (a, b), (c, d) = gains.ellipsoid
     stiffness, damping = gains.ellipsoid_center
-    least = stiffness - max(a, 0.0) ** 0.5, damping - abs(d) ** 0.5
-    if not (a > 0.0 and a * d - b * c > 0.0 and min(least) > 0.0):
+    lowest_stiffness = stiffness - max(a, 0.0) ** 0.5
+    lowest_damping = damping - abs(d) ** 0.5
+    is_ellipsoid = a > 0.0 and a * d - b * c > 0.0
+    if not (is_ellipsoid and lowest_stiffness > 0.0 and lowest_damping > 0.0):
         raise PronkError(
             f"the gains about {gains.stiffness:g} and {gains.damping:g} have no ellipsoid of "
-            f"positive gains (it reaches down to {least[0]:g} and {least[1]:g}); draw them in the "
-            "box, or use a gains.yaml whose joints differ."
+            f"positive gains (it reaches down to {lowest_stiffness:g} and {lowest_damping:g}); "
+            "draw them in the box, or use a gains.yaml whose joints differ."
         )
 
 
@@ -88,11 +107,19 @@ def randomize_shank_length(
     """Draw the length of every shank, knee axis to foot centre (D5).
 
     The foot moves along the shank, and the shank's capsule ends as far from the foot as before.
-    Mass and inertia of the shank stay: a tube cut by 7 % changes them no more. `span` is of the
-    length [m]; `shanks` are capsules along z, as many as `feet` and in the same order.
+    Mass and inertia of the shank stay: a tube cut by 7 % changes them no more.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        span: Shortest and longest shank [m].
+        feet: Geoms and sites of the feet.
+        shanks: Capsules along z, as many as `feet` and in the same order.
     """
-    robot, model = env.scene["robot"], env.sim.model
-    foot, shank = (robot.indexing.geom_ids[cfg.geom_ids] for cfg in (feet, shanks))
+    robot = env.scene["robot"]
+    model = env.sim.model
+    foot = robot.indexing.geom_ids[feet.geom_ids]
+    shank = robot.indexing.geom_ids[shanks.geom_ids]
     site = robot.indexing.site_ids[feet.site_ids]
     default = env.sim.get_default_field
     length = _uniform(env, span, env.num_envs, len(foot))
@@ -100,35 +127,45 @@ def randomize_shank_length(
     model.geom_pos[:, foot, 2] = -length
     model.site_pos[:, site, 2] = -length
     # A capsule's size is (radius, half length); one of its ends moves.
-    half = default("geom_size")[shank, 1] + longer / 2
-    tip = default("geom_size")[shank, 0] + half
+    half_length = default("geom_size")[shank, 1] + longer / 2
+    tip = default("geom_size")[shank, 0] + half_length
     model.geom_pos[:, shank, 2] = default("geom_pos")[shank, 2] - longer / 2
-    model.geom_size[:, shank, 1] = half
+    model.geom_size[:, shank, 1] = half_length
     model.geom_rbound[:, shank] = tip
     model.geom_aabb[:, shank, 1, 2] = tip
 
 
 @requires_model_fields("body_mass", "body_inertia", recompute=RecomputeLevel.set_const)  # type: ignore[untyped-decorator]
 def randomize_base_mass(env: Any, env_ids: None, added: Range, base: SceneEntityCfg) -> None:
-    """Draw the trunk's mass (D6); its inertia grows in proportion, its centre of mass stays."""
+    """Draw the mass added to the trunk [kg] (D6); its inertia grows in proportion."""
     ids = env.scene["robot"].indexing.body_ids[base.body_ids]
-    mass, inertia = (env.sim.get_default_field(f)[ids] for f in ("body_mass", "body_inertia"))
+    mass = env.sim.get_default_field("body_mass")[ids]
+    inertia = env.sim.get_default_field("body_inertia")[ids]
     if not float(mass) + added[0] > 0.0:
         raise PronkError(
             f"base_mass adds {added[0]:g} kg to a trunk of {float(mass):.3g} kg; expected a mass "
             "above 0."
         )
-    drawn = mass + _uniform(env, added, env.num_envs, 1)
-    env.sim.model.body_mass[:, ids] = drawn
-    env.sim.model.body_inertia[:, ids] = inertia * (drawn / mass)[..., None]
+    new_mass = mass + _uniform(env, added, env.num_envs, 1)
+    env.sim.model.body_mass[:, ids] = new_mass
+    env.sim.model.body_inertia[:, ids] = inertia * (new_mass / mass)[..., None]
 
 
 def randomize_battery(
     env: Any, env_ids: None, voltage: Range, resistance: Range, rated: float
 ) -> None:
-    """Draw each robot's battery: voltage at no load [V], resistance with the wires [ohm]."""
-    volts, ohms = (_uniform(env, span, env.num_envs, 1) for span in (voltage, resistance))
-    joint_position_action(env).battery.set(volts, ohms, rated=rated)
+    """Draw each robot's battery.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        voltage: Lowest and highest voltage at no load [V].
+        resistance: Lowest and highest resistance with the wires [ohm].
+        rated: Rated voltage of the drives [V].
+    """
+    no_load = _uniform(env, voltage, env.num_envs, 1)
+    internal = _uniform(env, resistance, env.num_envs, 1)
+    joint_position_action(env).battery.set(no_load, internal, rated=rated)
 
 
 def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int, int]) -> None:
@@ -136,6 +173,12 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
 
     The draw is a function of the step counter: the same in every process, so that GPUs need not
     wait for one another.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        nominal: Physics steps of a policy step without randomization.
+        added: Smallest and largest number of steps added to that.
     """
     if nominal + added[0] < 1:
         raise PronkError(
@@ -151,19 +194,26 @@ def reset_state(
     """Draw the state in which an episode begins, about the initial state, which stands upright.
 
     mjlab's events for this take four times the operations: a seventh of a training step with
-    thousands of robots. Arguments are half-widths: `place` of the position [m] and `speed` of the
-    velocity [m/s] along world x and y, `heading` of the yaw angle [rad], `joints` of the joint
-    positions about the default pose [rad].
+    thousands of robots.
+
+    Args:
+        env: The environment.
+        env_ids: Robots whose episode begins, (n,).
+        place: Half-width of the position along world x and y [m].
+        speed: Half-width of the velocity along world x and y [m/s].
+        heading: Half-width of the yaw angle [rad].
+        joints: Half-width of the joint positions about the default pose [rad].
     """
     robot = env.scene["robot"]
     root = robot.data.default_root_state[env_ids]
     pose = robot.data.default_joint_pos[env_ids]
-    drawn = _uniform(env, (-1.0, 1.0), len(env_ids), 5 + pose.shape[1])
+    uniform = _uniform(env, (-1.0, 1.0), len(env_ids), 5 + pose.shape[1])
     root[:, :3] += env.scene.env_origins[env_ids]
-    root[:, :2].add_(drawn[:, :2], alpha=place)
-    half = drawn[:, 2] * (heading / 2)
-    root[:, 3], root[:, 6] = half.cos(), half.sin()
-    root[:, 7:9].add_(drawn[:, 3:5], alpha=speed)
-    pose.add_(drawn[:, 5:], alpha=joints)
+    root[:, :2].add_(uniform[:, :2], alpha=place)
+    half_angle = uniform[:, 2] * (heading / 2)
+    root[:, 3] = half_angle.cos()
+    root[:, 6] = half_angle.sin()
+    root[:, 7:9].add_(uniform[:, 3:5], alpha=speed)
+    pose.add_(uniform[:, 5:], alpha=joints)
     robot.write_root_state_to_sim(root, env_ids=env_ids)
     robot.write_joint_state_to_sim(pose, torch.zeros_like(pose), env_ids=env_ids)

@@ -22,11 +22,18 @@ _DIFFERENCE = 1e-4
 
 
 def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Hip pitch and knee [rad] of a leg whose foot is below its hip, bent as in the default pose.
+    """Compute the angles of a leg whose foot is below its hip, bent as in the default pose.
 
-    `length` is from the axis of the hip pitch to the foot [m], at most that of a straight leg.
+    Args:
+        body: Dimensions of the robot.
+        length: Distance from the axis of the hip pitch to the foot [m], at most that of a straight
+            leg; any shape.
+
+    Returns:
+        Hip pitch and knee [rad].
     """
-    thigh, shank = body.thigh_length, body.shank_length
+    thigh = body.thigh_length
+    shank = body.shank_length
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = torch.arccos(cosine.clamp(-1.0, 1.0))
     pitch = -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos())
@@ -37,33 +44,44 @@ def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
 def guidance(
     body: Legged, settings: JumpSettings, stiffness: Tensor, damping: Tensor, dt: float
 ) -> Tensor:
-    """Offsets of the joint targets in each policy step after a jump command [rad].
+    """Compute offsets of the joint targets in each policy step after a jump command [rad].
 
     A drive gives stiffness (target - q) - damping qdot, so a target lies beyond the joint's
     intended position by what torque and velocity need. Guided like that, a policy that only walks
     left the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
 
-    `stiffness` [N m/rad] and `damping` [N m s/rad] are of the drives, leg by leg, (12,); a policy
-    step takes `dt` [s]. Returns (steps + 1, 12): the last but one is for the step that ends with
-    the lift-off, the last is zero.
+    Args:
+        body: Dimensions of the robot.
+        settings: The countermovement.
+        stiffness: Stiffness of the drives, leg by leg [N m/rad], (12,).
+        damping: Damping of the drives, leg by leg [N m s/rad], (12,).
+        dt: Duration of a policy step [s].
+
+    Returns:
+        The offsets, (steps + 1, 12): the last but one is for the step that ends with the lift-off,
+        the last is zero.
     """
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
     default = torch.tensor([body.default_position[name] for name in body.leg_joints]).double()
-
-    def angles(at: Tensor) -> Tensor:
-        pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(at))
-        return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)
-
-    pose, rate = angles(time), angles(time + _DIFFERENCE) - angles(time - _DIFFERENCE)
+    pose = _countermovement_angles(body, settings, time)
+    later_pose = _countermovement_angles(body, settings, time + _DIFFERENCE)
+    earlier_pose = _countermovement_angles(body, settings, time - _DIFFERENCE)
     upwards = torch.where(time < settings.fall_s, -settings.fall, settings.push)
     force = (0.25 * body.total_mass * (upwards + GRAVITY)).clamp_min(0.0)
     torque = torch.zeros_like(pose)
     # The force passes through the hip; the knee is beside it by the thigh's horizontal part.
     torque[:, 2] = force * body.thigh_length * pose[:, 1].sin()
-    offset, torque, rate = (
-        value.repeat(1, len(body.legs)) for value in (pose - default, torque, rate)
-    )
-    moving = damping.double().cpu() * rate / (2.0 * _DIFFERENCE)
-    added = offset + (torque + moving) / stiffness.double().cpu()
+    legs = len(body.legs)
+    offset = (pose - default).repeat(1, legs)
+    torque = torque.repeat(1, legs)
+    change = (later_pose - earlier_pose).repeat(1, legs)
+    damping_torque = damping.double().cpu() * change / (2.0 * _DIFFERENCE)
+    added = offset + (torque + damping_torque) / stiffness.double().cpu()
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)
+
+
+def _countermovement_angles(body: Legged, settings: JumpSettings, time: Tensor) -> Tensor:
+    """Compute the angles of a leg's joints at times after a jump command [rad], (n, 3)."""
+    pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(time))
+    return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)

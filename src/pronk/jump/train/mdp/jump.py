@@ -12,7 +12,7 @@ is yet to be found; later a narrow one separates 2.2 from 2.5 m/s.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
@@ -67,7 +67,7 @@ class JumpSettings:
 
     def __post_init__(self) -> None:
         """Refuse values that are not positive, and times in the wrong order."""
-        for name, value in vars(self).items():
+        for name, value in asdict(self).items():
             if not value > 0.0:
                 raise PronkError(f"JumpSettings.{name} is {value}; expected more than 0.")
         if not (self.ready_s <= self.prompt_s and self.fall_s < self.prompt_s):
@@ -82,11 +82,14 @@ class JumpSettings:
         return (self.liftoff_velocity + self.fall * self.fall_s) / (self.prompt_s - self.fall_s)
 
     def countermovement(self, since: Tensor) -> Tensor:
-        """Leg length minus that of the default pose in a jump, `since` the command [s] [m].
+        """Compute leg lengths in a jump, less that of the default pose [m].
 
         The trunk falls with `fall` for `fall_s`; then its velocity rises evenly, by `push`, to
         `liftoff_velocity` at `prompt_s`. The feet stay in place. This takes about a third of the
         power of a push at once.
+
+        Args:
+            since: Time since the command [s]; any shape.
         """
         falls = since.clamp_max(self.fall_s)
         pushes = (since - self.fall_s).clamp_min(0.0)
@@ -94,10 +97,46 @@ class JumpSettings:
         return pushed - 0.5 * self.fall * falls.square()
 
 
+@dataclass(frozen=True, kw_only=True)
+class JumpInputs:
+    """What the jump state learns of N robots in one policy step."""
+
+    command: Tensor
+    """The jump input, bool. (N,)"""
+    contact: Tensor
+    """Whether each foot is on the ground, bool. (N, 4)"""
+    height: Tensor
+    """Height of the trunk over ground [m]. (N,)"""
+    vertical: Tensor
+    """Vertical velocity of the trunk [m/s]. (N,)"""
+    velocity_error: Tensor
+    """Distance of the trunk's horizontal velocity from the one rewarded [m/s]. (N,)"""
+    turn: Tensor
+    """Norm of the trunk's roll and pitch rate [rad/s]. (N,)"""
+    along: Tensor
+    """Part of the horizontal velocity in the commanded direction, at most the one rewarded [m/s].
+    (N,)"""
+    excess: Tensor
+    """The same part without its upper limit, minus the commanded speed [m/s]. (N,)"""
+    feet: Tensor
+    """Horizontal positions of the feet in the world's frame [m]. (N, 4, 2)"""
+    direction: Tensor
+    """Unit vector of the commanded velocity in the world's frame, or zero. (N, 2)"""
+    extension: Tensor
+    """Length of each leg minus that in the default pose [m]. (N, 4)"""
+
+
 class JumpState:
     """State of the jumps of N robots, and what changed in the last policy step."""
 
     def __init__(self, count: int, device: torch.device | str, settings: JumpSettings) -> None:
+        """Begin without any jump.
+
+        Args:
+            count: Number of robots, N.
+            device: Device of the state.
+            settings: Definition of a good jump.
+        """
         self.settings = settings
         self.liftoff_std = 1.0
         """Standard deviation of the lift-off kernel [m/s]; a phase sets it."""
@@ -111,7 +150,7 @@ class JumpState:
         self.commanded = false()  # jump input at the last step
         self.airborne = false()
         self.mode = false()  # in jump mode
-        self.settling = zeros()  # left in jump mode once on the ground with the input off [s]
+        self.settling = zeros()  # time in jump mode on the ground with the input off, to go [s]
         self.since = zeros()  # since the rising edge of the input; 0 outside jump mode [s]
         self.vertical = zeros()  # vertical velocity of the trunk at the last step [m/s]
         self.overspeed = zeros()  # speed above the command when the jump was commanded [m/s]
@@ -140,40 +179,57 @@ class JumpState:
 
     def reset(self, env_ids: Tensor) -> None:
         """Clear the state of some robots, env_ids (n,)."""
-        for value in vars(self).values():
-            if isinstance(value, Tensor):
-                value[env_ids] = 0
+        for value in (
+            self.commanded,
+            self.airborne,
+            self.mode,
+            self.settling,
+            self.since,
+            self.vertical,
+            self.overspeed,
+            self.reward_scale,
+            self.best_score,
+            self.score_gain,
+            self.liftoffs,
+            self.hop,
+            self.highest,
+            self.lowest,
+            self.travel,
+            self.travel_gain,
+            self.flight,
+            self.overspeed_distance,
+            self.best_flight,
+            self.flight_gain,
+            self.stance,
+            self.best_gap,
+            self.gap_gain,
+            self.similarity,
+        ):
+            value[env_ids] = 0
 
-    def advance(
-        self,
-        *,
-        jump: Tensor,  # jump input, bool
-        contact: Tensor,  # foot contacts, bool, (N, 4)
-        height: Tensor,  # trunk over ground [m]
-        vertical: Tensor,  # vertical velocity of the trunk [m/s]
-        velocity_error: Tensor,  # distance of its horizontal velocity from the one rewarded [m/s]
-        turn: Tensor,  # norm of its roll and pitch rate [rad/s]
-        along: Tensor,  # part of its horizontal velocity in the commanded direction [m/s]
-        excess: Tensor,  # `along` without its upper limit, minus the commanded speed [m/s]
-        feet: Tensor,  # horizontal positions of the feet, world frame [m], (N, 4, 2)
-        direction: Tensor,  # unit vector of the commanded velocity, world frame, or zero, (N, 2)
-        extension: Tensor,  # length of each leg minus that in the default pose [m], (N, 4)
-        dt: float,
-    ) -> None:
-        """Advance by one policy step of `dt` [s]."""
+    def advance(self, inputs: JumpInputs, dt: float) -> None:
+        """Advance by one policy step.
+
+        Args:
+            inputs: What was commanded and measured in it.
+            dt: Its duration [s].
+        """
         s = self.settings
-        airborne = ~contact.any(dim=-1)
+        jump = inputs.command
+
+        # Jump mode.
+        airborne = ~inputs.contact.any(dim=-1)
         begins = jump & ~self.commanded
         keep = ~begins
-        self.overspeed = torch.where(begins, excess.clamp_min(0.0), self.overspeed)
+        self.overspeed = torch.where(begins, inputs.excess.clamp_min(0.0), self.overspeed)
         on_the_ground = (self.settling - dt).clamp_min(0.0)
         self.settling = torch.where(airborne, self.settling, on_the_ground)
         self.settling = torch.where(jump, s.settle_s, self.settling)
         self.mode = self.settling > 0.0
         self.since = (self.since * keep + dt) * self.mode
 
-        # Sampled every 20 ms, the velocity at lift-off lies between the last two samples.
-        speed = torch.maximum(vertical, self.vertical)
+        # Lift-off. Sampled every 20 ms, its velocity lies between the last two samples.
+        speed = torch.maximum(inputs.vertical, self.vertical)
         liftoff = (airborne & ~self.airborne & self.mode).float()
         jumped = liftoff * (speed > s.stride_velocity)
         kernel = torch.exp((speed - s.liftoff_velocity).square() * (-0.5 / self.liftoff_std**2))
@@ -183,48 +239,55 @@ class JumpState:
         scale = torch.minimum(late, early).clamp(0.0, 1.0) * slow_start
         self.reward_scale = torch.where(liftoff > 0.0, scale, self.reward_scale * keep)
         # Half of the score is for the vertical velocity, half for that with direction and attitude.
-        off_aim = (velocity_error / s.aim_std).square() + (turn / s.turn_std).square()
-        score = kernel * (0.5 + 0.5 * torch.exp(-0.5 * off_aim)) * self.reward_scale * liftoff
-        best = self.best_score * keep
-        self.best_score = torch.maximum(best, score)
-        self.score_gain = self.best_score - best
-        liftoffs = self.liftoffs * keep
-        self.hop = jumped * (liftoffs > 0.0)
-        self.liftoffs = liftoffs + jumped
+        aim_error = (inputs.velocity_error / s.aim_std).square()
+        aim_error = aim_error + (inputs.turn / s.turn_std).square()
+        score = kernel * (0.5 + 0.5 * torch.exp(-0.5 * aim_error)) * self.reward_scale * liftoff
+        score_before = self.best_score * keep
+        self.best_score = torch.maximum(score_before, score)
+        self.score_gain = self.best_score - score_before
+        liftoffs_before = self.liftoffs * keep
+        self.hop = jumped * (liftoffs_before > 0.0)
+        self.liftoffs = liftoffs_before + jumped
 
-        # Leg by leg: the trunk's velocity shows the action of one leg only with three others' and
-        # later. With it nothing was learned in 170 iterations.
-        before = self.mode & (self.liftoffs == 0.0) & (self.since <= s.prompt_s)
-        off = (extension - s.countermovement(self.since)[:, None]).square()
-        self.similarity = torch.exp(off * (-0.5 / s.similarity_std**2)).mean(dim=-1) * before
+        # Countermovement, leg by leg: the trunk's velocity shows the action of one leg only with
+        # three others' and later. With it nothing was learned in 170 iterations.
+        is_prompt = self.mode & (self.liftoffs == 0.0) & (self.since <= s.prompt_s)
+        length_error = inputs.extension - s.countermovement(self.since)[:, None]
+        kernel = torch.exp(length_error.square() * (-0.5 / s.similarity_std**2))
+        self.similarity = kernel.mean(dim=-1) * is_prompt
 
-        # A crouch counts: a battery's power is too low for a push over a short way.
+        # Height. A crouch counts: a battery's power is too low for a push over a short way.
         continues = self.mode & keep
-        low = height.clamp_min(s.crouch)
+        low = inputs.height.clamp_min(s.crouch)
         lowest = torch.where(continues, self.lowest, low)
-        travel = self.travel * continues
-        self.highest = torch.maximum(torch.where(continues, self.highest, height), height)
+        highest = torch.where(continues, self.highest, inputs.height)
+        travel_before = self.travel * continues
+        self.highest = torch.maximum(highest, inputs.height)
         self.lowest = torch.where(self.liftoffs > 0.0, lowest, torch.minimum(lowest, low))
         self.travel = (self.highest - self.lowest).clamp(0.0, s.max_travel)
-        self.travel_gain = self.travel - travel
+        self.travel_gain = self.travel - travel_before
 
+        # Distance.
         flies = airborne & self.airborne & self.mode
-        self.flight = (self.flight + (along - self.overspeed) * self.reward_scale * dt) * flies
-        best_flight = self.best_flight * keep
-        self.best_flight = torch.maximum(best_flight, self.flight)
-        self.flight_gain = self.best_flight - best_flight
+        covered = (inputs.along - self.overspeed) * self.reward_scale * dt
+        self.flight = (self.flight + covered) * flies
+        flight_before = self.best_flight * keep
+        self.best_flight = torch.maximum(flight_before, self.flight)
+        self.flight_gain = self.best_flight - flight_before
 
-        # No foot stepped between the front-most that left and the hind-most that lands (A16).
+        # Gap. No foot stepped between the front-most that took off and the hind-most that lands
+        # (A16).
         lands = self.airborne & ~airborne & self.mode
-        left = (self.stance @ direction[:, :, None]).amax(dim=(1, 2))
-        landed = (feet @ direction[:, :, None]).amin(dim=(1, 2))
-        gap = (landed - left - self.overspeed_distance).clamp_max(s.max_gap)
-        best_gap = self.best_gap * keep
-        self.best_gap = torch.maximum(best_gap, gap * self.reward_scale * lands)
-        self.gap_gain = self.best_gap - best_gap
+        direction = inputs.direction[:, :, None]
+        taken_off_at = (self.stance @ direction).amax(dim=(1, 2))
+        landed_at = (inputs.feet @ direction).amin(dim=(1, 2))
+        gap = (landed_at - taken_off_at - self.overspeed_distance).clamp_max(s.max_gap)
+        gap_before = self.best_gap * keep
+        self.best_gap = torch.maximum(gap_before, gap * self.reward_scale * lands)
+        self.gap_gain = self.best_gap - gap_before
         self.overspeed_distance = (self.overspeed_distance + self.overspeed * dt) * airborne
-        self.stance = torch.where(contact[:, :, None], feet, self.stance)
+        self.stance = torch.where(inputs.contact[:, :, None], inputs.feet, self.stance)
 
         self.commanded = jump.clone()
         self.airborne = airborne
-        self.vertical = vertical.clone()
+        self.vertical = inputs.vertical.clone()

@@ -1,14 +1,12 @@
 """Reward terms: functions of the environment, (N,) each; `tasks.reward_weights` has their weights.
 
 A penalty's term is positive and its weight negative. Most terms are rates; an event earns its
-weight once, however long its step took. Terms take `jump_scale`, a factor in jump mode (see
+weight once, however long its step took. `jump_scale` is the factor of a term in jump mode (see
 `pronk.jump.train.mdp.jump`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,194 +19,221 @@ if TYPE_CHECKING:
 
 
 def _measured(env: Env) -> MotionCommand:
-    """The command term, after the motion and the jumps of this step were measured."""
+    """Return the command term, after motion and jumps of this step were measured."""
     command = motion_command(env)
     _ = command.motion
     return command
 
 
-def _term(value: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Make a term of a function of the command term."""
-
-    @wraps(value)
-    def term(env: Env, jump_scale: float = 1.0, **params: float) -> Tensor:
-        command = _measured(env)
-        found = value(command, **params)
-        return found if jump_scale == 1.0 else found * command.in_jump_mode(jump_scale)
-
-    return term
-
-
-def gain(env: Env, of: str) -> Tensor:
-    """Increase of a quantity of `JumpState` in this step; an event."""
-    found: Tensor = getattr(_measured(env).state, of)
-    return found / env.step_dt
-
-
 # --- The paper's table ---------------------------------------------------------------------------
 
 
-@_term
-def tracking_linear(command: MotionCommand, variance: float) -> Tensor:
+def tracking_linear(env: Env, variance: float, jump_scale: float = 1.0) -> Tensor:
     """exp(-|e|^2 / variance), e the error of the horizontal velocity [m/s] (A3)."""
-    error = command.target - command.motion.velocity_heading
-    return torch.exp(error.square().sum(dim=-1) / -variance)
+    command = _measured(env)
+    error = command.target - command.motion.trunk.velocity_heading
+    kernel = torch.exp(error.square().sum(dim=-1) / -variance)
+    return command.scaled_in_jump_mode(kernel, jump_scale)
 
 
-@_term
-def tracking_angular(command: MotionCommand, variance: float) -> Tensor:
+def tracking_angular(env: Env, variance: float, jump_scale: float = 1.0) -> Tensor:
     """exp(-e^2 / variance), e the error of the yaw rate [rad/s] (A3)."""
-    error = command.velocity[:, 2] - command.motion.angular_velocity[:, 2]
-    return torch.exp(error.square() / -variance)
+    command = _measured(env)
+    error = command.velocity[:, 2] - command.motion.trunk.angular_velocity[:, 2]
+    kernel = torch.exp(error.square() / -variance)
+    return command.scaled_in_jump_mode(kernel, jump_scale)
 
 
-@_term
-def posture(command: MotionCommand, standing: float) -> Tensor:
+def posture(env: Env, standing: float, jump_scale: float = 1.0) -> Tensor:
     """|q - q_default|^2 [rad^2] ("action magnitude"), `standing` times as much at zero command."""
-    away = (command.motion.position - command.default_position).square().sum(dim=-1)
-    return away * torch.where(command.standing, standing, 1.0)
+    command = _measured(env)
+    offset = command.motion.joints.position - command.default_position
+    square = offset.square().sum(dim=-1) * torch.where(command.standing, standing, 1.0)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def vertical_velocity(command: MotionCommand) -> Tensor:
+def vertical_velocity(env: Env, jump_scale: float = 1.0) -> Tensor:
     """v_z^2 of the trunk [m^2/s^2]."""
-    return command.motion.velocity_world[:, 2].square()
+    command = _measured(env)
+    square = command.motion.trunk.velocity_world[:, 2].square()
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def smoothness(command: MotionCommand) -> Tensor:
+def smoothness(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|tau_t - tau_(t-1)|^2 [N^2 m^2]."""
-    return command.motion.torque_change.square().sum(dim=-1)
+    command = _measured(env)
+    square = command.motion.joints.torque_change.square().sum(dim=-1)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def orientation(command: MotionCommand) -> Tensor:
+def orientation(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|g_xy|^2 of the unit vector of gravity in the trunk's frame (A2)."""
-    return command.motion.gravity[:, :2].square().sum(dim=-1)
+    command = _measured(env)
+    square = command.motion.trunk.gravity[:, :2].square().sum(dim=-1)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def collision(command: MotionCommand) -> Tensor:
+def collision(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Number of parts other than feet on the ground (A7)."""
-    return command.motion.non_foot_contacts
+    command = _measured(env)
+    return command.scaled_in_jump_mode(command.motion.non_foot_contacts, jump_scale)
 
 
-@_term
-def torque_limits(command: MotionCommand) -> Tensor:
+def torque_over_limits(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Sum of relu(|tau| - tau_max) [N m], tau the PD law's torque before the drive clips (A7).
 
     The PD law has the nominal gains.
     """
-    motion = command.motion
-    torque = command.stiffness * (command.position_target - motion.position)
-    torque = torch.addcmul(torque, command.damping, motion.velocity, value=-1.0)
-    return (torque.abs() - command.effort_limit).clamp_min(0.0).sum(dim=-1)
+    command = _measured(env)
+    joints = command.motion.joints
+    torque = command.stiffness * (command.position_target - joints.position)
+    torque = torch.addcmul(torque, command.damping, joints.velocity, value=-1.0)
+    excess = (torque.abs() - command.effort_limit).clamp_min(0.0).sum(dim=-1)
+    return command.scaled_in_jump_mode(excess, jump_scale)
 
 
-@_term
-def position_limits(command: MotionCommand) -> Tensor:
+def position_over_limits(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Sum of relu(q_low - q) + relu(q - q_high) [rad] (A7): how far q is outside its limits."""
+    command = _measured(env)
     low, high = command.position_limits.unbind(dim=-1)
-    position = command.motion.position
-    return (position - position.clamp(low, high)).abs().sum(dim=-1)
+    position = command.motion.joints.position
+    excess = (position - position.clamp(low, high)).abs().sum(dim=-1)
+    return command.scaled_in_jump_mode(excess, jump_scale)
 
 
-@_term
-def foot_acceleration(command: MotionCommand) -> Tensor:
+def foot_acceleration(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|v_feet,t - v_feet,(t-1)| over all feet together [m/s]."""
-    change = command.motion.foot_velocity_change
-    return torch.linalg.vector_norm(change.flatten(1), dim=-1)
+    command = _measured(env)
+    change = command.motion.legs.foot_velocity_change
+    norm = torch.linalg.vector_norm(change.flatten(1), dim=-1)
+    return command.scaled_in_jump_mode(norm, jump_scale)
 
 
-@_term
-def foot_clearance(command: MotionCommand, height: float) -> Tensor:
+def foot_clearance(env: Env, height: float, jump_scale: float = 1.0) -> Tensor:
     """Sum of (height - z)^2 |v_xy|^(1/2) over the feet [m^2 (m/s)^(1/2)] (A7; Ji 2022)."""
-    motion = command.motion
-    speed = torch.linalg.vector_norm(motion.foot_velocity[..., :2], dim=-1)
-    return ((height - motion.foot_height).square() * speed.sqrt()).sum(dim=-1)
+    command = _measured(env)
+    legs = command.motion.legs
+    speed = torch.linalg.vector_norm(legs.foot_velocity[..., :2], dim=-1)
+    clearance = ((height - legs.foot_height).square() * speed.sqrt()).sum(dim=-1)
+    return command.scaled_in_jump_mode(clearance, jump_scale)
 
 
-def termination(env: Env, jump_scale: float) -> Tensor:
+def fall(env: Env, jump_scale: float = 1.0) -> Tensor:
     """1 for a fall; an event."""
+    command = _measured(env)
     fell = env.termination_manager.terminated / env.step_dt
-    return fell * _measured(env).in_jump_mode(jump_scale)
+    return command.scaled_in_jump_mode(fell, jump_scale)
 
 
-@_term
-def torque(command: MotionCommand) -> Tensor:
+def joint_torque(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|tau|^2 [N^2 m^2]."""
-    return command.motion.torque.square().sum(dim=-1)
+    command = _measured(env)
+    square = command.motion.joints.torque.square().sum(dim=-1)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
 # --- The paper's jump rewards (Table II) ---------------------------------------------------------
 
 
-@_term
-def dense_jump(command: MotionCommand) -> Tensor:
+def dense_jump(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Standard deviation of the force over the four feet, in jump mode [N] (A5)."""
-    return command.motion.force.std(dim=-1, unbiased=False) * command.state.mode
+    command = _measured(env)
+    deviation = command.motion.legs.force.std(dim=-1, unbiased=False) * command.state.mode
+    return command.scaled_in_jump_mode(deviation, jump_scale)
+
+
+def sparse_jump(env: Env) -> Tensor:
+    """Increase of the best score of a lift-off (A6); an event."""
+    return _measured(env).state.score_gain / env.step_dt
 
 
 # --- Not in the paper ----------------------------------------------------------------------------
 
 
-@_term
-def countermovement(command: MotionCommand) -> Tensor:
+def jump_height(env: Env) -> Tensor:
+    """Increase of the trunk's travel from the lowest to the highest point [m]; an event."""
+    return _measured(env).state.travel_gain / env.step_dt
+
+
+def flight_distance(env: Env) -> Tensor:
+    """Increase of the ground that the best flight has covered [m]; an event."""
+    return _measured(env).state.flight_gain / env.step_dt
+
+
+def clearance_gap(env: Env) -> Tensor:
+    """Increase of the widest gap that a flight has cleared [m]; an event."""
+    return _measured(env).state.gap_gain / env.step_dt
+
+
+def hop(env: Env) -> Tensor:
+    """1 for a lift-off after the first of a command; an event."""
+    return _measured(env).state.hop / env.step_dt
+
+
+def countermovement(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Similarity of the legs' lengths to a countermovement's, 0 to 1, up to the first lift-off."""
-    return command.state.similarity
+    command = _measured(env)
+    return command.scaled_in_jump_mode(command.state.similarity, jump_scale)
 
 
-def action_rate(env: Env, jump_scale: float) -> Tensor:
+def action_rate(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|a_t - a_(t-1)|^2 of the network's actions."""
+    command = _measured(env)
     change = env.action_manager.action - env.action_manager.prev_action
-    return change.square().sum(dim=-1) * _measured(env).in_jump_mode(jump_scale)
+    return command.scaled_in_jump_mode(change.square().sum(dim=-1), jump_scale)
 
 
-@_term
-def roll_pitch_rate(command: MotionCommand) -> Tensor:
+def roll_pitch_rate(env: Env, jump_scale: float = 1.0) -> Tensor:
     """|omega_xy|^2 of the trunk [rad^2/s^2]."""
-    return command.motion.angular_velocity[:, :2].square().sum(dim=-1)
+    command = _measured(env)
+    square = command.motion.trunk.angular_velocity[:, :2].square().sum(dim=-1)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def slip(command: MotionCommand) -> Tensor:
+def slip(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Sum of |v_xy|^2 of the feet on the ground [m^2/s^2]."""
-    motion = command.motion
-    return (motion.foot_velocity[..., :2].square().sum(dim=-1) * motion.contact).sum(dim=-1)
+    command = _measured(env)
+    legs = command.motion.legs
+    square = (legs.foot_velocity[..., :2].square().sum(dim=-1) * legs.contact).sum(dim=-1)
+    return command.scaled_in_jump_mode(square, jump_scale)
 
 
-@_term
-def trunk_height(command: MotionCommand, above: float) -> Tensor:
+def trunk_height(env: Env, above: float, jump_scale: float = 1.0) -> Tensor:
     """relu(z - z_standing - above)^2 of the trunk [m^2]."""
-    height = command.motion.height - (command.body.standing_height + above)
-    return height.clamp_min(0.0).square()
+    command = _measured(env)
+    height = command.motion.trunk.height - (command.body.standing_height + above)
+    return command.scaled_in_jump_mode(height.clamp_min(0.0).square(), jump_scale)
 
 
-@_term
-def crouch(command: MotionCommand, below: float) -> Tensor:
+def crouch(env: Env, below: float, jump_scale: float = 1.0) -> Tensor:
     """relu(z_standing - below - z)^2 of the trunk [m^2]."""
-    depth = (command.body.standing_height - below) - command.motion.height
-    return depth.clamp_min(0.0).square()
+    command = _measured(env)
+    depth = (command.body.standing_height - below) - command.motion.trunk.height
+    return command.scaled_in_jump_mode(depth.clamp_min(0.0).square(), jump_scale)
 
 
-@_term
-def knees(command: MotionCommand, height: float) -> Tensor:
+def low_knees(env: Env, height: float, jump_scale: float = 1.0) -> Tensor:
     """Sum of relu(1 - z / height) over the axes of the knees."""
-    return (1.0 - command.motion.knee_height / height).clamp_min(0.0).sum(dim=-1)
+    command = _measured(env)
+    lowness = (1.0 - command.motion.legs.knee_height / height).clamp_min(0.0).sum(dim=-1)
+    return command.scaled_in_jump_mode(lowness, jump_scale)
 
 
-@_term
-def landing(command: MotionCommand, height: float) -> Tensor:
+def low_landing(env: Env, height: float, jump_scale: float = 1.0) -> Tensor:
     """relu(height - z) of the trunk on the ground after a jump, in jump mode [m]."""
+    command = _measured(env)
     state = command.state
     landed = (state.liftoffs > 0.0) & ~state.airborne & state.mode
-    return (height - command.motion.height).clamp_min(0.0) * landed
+    depth = (height - command.motion.trunk.height).clamp_min(0.0) * landed
+    return command.scaled_in_jump_mode(depth, jump_scale)
 
 
-@_term
-def stray_foot(command: MotionCommand) -> Tensor:
+def stray_foot(env: Env, jump_scale: float = 1.0) -> Tensor:
     """Lowest foot below the mean of the four as a jump comes down, in jump mode [m]."""
-    feet, state = command.motion.foot_height, command.state
+    command = _measured(env)
+    state = command.state
+    feet = command.motion.legs.foot_height
     below = feet.mean(dim=-1) - feet.amin(dim=-1)
-    falls = command.motion.velocity_world[:, 2] < 0.0
-    return below * (state.airborne & state.mode & falls)
+    falls = command.motion.trunk.velocity_world[:, 2] < 0.0
+    depth = below * (state.airborne & state.mode & falls)
+    return command.scaled_in_jump_mode(depth, jump_scale)

@@ -28,6 +28,7 @@ class SpeedRanges:
     """Fraction of the velocity ranges in use, computed without waiting for the device."""
 
     def __init__(self, device: torch.device | str) -> None:
+        """Begin with the smallest ranges."""
         self.tracking = torch.zeros((), device=device)
         """Recent mean of the tracking kernel over all robots. ()"""
         self.grown = torch.zeros((), device=device)
@@ -41,11 +42,12 @@ class SpeedRanges:
     def advance(self, error: Tensor, counted: Tensor) -> None:
         """Advance by one policy step.
 
-        `error` is of the horizontal velocity [m/s], (N, 2); `counted` are the robots outside jump
-        mode, bool, (N,).
+        Args:
+            error: Error of the horizontal velocity [m/s], (N, 2).
+            counted: The robots outside jump mode, bool, (N,).
         """
         # A robot with a state that is not finite counts as not tracking.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * counted
         self.tracking.lerp_(kernel.sum() / counted.sum().clamp_min(1), _SMOOTHING)
-        low, high = NO_GROWTH_TRACKING, FULL_RATE_TRACKING
-        self.grown += ((self.tracking - low) / (high - low)).clamp(0.0, 1.0)
+        span = FULL_RATE_TRACKING - NO_GROWTH_TRACKING
+        self.grown += ((self.tracking - NO_GROWTH_TRACKING) / span).clamp(0.0, 1.0)

@@ -12,9 +12,15 @@ if TYPE_CHECKING:
 
 
 def fell(env: ManagerBasedRlEnv, tilt_cosine: float, height: float) -> Tensor:
-    """The trunk is below `height` [m], or leans so that the cosine is below `tilt_cosine`. (N,).
+    """Find robots whose trunk is low or leans.
 
-    The cosine is that of the angle between the trunk's z axis and the vertical.
+    Args:
+        env: The environment.
+        tilt_cosine: Smallest cosine of the angle between the trunk's z axis and the vertical.
+        height: Smallest height of the trunk [m].
+
+    Returns:
+        Bool, (N,).
     """
     qpos = env.sim.data.qpos
     # It is 1 - 2 (x^2 + y^2) of the quaternion (w, x, y, z).
@@ -23,9 +29,14 @@ def fell(env: ManagerBasedRlEnv, tilt_cosine: float, height: float) -> Tensor:
 
 
 def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
-    """State that is not finite, or a joint or trunk faster than `speed` [rad/s, m/s]. (N,).
+    """Find robots whose physics went wrong; the episode of such a robot alone ends.
 
-    Ends the episode of this robot alone.
+    Args:
+        env: The environment.
+        speed: Largest speed of joints and trunk [rad/s, m/s].
+
+    Returns:
+        Where the state is not finite or something is faster, bool, (N,).
     """
     # A largest magnitude is NaN if one of them is, and NaN is no less than anything.
     fastest = torch.linalg.vector_norm(env.sim.data.qvel, ord=torch.inf, dim=-1)
@@ -34,5 +45,5 @@ def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
 
 
 def time_out(env: ManagerBasedRlEnv, steps: int) -> Tensor:
-    """The episode has `steps` policy steps, however long each took (D1 varies it). (N,)."""
+    """Find robots whose episode has `steps` policy steps, however long each took (D1 varies it)."""
     return env.episode_length_buf >= steps

@@ -8,7 +8,7 @@ collision geoms `trunk_collision`, `LEG_thigh_collision`, `LEG_shank_collision`,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -29,11 +29,12 @@ from mjlab.sensor import ContactMatch, ContactSensorCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.viewer import ViewerConfig
+from torch import Tensor
 
 from pronk.jump.train import phases
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp import actions, commands, events, observations, terminations
-from pronk.jump.train.mdp.actuators import actuators
+from pronk.jump.train.mdp.actuators import drive_cfgs
 from pronk.jump.train.tasks.reward_weights import reward_weights
 from pronk.policy.observation import ACTIONS, HISTORY
 from pronk.robots.legged import legged
@@ -58,7 +59,16 @@ def jump_env_cfg(
     num_envs: int = 4096,
     seed: int = 0,
 ) -> ManagerBasedRlEnvCfg:
-    """The environment of all phases, with their PPO iterations by name."""
+    """Configure the environment of all phases.
+
+    Args:
+        robot: The robot.
+        gains: Nominal gains, their ranges and the command delay.
+        iterations: PPO iterations of each phase.
+        gain_shape: Whether gains are drawn in the box or in the ellipsoid of their ranges.
+        num_envs: Number of robots.
+        seed: Seed of all draws.
+    """
     delay = round(gains.delay_s / robot.timestep_s)
     return ManagerBasedRlEnvCfg(
         seed=seed,
@@ -109,12 +119,16 @@ def jump_env_cfg(
 
 
 def without_randomization(cfg: ManagerBasedRlEnvCfg, *, noise: bool = False) -> None:
-    """Leave the nominal robot, undisturbed; with `noise` keep that of measurements, timing, delay.
+    """Leave the nominal robot, undisturbed; starts and commands are still drawn.
 
-    Starts and commands are still drawn.
+    Args:
+        cfg: Configuration of the environment, which is changed.
+        noise: Whether the noise of measurements, timing and delay stays.
     """
-    kept = ("reset", "decimation") if noise else ("reset",)
-    cfg.events = {name: term for name, term in cfg.events.items() if name in kept}
+    events_that_stay = ["reset"]
+    if noise:
+        events_that_stay.append("decimation")
+    cfg.events = {name: term for name, term in cfg.events.items() if name in events_that_stay}
     if not noise:
         cfg.observations["measured"].enable_corruption = False
         action = cfg.actions[actions.NAME]
@@ -127,25 +141,21 @@ def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     without_randomization(cfg)
     cfg.scene.num_envs = 1
     cfg.episode_length_s = 1e6
-    cfg.terminations = {n: t for n, t in cfg.terminations.items() if not t.time_out}
+    cfg.terminations = {name: term for name, term in cfg.terminations.items() if not term.time_out}
     cfg.curriculum = {}
     cfg.commands[commands.NAME].jump_fraction = 1.0
     return cfg
 
 
 def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
-    """The robot on a plane, with sensors `feet` (force and contact) and `limbs` (contact)."""
+    """Put the robot on a plane, with sensors `feet` (force and contact) and `limbs` (contact)."""
     body = legged(robot.source)
     feet = tuple(f"{leg}_foot_collision" for leg in body.legs)
-    limbs = [f"{leg}_{link}_collision" for leg in body.legs for link in ("thigh", "shank")]
-
-    def sensor(name: str, geoms: tuple[str, ...], **measured: Any) -> ContactSensorCfg:
-        return ContactSensorCfg(
-            name=name,
-            primary=ContactMatch(mode="geom", pattern=geoms, entity="robot"),
-            secondary=ContactMatch(mode="body", pattern="terrain"),
-            **measured,
-        )
+    limbs = ["trunk_collision"]
+    for leg in body.legs:
+        limbs.append(f"{leg}_thigh_collision")
+        limbs.append(f"{leg}_shank_collision")
+    ground = ContactMatch(mode="body", pattern="terrain")
 
     entity = EntityCfg(
         spec_fn=partial(_spec, robot, feet),
@@ -154,15 +164,27 @@ def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
             joint_pos={joint.name: joint.default_position for joint in robot.joints},
             joint_vel={".*": 0.0},
         ),
-        articulation=EntityArticulationInfoCfg(actuators=actuators(robot, gains)),
+        articulation=EntityArticulationInfoCfg(actuators=drive_cfgs(robot, gains)),
         sort_actuators=True,
     )
     return SceneCfg(
         terrain=TerrainEntityCfg(terrain_type="plane"),
         entities={"robot": entity},
         sensors=(
-            sensor("feet", feet, fields=("found", "force"), reduce="netforce"),
-            sensor("limbs", ("trunk_collision", *limbs), fields=("found",), reduce="none"),
+            ContactSensorCfg(
+                name="feet",
+                primary=ContactMatch(mode="geom", pattern=feet, entity="robot"),
+                secondary=ground,
+                fields=("found", "force"),
+                reduce="netforce",
+            ),
+            ContactSensorCfg(
+                name="limbs",
+                primary=ContactMatch(mode="geom", pattern=tuple(limbs), entity="robot"),
+                secondary=ground,
+                fields=("found",),
+                reduce="none",
+            ),
         ),
         num_envs=num_envs,
         extent=2.0,
@@ -170,6 +192,7 @@ def _scene(robot: RobotSpec, gains: TrainingGains, num_envs: int) -> SceneCfg:
 
 
 def _spec(robot: RobotSpec, feet: tuple[str, ...]) -> mujoco.MjSpec:
+    """Build the robot's model with the contact of its feet."""
     spec = robot.build_spec()
     for name in feet:
         spec.geom(name).solref = FOOT_CONTACT
@@ -177,7 +200,7 @@ def _spec(robot: RobotSpec, feet: tuple[str, ...]) -> mujoco.MjSpec:
 
 
 def _simulation(robot: RobotSpec) -> SimulationCfg:
-    """MuJoCo Warp at the timestep that gains are matched for."""
+    """Configure MuJoCo Warp, at the timestep that gains are matched for."""
     return SimulationCfg(
         # At most 4 feet, 8 limb capsules with two points each and 4 trunk corners touch; each
         # point of condim 3 has three constraint rows, each joint a friction and a limit row.
@@ -197,33 +220,43 @@ def _simulation(robot: RobotSpec) -> SimulationCfg:
 
 
 def _observations() -> dict[str, ObservationGroupCfg]:
-    """The groups; noise is uniform, with these half-widths (D7 to D10)."""
-
-    def term(func: Any, noise: float = 0.0, history: int = 0) -> ObservationTermCfg:
-        drawn = events.UniformNoise(n_min=-noise, n_max=noise) if noise else None
-        return ObservationTermCfg(func=func, noise=drawn, history_length=history)
-
-    groups = {
-        name: ObservationGroupCfg(terms={"all": term(getattr(observations, name))})
-        for name in ("jump", "critic", "critic_jump", "estimator_target")
+    """Configure the groups; noise is uniform, with these half-widths (D7 to D10)."""
+    return {
+        "jump": _group(observations.jump_input),
+        "critic": _group(observations.critic_state),
+        "critic_jump": _group(observations.critic_jump_state),
+        "estimator_target": _group(observations.estimator_target),
+        "measured": ObservationGroupCfg(
+            terms={
+                "angular_velocity": _measured(observations.angular_velocity, 0.2),
+                "projected_gravity": _measured(observations.gravity_direction, 0.05),
+                "joint_position": _measured(observations.joint_position, 0.05, HISTORY),
+                "joint_velocity": _measured(observations.joint_velocity, 0.5, HISTORY),
+                "action": ObservationTermCfg(func=observations.last_action, history_length=ACTIONS),
+                "command": ObservationTermCfg(func=observations.velocity_command),
+            },
+            enable_corruption=True,
+        ),
     }
-    groups["measured"] = ObservationGroupCfg(
-        terms={
-            "angular_velocity": term(observations.angular_velocity, 0.2),
-            "projected_gravity": term(observations.projected_gravity, 0.05),
-            "joint_position": term(observations.joint_position, 0.05, HISTORY),
-            "joint_velocity": term(observations.joint_velocity, 0.5, HISTORY),
-            "action": term(observations.action, 0.0, ACTIONS),
-            "command": term(observations.command),
-        },
-        enable_corruption=True,
-    )
-    return groups
+
+
+def _group(func: Callable[[Any], Tensor]) -> ObservationGroupCfg:
+    """Configure a group of one term without noise."""
+    return ObservationGroupCfg(terms={"all": ObservationTermCfg(func=func)})
+
+
+def _measured(
+    func: Callable[[Any], Tensor], half_width: float, history: int = 0
+) -> ObservationTermCfg:
+    """Configure a term with noise."""
+    noise = events.UniformNoise(n_min=-half_width, n_max=half_width)
+    return ObservationTermCfg(func=func, noise=noise, history_length=history)
 
 
 def _events(
     robot: RobotSpec, gains: TrainingGains, gain_shape: events.Shape
 ) -> dict[str, EventTermCfg]:
+    """Configure what is randomized, and when."""
     feet = SceneEntityCfg("robot", geom_names=".*_foot_collision", site_names=".*_foot")
     shanks = SceneEntityCfg("robot", geom_names=".*_shank_collision")
     base = SceneEntityCfg("robot", body_names=robot.base_body)
@@ -237,9 +270,6 @@ def _events(
     added = (-0.4 / 12.0 * body.total_mass, 1.6 / 12.0 * body.total_mass)
     rated = robot.joints[0].drive.bus_voltage
 
-    def once(func: Any, **params: Any) -> EventTermCfg:
-        return EventTermCfg(func=func, mode="startup", params=params)
-
     return {
         "reset": EventTermCfg(
             func=events.reset_state,
@@ -247,17 +277,36 @@ def _events(
             params={"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1},
         ),
         # D2, one for all feet, which have priority over the floor.
-        "friction": once(dr.geom_friction, ranges=(0.05, 3.0), shared_random=True, asset_cfg=feet),
-        "gains": once(events.randomize_gains, ranges=ranges, shape=gain_shape),  # D3, D4
-        "shank_length": once(events.randomize_shank_length, span=shank, feet=feet, shanks=shanks),
-        "base_mass": once(events.randomize_base_mass, added=added, base=base),
+        "friction": EventTermCfg(
+            func=dr.geom_friction,
+            mode="startup",
+            params={"ranges": (0.05, 3.0), "shared_random": True, "asset_cfg": feet},
+        ),
+        "gains": EventTermCfg(  # D3, D4
+            func=events.randomize_gains,
+            mode="startup",
+            params={"ranges": ranges, "shape": gain_shape},
+        ),
+        "shank_length": EventTermCfg(
+            func=events.randomize_shank_length,
+            mode="startup",
+            params={"span": shank, "feet": feet, "shanks": shanks},
+        ),
+        "base_mass": EventTermCfg(
+            func=events.randomize_base_mass,
+            mode="startup",
+            params={"added": added, "base": base},
+        ),
         # Lithium cells from 3.7 V (nominal, and all but empty) to 4.2 V (full); of six cells 5 to
         # 12 milliohm each, and plugs and wires. Not in the paper. A jump draws a kilowatt and more.
-        "battery": once(
-            events.randomize_battery,
-            voltage=(22.2 / 24.0 * rated, 25.2 / 24.0 * rated),
-            resistance=(0.03, 0.1),
-            rated=rated,
+        "battery": EventTermCfg(
+            func=events.randomize_battery,
+            mode="startup",
+            params={
+                "voltage": (22.2 / 24.0 * rated, 25.2 / 24.0 * rated),
+                "resistance": (0.03, 0.1),
+                "rated": rated,
+            },
         ),
         "decimation": EventTermCfg(  # D1, A1
             func=events.randomize_decimation,

@@ -21,7 +21,8 @@ PAPER_UNIT = 20.0
 """One unit of a weight here is this many of the paper's."""
 
 
-def _term(func: Callable[..., Tensor], weight: float, **params: float | str) -> RewardTermCfg:
+def _term(func: Callable[..., Tensor], weight: float, **params: float) -> RewardTermCfg:
+    """Return a term of the reward."""
     return RewardTermCfg(func=func, weight=weight, params=params)
 
 
@@ -50,28 +51,28 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         "collision": _term(rewards.collision, -5.0, jump_scale=1.0),
         # Paper -900 | -900, -45 here: the drive clips what exceeds the limit, and a position
         # command beyond reach is how a policy commands full torque.
-        "torque_limits": _term(rewards.torque_limits, -0.02, jump_scale=0.25),
+        "torque_limits": _term(rewards.torque_over_limits, -0.02, jump_scale=0.25),
         # Paper -150 | -150.
-        "position_limits": _term(rewards.position_limits, -7.5),
+        "position_limits": _term(rewards.position_over_limits, -7.5),
         # Paper -0.5 | -0.5.
         "foot_acceleration": _term(rewards.foot_acceleration, -0.025),
         # Paper -250 | -250. In a jump feet follow the jump.
         "foot_clearance": _term(rewards.foot_clearance, -12.5, height=0.09, jump_scale=0.0),
         # Paper -500 | -500, for one step of 20 ms: -0.5. More of it, and most where most can be
         # earned by a jump that ends on the side.
-        "termination": _term(rewards.termination, -2.0, jump_scale=5.0),
+        "termination": _term(rewards.fall, -2.0, jump_scale=5.0),
         # Paper -0.08 | -0.08, -0.004 here: running takes 1,000 N^2 m^2 and would lose 4 of the 5.5
         # that tracking can earn.
-        "torque": _term(rewards.torque, -0.0004, jump_scale=0.25),
+        "torque": _term(rewards.joint_torque, -0.0004, jump_scale=0.25),
         # Table II, phase 1.
         "dense_jump": _term(rewards.dense_jump, 0.0),
-        "sparse_jump": _term(rewards.gain, 0.0, of="score_gain"),  # A6
+        "sparse_jump": _term(rewards.sparse_jump, 0.0),  # A6
         # Not in the paper.
-        "jump_height": _term(rewards.gain, 0.0, of="travel_gain"),
-        "flight_distance": _term(rewards.gain, 0.0, of="flight_gain"),
-        "clearance_gap": _term(rewards.gain, 0.0, of="gap_gain"),
+        "jump_height": _term(rewards.jump_height, 0.0),
+        "flight_distance": _term(rewards.flight_distance, 0.0),
+        "clearance_gap": _term(rewards.clearance_gap, 0.0),
         "countermovement": _term(rewards.countermovement, 0.0),
-        "hop": _term(rewards.gain, 0.0, of="hop"),
+        "hop": _term(rewards.hop, 0.0),
         "action_rate": _term(rewards.action_rate, -0.02, jump_scale=0.25),
         "roll_pitch_rate": _term(rewards.roll_pitch_rate, -0.02),
         "slip": _term(rewards.slip, -0.1, jump_scale=0.0),
@@ -80,9 +81,9 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         # A trot dips by 2 cm; waiting for the next jump with bent knees is below that.
         "crouch": _term(rewards.crouch, -500.0, below=0.02, jump_scale=0.0),
         # Stopping from -2 m/s, a policy came down on a hind knee, 2 cm thick.
-        "knees": _term(rewards.knees, -3.0, height=0.06, jump_scale=1.0),
+        "knees": _term(rewards.low_knees, -3.0, height=0.06, jump_scale=1.0),
         # Jumps alike to 7 mm in the air differed by 25 mm in their landing, .16 to .23 m.
-        "landing": _term(rewards.landing, 0.0, height=0.22),
+        "landing": _term(rewards.low_landing, 0.0, height=0.22),
         # A policy trotted on in the air and landed on one foot: 40 ms early, thighs on the ground.
         "stray_foot": _term(rewards.stray_foot, -30.0),
     }
