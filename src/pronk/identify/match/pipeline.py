@@ -15,6 +15,7 @@ from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.arm import fit_together
+from pronk.identify.match.checks import check_recordings, check_response
 from pronk.identify.match.export import actuators
 from pronk.identify.match.grid import (
     GridSearch,
@@ -43,7 +44,6 @@ from pronk.identify.match.parameters import (
     PARAMETERS,
     checked_names,
 )
-from pronk.identify.match.plausibility import CAUSES, findings, require_plausible
 from pronk.identify.match.ranges import matched_gains
 from pronk.identify.match.response_fit import Fit, refine, require_sweeps, response_fit
 from pronk.identify.match.result import (
@@ -152,7 +152,10 @@ def match_frameworks(
                 f"by torque: {reasons or 'record larger or faster motions'}."
             )
         return {"": _result(robot, by_torque, logs, mujoco_info(robot))}
-    require_plausible(logs_by_joint(logs, robot), robot)
+    wrong: dict[str, tuple[str, ...]] = {}
+    for joint, sources in logs_by_joint(logs, robot).items():
+        recordings = [recording for log in sources for recording in log.excitations(joint)]
+        wrong[joint] = check_recordings(recordings, robot)
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
     work = _Work(logs=logs, settings=chosen, mode=mode)
     own = _Match(work=work, robot=robot, fitted=fitted, clock=clock)
@@ -180,7 +183,6 @@ def match_frameworks(
         try:
             own.ready = begin
             own.run()
-            wrong = own.wrong()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -247,8 +249,8 @@ class _Clock:
 
 Found = Mapping[str, Sequence[MeasuredJoint]]
 """Measured responses by joint; largest amplitude, the one that is matched, first."""
-Wrong = Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
-"""What contradicts the logs of each joint, and what would leave no trace in them."""
+Wrong = Mapping[str, tuple[str, ...]]
+"""What contradicts the logs of each joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,24 +347,11 @@ class _Match:
             self.joints = match(rigs, found)
         return self
 
-    def wrong(self) -> Wrong:
-        """Causes that the joints show where their logs are checked."""
-        out = {}
-        with self.clock.stage("plausibility"):
-            for name, fit in self.joints.items():
-                time_fit = self.fits.get(name)
-                found, hidden = findings(
-                    self.work.logs, name, self.robot, fit=fit, time_fit=time_fit
-                )
-                out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
-        return out
-
     def result(self, logs: Sequence[JointLog], wrong: Wrong) -> MatchResult:
         """The result for the simulator, with what is wrong about the logs."""
         joints = {}
         for name, fit in self.joints.items():
-            flags, unchecked = wrong.get(name, ((), ()))
-            joints[name] = replace(fit, flags=(*fit.flags, *flags), unchecked=unchecked)
+            joints[name] = replace(fit, flags=(*fit.flags, *wrong.get(name, ())))
         return _result(
             self.robot,
             joints,
@@ -540,7 +529,7 @@ def _time_joint_fit(
         amplitude_gains=fit.amplitude_gains,
         flags=(
             *held_out_flags(fit.held_out),
-            *_no_match(error_db, goals[0]),
+            *_no_match(both[0], goals[0]),
             *_time_flags(fit),
             *fit.estimate.flags,
             *_goal_flags(goals[0], robot),
@@ -576,7 +565,7 @@ def _joint_fit(
         zero_armature=zero_response,
         amplitude_gains=rows,
         flags=(
-            *_search_flags(fit, grid),
+            *_search_flags(fit, grid, both[0]),
             *found.flags,
             *amplitude_flags(rows),
             *_goal_flags(goals[0], robot),
@@ -612,19 +601,14 @@ def _no_match_db(goal: MeasuredJoint) -> float:
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * goal.measurement_error_db())
 
 
-def _no_match(error_db: float, goal: MeasuredJoint) -> Iterator[str]:
+def _no_match(matched: ComplexArray, goal: MeasuredJoint) -> Iterator[str]:
     """Flag gains whose response is not the measured one."""
-    limit = _no_match_db(goal)
-    if not error_db <= limit:
-        yield (
-            f"no match: the best gains miss the measured response by {error_db:.2g} dB RMS, "
-            f"more than {limit:.2g} dB; the model lacks something that the robot has"
-        )
+    yield from check_response(goal.measured, matched, goal.fit_mask, _no_match_db(goal))
 
 
-def _search_flags(fit: Fit, grid: GridSearch) -> Iterator[str]:
+def _search_flags(fit: Fit, grid: GridSearch, matched: ComplexArray) -> Iterator[str]:
     """Flags of the optimum of the paper's search."""
-    yield from _no_match(fit.error_db, fit.target)
+    yield from _no_match(matched, fit.target)
     if grid.at_edge:
         yield (
             f"at the edge of the grid ({grid.gains[0]:.3g} N m/rad, {grid.gains[1]:.3g} N m s/rad)"

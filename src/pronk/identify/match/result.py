@@ -99,7 +99,6 @@ class JointFit:
     """The same with the robot's published parameters [rad]."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
-    unchecked: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse arrays of contradictory shapes."""

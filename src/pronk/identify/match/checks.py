@@ -1,0 +1,442 @@
+"""Checks of the recordings of a joint before the fit, and of the matched response after it.
+
+Each check is one function with its equation. Limits hold for any position-controlled joint: none of
+them was set by the logs of a particular robot. What would make every matched number meaningless is
+a LogError: another joint moved, a sign is flipped, or an angle is in degrees. What only weakens a
+match is a flag, one sentence with the way out.
+
+No check sees gains that are stated wrongly for the drive: a match finds the product of the gains
+and the torque constant, so that wrongly stated gains change no matched number. A position that was
+filtered, a compliant gear and an inertia that the model does not have all show alike, as a response
+that no gains reach (`check_response`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from pronk.arrays import Array, ComplexArray, Mask
+from pronk.errors import LogError
+from pronk.identify.logs.joint_log import Excitation
+from pronk.identify.match.measured_joint import DB
+from pronk.identify.response.response import FrequencyResponse
+from pronk.robots.robot import Joint, RobotSpec
+
+DEGREES = 180.0 / math.pi
+"""Degrees in a radian, the factor by which a wrong unit scales a column."""
+
+LOWEST_HZ = 0.25
+"""Lowest frequency of the slow response [Hz]: below it a chirp of 20 s is in its ramp."""
+SLOW_SHARE = 0.2
+"""Share of the joint's band that counts as slow. A drive of resonance f and damping ratio 0.3 or
+more is within 10 % of its command there."""
+SLOWEST_TOP_HZ = 1.0
+"""Highest frequency of the slow response [Hz], for joints whose band is wide."""
+EXCITED_SHARE = 0.05
+"""Magnitude of the command over its largest from which on a frequency counts as excited."""
+COHERENT = 0.8
+"""Coherence from which on the slow response is judged: less than a quarter of the motion is then
+due to something else."""
+OPPOSITE = -0.7
+"""Cosine of the phase of the slow response below which the joint moves against its command: more
+than 135 degrees, where no drive of a moving joint is at a fifth of its band."""
+
+SAMPLES_A_PERIOD = 6.0
+"""Least samples in a period at the top of the band. A position that is interpolated linearly
+between six samples a period loses 1 - sinc(1/6)^2 = 9 % of its amplitude, between three 32 %."""
+CLOCK_TOLERANCE = 2e-3
+"""Largest relative difference of the period of the commands from the stated one. Crystals keep
+1e-4, and a sweep of 20 s at 50 Hz slips by two ticks at 2e-3."""
+HELD = 0.9
+"""Sharpness of the instants of change from which on a command counts as held between ticks: 1 where
+it changes at the ticks alone, and about 0 where it changes with every sample."""
+SMOOTHED = 0.05
+"""Sharpness below which a command counts as computed anew for every sample."""
+
+STILL_SHARE = 0.02
+"""Travel of the position over that of the command within a second below which a joint stands: -34
+dB, which no joint reaches inside its band."""
+STILL_COMMAND_RAD = 0.15
+"""Least travel of the command for a joint to count as standing [rad]: dry friction holds the elbow
+of an SO-101 against 0.08 rad."""
+
+LIMITED_SHARE = 0.01
+"""Share of the time at the effort limit from which on a joint counts as limited. A response is
+linear only as long as the torque is; at 1 % of the time its first harmonic changes by less than
+0.1 dB."""
+
+TORQUE_COMPUTED = "computed"
+"""Value of a log's metadata `torque` where the column was computed from the command."""
+
+
+def check_recordings(recordings: Sequence[Excitation], robot: RobotSpec) -> tuple[str, ...]:
+    """Check the recordings of one joint before it is matched.
+
+    Args:
+        recordings: Excitations of one joint, of one or several logs.
+        robot: The robot.
+
+    Returns:
+        Flags, one sentence each: too few samples, another clock, a joint that stands still, a
+        drive at its effort limit. Empty for a joint whose unit is not radians.
+
+    Raises:
+        LogError: Another joint moved, a sign is flipped, or angles are in degrees.
+    """
+    flags: list[str] = []
+    for recording in recordings:
+        if recording.log.unit(recording.joint) != "rad":
+            continue
+        joint = robot.joint(recording.joint)
+        for problem in (
+            wrong_joint(recording),
+            wrong_unit(recording, joint),
+            wrong_sign(recording, joint),
+        ):
+            if problem:
+                source = recording.source or "log"
+                raise LogError(f"{source}: {recording.joint}: {problem}.")
+        for flag in (
+            standstill(recording, joint),
+            too_few_samples(recording, joint),
+            wrong_clock(recording, robot.policy_rate_hz),
+            effort_limit_reached(recording, joint),
+        ):
+            if flag and not _is_repeated(flag, flags):
+                flags.append(flag)
+    return tuple(flags)
+
+
+def _is_repeated(flag: str, flags: Sequence[str]) -> bool:
+    """Return whether flags hold one of the same check, which begins with the same word."""
+    check = flag.split(":")[0]
+    return any(other.split(":")[0] == check for other in flags)
+
+
+# ---- errors: what makes every number meaningless ----
+
+
+def wrong_joint(recording: Excitation) -> str:
+    """Say how the recorded joint is not the excited one.
+
+    The log names another joint, or a joint whose command stands still travelled twice as far as
+    the commanded joint and more than half of its command: dynamic coupling of a limb moves its
+    other joints less than the excited one.
+
+    Args:
+        recording: Excitation of a joint.
+
+    Returns:
+        What was seen and the way out; empty if nothing contradicts the joint.
+    """
+    log = recording.log
+    remedy = "give the order of the file's joints (--joints), or check the wiring"
+    stated = log.origin.metadata.get("excited", recording.joint)
+    if stated != recording.joint:
+        return f"the log says that {stated} was excited; {remedy}"
+    command_travel = np.ptp(log.command[recording.samples], axis=0)
+    travel = np.ptp(log.position[recording.samples], axis=0)
+    column = log.column(recording.joint)
+    largest = max(0.5 * command_travel[column], 2.0 * travel[column])
+    for other, name in enumerate(log.joints):
+        commanded = other == column or command_travel[other] > 0.0
+        if not commanded and log.unit(name) == "rad" and travel[other] > largest:
+            return (
+                f"{name} moved by {travel[other]:.2g} rad while {recording.joint} was commanded; "
+                f"the columns are another joint's: {remedy}"
+            )
+    return ""
+
+
+def wrong_unit(recording: Excitation, joint: Joint) -> str:
+    """Say how angles are in degrees where radians are stated.
+
+    The command leaves the range of the joint by more than a radian and is inside of it in degrees,
+    or the slow response has a gain of 180 / pi or pi / 180, within a factor of two: drives follow
+    slow commands with a gain near 1.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model.
+
+    Returns:
+        What was seen and the way out; empty if the unit fits.
+    """
+    remedy = "degrees are read as radians: read the log with unit deg"
+    command = recording.command
+    lowest = float(command.min())
+    highest = float(command.max())
+    low, high = joint.range
+    outside = lowest < low - 1.0 or highest > high + 1.0
+    fits_in_degrees = low <= lowest / DEGREES and highest / DEGREES <= high
+    if outside and fits_in_degrees:
+        return (
+            f"the command goes from {lowest:.3g} to {highest:.3g}, the joint from {low:.3g} to "
+            f"{high:.3g} rad; {remedy}"
+        )
+    gain = abs(slow_response(recording, joint))
+    if 0.5 < gain / DEGREES < 2.0 or 0.5 < gain * DEGREES < 2.0:
+        return f"at low frequency the position is {gain:.3g} times the command; {remedy}"
+    return ""
+
+
+def wrong_sign(recording: Excitation, joint: Joint) -> str:
+    """Say how the position has the other sign than the command: `cos(phase) < OPPOSITE`.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model.
+
+    Returns:
+        What was seen and the way out; empty if the signs agree.
+    """
+    response = slow_response(recording, joint)
+    if response.real < OPPOSITE * abs(response):
+        return (
+            "at low frequency the position moves against the command; a sign is flipped: negate "
+            "the position or the command when reading"
+        )
+    return ""
+
+
+def slow_response(recording: Excitation, joint: Joint) -> complex:
+    """Compute the response of a joint to the slow part of its command.
+
+    `sum(conj(U) Y) / sum(conj(U) U)` over the excited frequencies from `LOWEST_HZ` to a fifth of
+    the joint's band, for the spectra U of the command and Y of the position.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model.
+
+    Returns:
+        Complex gain; NaN where nothing slow is excited or the motion is not coherent with it.
+    """
+    time = recording.time
+    grid, step = np.linspace(time[0], time[-1], len(time), retstep=True)
+    command = np.interp(grid, time, recording.command)
+    position = np.interp(grid, time, recording.position)
+    command_spectrum = np.fft.rfft(command - command.mean())
+    position_spectrum = np.fft.rfft(position - position.mean())
+    hz = np.fft.rfftfreq(len(grid), float(step))
+    top_hz = min(SLOWEST_TOP_HZ, SLOW_SHARE * joint.band_hz[1])
+    slow = (hz >= LOWEST_HZ) & (hz <= top_hz)
+    size = np.abs(command_spectrum)
+    excited = slow & (size > EXCITED_SHARE * size[slow].max(initial=0.0))
+
+    cross = complex(np.vdot(command_spectrum[excited], position_spectrum[excited]))
+    command_power = float(np.sum(np.abs(command_spectrum[excited]) ** 2))
+    position_power = float(np.sum(np.abs(position_spectrum[excited]) ** 2))
+    if command_power == 0.0 or position_power == 0.0:
+        return complex(math.nan)
+    if abs(cross) ** 2 < COHERENT * command_power * position_power:
+        return complex(math.nan)
+    return cross / command_power
+
+
+# ---- flags: what weakens a match ----
+
+
+def standstill(recording: Excitation, joint: Joint) -> str:
+    """Say when a joint stands still for a second while its command moves.
+
+    Inside the joint's band it stands where it moves by less than `STILL_SHARE` of its command;
+    above the band, where the reading does not change at all.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model.
+
+    Returns:
+        What was seen and the way out; empty if the joint moves.
+    """
+    time = recording.time
+    least_travel = max(0.5 * float(np.ptp(recording.command)), STILL_COMMAND_RAD)
+    edges = np.searchsorted(time, np.arange(time[0], time[-1], 1.0))
+    for first, stop in pairwise(edges):
+        command = recording.command[first:stop]
+        if stop - first < 4 or np.ptp(command) < least_travel:
+            continue
+        crossings = np.count_nonzero(np.diff(np.sign(command - command.mean())))
+        inside_band = crossings <= 2.0 * joint.band_hz[1]
+        travel = float(np.ptp(recording.position[first:stop]))
+        slow_standstill = inside_band and travel < STILL_SHARE * float(np.ptp(command))
+        if travel == 0.0 or slow_standstill:
+            return (
+                f"standstill: {recording.joint} does not move at {time[first]:.1f} s while its "
+                "command does; the drive was off or the encoder stuck: repair it and record again"
+            )
+    return ""
+
+
+def too_few_samples(recording: Excitation, joint: Joint) -> str:
+    """Say when a log is too slow for the band: `rate / top of the band < SAMPLES_A_PERIOD`.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model.
+
+    Returns:
+        What was seen and the way out; empty if the rate suffices.
+    """
+    top_hz = joint.band_hz[1]
+    samples = recording.log.rate_hz / top_hz
+    if samples >= SAMPLES_A_PERIOD:
+        return ""
+    return (
+        f"sample rate: {recording.log.rate_hz:.3g} samples a second are {samples:.2g} a period at "
+        f"{top_hz:g} Hz, fewer than {SAMPLES_A_PERIOD:g}; log faster, or lower the joint's band"
+    )
+
+
+def wrong_clock(recording: Excitation, policy_rate_hz: float) -> str:
+    """Say when commands that are held between ticks change at another rate than stated.
+
+    The period T of the ticks is where `|sum(|change| exp(2 pi i t / T))|` is largest near the
+    stated one; that sum over `sum(|change|)` is the sharpness, 1 where the command changes at the
+    ticks alone. The stated rate is the log's, or else the robot's policy rate.
+
+    Args:
+        recording: Excitation of a joint.
+        policy_rate_hz: Rate at which the robot's commands are sent [Hz].
+
+    Returns:
+        What was seen and the way out; empty if the rates agree or nothing can be said.
+    """
+    log = recording.log
+    stated_hz = log.origin.metadata.get("command_rate_hz")
+    tick_s = 1.0 / (float(stated_hz) if stated_hz else policy_rate_hz)
+    if log.rate_hz * tick_s < 3.0:
+        return ""  # too few samples in a tick to see when the command changes
+    changes = np.abs(np.diff(recording.command))
+    if not changes.any():
+        return ""
+    period_s, sharpness = _period_of_changes(recording.time[1:], changes, tick_s)
+    if sharpness < SMOOTHED and not stated_hz:
+        return ""  # commands that are computed for every sample have no ticks
+    difference = abs(period_s / tick_s - 1.0)
+    if sharpness > HELD and difference > CLOCK_TOLERANCE:
+        cause = "the timestamps run at a wrong rate: check the clock and the unit of the time"
+        if not stated_hz:
+            cause += (
+                ", or the command was sent at another rate than the robot's policy rate: state the "
+                "rate of the commands in the log or the robot's file"
+            )
+        return (
+            f"clock: the command changes every {1e3 * period_s:.2f} ms instead of every "
+            f"{1e3 * tick_s:.2f} ms, {period_s / tick_s:.4f} times; {cause}"
+        )
+    if sharpness < HELD and (stated_hz or difference < CLOCK_TOLERANCE):
+        return (
+            f"command column: it changes all the time instead of once in {1e3 * tick_s:.1f} ms; it "
+            "was filtered or interpolated: log the command as it was sent"
+        )
+    return ""
+
+
+def _period_of_changes(times: Array, changes: Array, tick_s: float) -> tuple[float, float]:
+    """Return the period near a tick at which changes recur [s], and its sharpness from 0 to 1."""
+    span = float(times[-1] - times[0])
+    rate_hz = (len(times) - 1) / span
+    padded = 4 * len(changes)
+    spectrum = np.abs(np.fft.rfft(changes, padded))
+    hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
+    near = np.flatnonzero((hz > 0.75 / tick_s) & (hz < 1.33 / tick_s))
+    peak_hz = hz[near[np.argmax(spectrum[near])]]
+    # The timestamps themselves, about the peak, at a tenth of the resolution of the recording.
+    fine_hz = peak_hz + np.linspace(-0.5, 0.5, 21) / span
+    lengths = np.abs(np.exp(2j * np.pi * np.outer(fine_hz, times)) @ changes)
+    best = int(np.argmax(lengths))
+    return 1.0 / float(fine_hz[best]), float(lengths[best] / changes.sum())
+
+
+def effort_limit_reached(recording: Excitation, joint: Joint) -> str:
+    """Say for how much of the time a drive is at its effort limit.
+
+    The torque is the measured one where the log has it, or else the one that the drive's law asks
+    for with the gains of the log: `stiffness (command - position) - damping velocity`.
+
+    Args:
+        recording: Excitation of a joint.
+        joint: Its model, which has the effort limit.
+
+    Returns:
+        What was seen and the way out; empty if the torque stays below the limit.
+    """
+    torque = _drive_torque(recording)
+    limit = joint.drive.effort_limit
+    if torque is None or not math.isfinite(limit):
+        return ""
+    share = float(np.mean(np.abs(torque) >= limit))
+    if share < LIMITED_SHARE:
+        return ""
+    return (
+        f"effort limit: for {100.0 * share:.0f} % of the excitation the torque is at or above the "
+        f"{limit:g} N m of the drive (up to {np.abs(torque).max():.3g} N m), where the joint does "
+        "not respond linearly; excite it with a smaller amplitude, or correct effort_limit in the "
+        "robot's file"
+    )
+
+
+def _drive_torque(recording: Excitation) -> Array | None:
+    """Return the torque of the drive during an excitation [N m], (n,); None if it is not known."""
+    log = recording.log
+    measured = log.origin.metadata.get("torque") != TORQUE_COMPUTED
+    if recording.torque is not None and measured and np.ptp(recording.torque) > 0.0:
+        return recording.torque
+    if log.stiffness is None or log.damping is None:
+        return None
+    column = log.column(recording.joint)
+    velocity = recording.velocity
+    if velocity is None:
+        velocity = np.gradient(recording.position, recording.time)
+    error = recording.command - recording.position
+    return np.asarray(log.stiffness[column] * error - log.damping[column] * velocity)
+
+
+# ---- after the fit ----
+
+
+def check_response(
+    measured: FrequencyResponse, simulated: ComplexArray, used: Mask, limit_db: float
+) -> tuple[str, ...]:
+    """Check the response with the matched gains against the measured one.
+
+    The error is `20 log10 |simulated / measured|`, its size the root mean square over the used
+    frequencies.
+
+    Args:
+        measured: Measured response of a joint.
+        simulated: Simulated response with the matched gains, shape (f,).
+        used: Frequencies that the match compares, shape (f,).
+        limit_db: Error above which the gains are no match [dB].
+
+    Returns:
+        A flag that says how large the error is, at which frequencies, and what would look so; none
+        if the gains are a match.
+    """
+    error_db = DB * np.log(np.abs(simulated[used] / measured.response[used]))
+    size_db = float(np.sqrt(np.mean(error_db**2)))
+    if size_db <= limit_db:
+        return ()
+    hz = measured.frequency_hz[used]
+    thirds = np.array_split(np.arange(len(hz)), 3)
+    sizes_db = [float(np.sqrt(np.mean(error_db[third] ** 2))) for third in thirds]
+    largest = int(np.argmax(sizes_db))
+    third = thirds[largest]
+    direction = "less" if error_db[third].mean() > 0.0 else "more"
+    causes = (
+        "dry friction or backlash that the model does not have, or a wrong scale of the position",
+        "a payload, or an inertia of the links or of the rotor, that the model does not have",
+        "a position or command that was filtered, a compliant gear, or a wrong rotor inertia",
+    )
+    return (
+        f"no match: the best gains miss the measured response by {size_db:.2g} dB RMS, more than "
+        f"{limit_db:.2g} dB; from {hz[third[0]]:.2g} to {hz[third[-1]]:.2g} Hz, where the error is "
+        f"largest, the real joint moves {direction} than the simulated one. So would look: "
+        f"{causes[largest]}",
+    )
