@@ -13,7 +13,7 @@ from pronk.cli.main import run
 
 
 @dataclass(frozen=True)
-class Done:
+class FinishedCommand:
     exit_code: int
     stdout: str
     stderr: str
@@ -23,30 +23,33 @@ class Done:
         return self.stdout + self.stderr
 
 
-def invoke(words: Sequence[str | Path], given: str = "") -> Done:
-    out, err = io.StringIO(), io.StringIO()
-    before, sys.stdin = sys.stdin, io.StringIO(given)
+def invoke(words: Sequence[str | Path], typed: str = "") -> FinishedCommand:
+    """Run `pronk` with some words; `typed` is what a person types."""
+    stdout = io.StringIO()
+    stderr = io.StringIO()
+    stdin = sys.stdin
+    sys.stdin = io.StringIO(typed)
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
             status = run([str(word) for word in words])
     finally:
-        sys.stdin = before
-    return Done(status, out.getvalue(), err.getvalue())
+        sys.stdin = stdin
+    return FinishedCommand(status, stdout.getvalue(), stderr.getvalue())
 
 
 def accepted(*words: str | Path) -> str:
-    """Standard output of a command that succeeds."""
-    done = invoke(words)
-    assert done.exit_code == 0, done.stderr
-    return done.stdout
+    """Return the standard output of a command that succeeds."""
+    command = invoke(words)
+    assert command.exit_code == 0, command.stderr
+    return command.stdout
 
 
 def refused(*words: str | Path) -> str:
-    """The one sentence of a command that is refused, on the last line of standard error."""
-    done = invoke(words)
-    assert done.exit_code == 2, done.output
-    lines = done.stderr.strip().splitlines()
+    """Return the one sentence of a command that is refused, on the last line of standard error."""
+    command = invoke(words)
+    assert command.exit_code == 2, command.output
+    lines = command.stderr.strip().splitlines()
     sentences = [line for line in lines if line.startswith("pronk: ")]
-    assert sentences == lines[-1:], done.stderr
-    assert "Traceback" not in done.output
+    assert sentences == lines[-1:], command.stderr
+    assert "Traceback" not in command.output
     return sentences[0]

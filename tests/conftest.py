@@ -11,16 +11,18 @@ settings.register_profile("pronk", deadline=None)
 settings.load_profile("pronk")
 
 # A process started in the background ignores these signals, and so would its children.
-for number, usual in (
-    (signal.SIGINT, signal.default_int_handler),
-    (signal.SIGQUIT, signal.SIG_DFL),
-    (signal.SIGHUP, signal.SIG_DFL),
-):
+DEFAULT_HANDLERS = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGQUIT: signal.SIG_DFL,
+    signal.SIGHUP: signal.SIG_DFL,
+}
+for number, handler in DEFAULT_HANDLERS.items():
     if signal.getsignal(number) is signal.SIG_IGN:
-        signal.signal(number, usual)
+        signal.signal(number, handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if (folder := Path(item.path).parent.name) in ("slow", "live"):
+        folder = Path(item.path).parent.name
+        if folder in ("slow", "live"):
             item.add_marker(folder)

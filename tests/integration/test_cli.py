@@ -11,30 +11,45 @@ import pytest
 
 from command_line import accepted, invoke, refused
 from hopper import ROBOT, write_hopper
-from pronk import __version__
 from pronk.cli import main as cli
 from pronk.cli.demo import find_policies
 from pronk.errors import ArtefactError, PronkError
+from pronk.version import VERSION
 
 KNEE = ("mini_cheetah", "--joints", "FR_knee", "--amplitude", "0.25")
 MATCH = ("--robot", "mini_cheetah", "--method", "paper")
 
 
-COMMANDS = "[pkgutil.resolve_name(where) for where, _ in m.COMMANDS.values()]"
+HEAVY_LIBRARIES = {"scipy", "matplotlib", "mujoco", "torch", "mjlab", "warp", "onnxruntime"}
+"""Libraries that a command runs with."""
+RESOLVE_ALL = "[pkgutil.resolve_name(location) for location, _ in main.COMMANDS.values()]"
 
 
 @pytest.mark.parametrize(
-    ("runs", "more"), [("m.run(['--help'])", "numpy jinja2 tyro msgspec"), (COMMANDS, "")]
+    ("statement", "more_libraries"),
+    [
+        ("main.run(['--help'])", {"numpy", "jinja2", "tyro", "msgspec"}),
+        (RESOLVE_ALL, set()),
+    ],
 )
-def test_help_and_options_are_read_without_the_libraries_that_a_command_runs_with(runs, more):
-    heavy = {*f"scipy matplotlib mujoco torch mjlab warp onnxruntime {more}".split()}
-    code = f"import pkgutil, sys, pronk.cli.main as m; {runs}; print({heavy} & sys.modules.keys())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "set()"
+def test_help_and_options_are_read_without_heavy_libraries(
+    statement: str, more_libraries: set[str]
+) -> None:
+    libraries = sorted(HEAVY_LIBRARIES | more_libraries)
+    code = (
+        "import pkgutil, sys\n"
+        "from pronk.cli import main\n"
+        f"{statement}\n"
+        f"print([name for name in {libraries} if name in sys.modules])\n"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.splitlines()[-1] == "[]"
 
 
-def test_version():
-    assert accepted("--version").strip() == f"pronk {__version__}"
+def test_version() -> None:
+    assert accepted("--version").strip() == f"pronk {VERSION}"
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
@@ -61,10 +76,10 @@ def test_exit_statuses(monkeypatch, raised, status):
     monkeypatch.setitem(cli.COMMANDS, "report", ("pronk.report.build:write_report", ""))
     monkeypatch.setattr("pronk.report.build.write_report", stop)
     monkeypatch.delenv("PRONK_DEBUG", raising=False)
-    done = invoke(["report"])
-    assert done.exit_code == status
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert ("defect" in done.stderr) == isinstance(raised, ZeroDivisionError)
+    command = invoke(["report"])
+    assert command.exit_code == status
+    assert len(command.stderr.strip().splitlines()) == 1
+    assert ("defect" in command.stderr) == isinstance(raised, ZeroDivisionError)
 
 
 @pytest.fixture(scope="module")
@@ -110,35 +125,36 @@ def test_response_table_and_files(swept, tmp_path):
 
 def test_match_finds_table_one(matched):
     figures = json.loads((matched / "match.json").read_text())
-    found = figures["gains"]["FR_knee"]
+    knee = figures["gains"]["FR_knee"]
     # Two cells of the paper's grid are 0.57 N m/rad and 0.024 N m s/rad.
-    assert found["stiffness"]["value"] == pytest.approx(21.8, abs=0.57)
-    assert found["damping"]["value"] == pytest.approx(0.541, abs=0.024)
-    quality = found["quality"]
+    assert knee["stiffness"]["value"] == pytest.approx(21.8, abs=0.57)
+    assert knee["damping"]["value"] == pytest.approx(0.541, abs=0.024)
+    quality = knee["quality"]
     assert quality["error_db"] < 0.5 * quality["nominal_error_db"]
-    assert found["zero_armature_error_db"] > 5.0 * quality["error_db"]
-    assert 0.002 < found["delay_s"]["value"] < 0.01
+    assert knee["zero_armature_error_db"] > 5.0 * quality["error_db"]
+    assert 0.002 < knee["delay_s"]["value"] < 0.01
     assert (figures["matched"], figures["joints"]) == (1, 1)
     assert "virtual robot" in (matched / "match.html").read_text(encoding="utf-8")
 
 
 def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path):
-    fresh, figures = tmp_path / "fresh", tmp_path / "predict.json"
+    fresh = tmp_path / "fresh"
+    figures = tmp_path / "predict.json"
     chirp = ("--signal", "log-chirp", "--repeats", "1", "--seed", "5")
     accepted("sweep", *KNEE, "--out", fresh, *chirp)
     gains = ("--robot", "mini_cheetah", "--gains", matched / "gains.yaml")
     accepted("predict", fresh, *gains, "--json", figures)
-    found = json.loads(figures.read_text())
-    (row,) = found["predictions"]
+    prediction = json.loads(figures.read_text())
+    (row,) = prediction["predictions"]
     assert row["rmse_matched"] < 0.5 * row["rmse_naive"]
-    assert found["fitted_on"] == []
+    assert prediction["fitted_on"] == []
     accepted("report", matched)
     assert "FR_knee" in (matched / "report.html").read_text(encoding="utf-8")
     log = matched / "FR_knee.mcap"
-    done = invoke(["predict", log, *gains, "--out", tmp_path / "again", "--json", figures])
-    assert done.exit_code == 0
+    again = invoke(["predict", log, *gains, "--out", tmp_path / "again", "--json", figures])
+    assert again.exit_code == 0
     assert json.loads(figures.read_text())["fitted_on"] == [str(log)]
-    assert "warning" in done.stderr
+    assert "warning" in again.stderr
 
 
 def test_export(matched, tmp_path):
@@ -147,11 +163,13 @@ def test_export(matched, tmp_path):
 
 
 def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
-    log, out = matched / "FR_knee.mcap", tmp_path / "gains.yaml"
+    log = matched / "FR_knee.mcap"
+    out = tmp_path / "gains.yaml"
     common = ("match", log, "--robot", "mini_cheetah", "--out", out)
     assert "--mode drive" in refused(*common, "--fit", "armature")
-    names = ("stiffness", "armature", "damping", "frictionloss")
-    fits = [word for name in names for word in ("--fit", name)]
+    fits = []
+    for name in ("stiffness", "armature", "damping", "frictionloss"):
+        fits += ["--fit", name]
     assert "FR_knee" in refused(*common, "--mode", "drive", *fits)
     assert not out.exists()
     printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
@@ -161,12 +179,18 @@ def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
 def test_the_demo_takes_the_matched_policy_first_and_refuses_another_robots(tmp_path):
     pytest.importorskip("onnxruntime")
     assert find_policies(None, ROBOT)[0].parts[-3:] == ("policies", "matched", "policy.onnx")
-    own = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12, "gains_sha256": ""}
-    for name, changes in (("naive", {"gains": "naive", **own}), ("matched", {})):
+    nominal = {
+        "gains": "naive",
+        "stiffness": (17.0,) * 12,
+        "damping": (0.4,) * 12,
+        "gains_sha256": "",
+    }
+    for name in ("naive", "matched"):
         (tmp_path / name).mkdir()
-        write_hopper(tmp_path / name / "policy.onnx", 0.5, **changes)
-    found = find_policies(tmp_path, ROBOT)
-    assert [path.parent.name for path in found] == ["matched", "naive"]
+    write_hopper(tmp_path / "naive" / "policy.onnx", 0.5, **nominal)
+    write_hopper(tmp_path / "matched" / "policy.onnx", 0.5)
+    policies = find_policies(tmp_path, ROBOT)
+    assert [path.parent.name for path in policies] == ["matched", "naive"]
     (tmp_path / "a").mkdir()
     write_hopper(tmp_path / "a" / "policy.onnx", robot="go2")
     with pytest.raises(ArtefactError, match="go2"):

@@ -256,7 +256,7 @@ REAL = ("--link", "dds", "--interface", "nowhere0", "--script")
 def test_a_command_that_must_not_move_the_robot_is_refused(
     policy: Path, words: tuple[str, ...], given: str, word: str
 ) -> None:
-    done = invoke(["deploy", str(policy), *words], given=given)
+    done = invoke(["deploy", str(policy), *words], typed=given)
     assert done.exit_code != 0
     assert word in done.stderr
     assert ("about to move" in done.stdout) is (word == "nothing was moved")

@@ -212,7 +212,7 @@ def test_a_person_clamps_joints_when_requested(
 
 def test_real_hardware_must_be_confirmed_by_its_name(tmp_path: Path) -> None:
     words = ["sweep", "mini_cheetah", "--link", "lcm", "--interface", "lo", "--joints", "FR_knee"]
-    done = invoke([*words, "--out", tmp_path / "x"], given="yes\n")
+    done = invoke([*words, "--out", tmp_path / "x"], typed="yes\n")
     assert done.exit_code == 2
     assert "A real mini_cheetah at lcm://lo is about to move" in done.stdout
     assert "nothing was moved" in done.stderr
