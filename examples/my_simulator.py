@@ -36,31 +36,48 @@ class Pendulum:
         )
         self.joints = robot.joint_names
         self.parameters = frozenset(PARAMETERS)
-        self._own = {
-            "stiffness": [joint.stiffness for joint in robot.joints],
-            "damping": [joint.damping for joint in robot.joints],
-            "armature": [joint.drive.armature for joint in robot.joints],
-            "frictionloss": [joint.drive.frictionloss for joint in robot.joints],
-            "delay": [0.0 for _ in robot.joints],
+        self._robot_values = {
+            "stiffness": np.array([joint.stiffness for joint in robot.joints]),
+            "damping": np.array([joint.damping for joint in robot.joints]),
+            "armature": np.array([joint.drive.armature for joint in robot.joints]),
+            "frictionloss": np.array([joint.drive.frictionloss for joint in robot.joints]),
+            "delay": np.zeros(len(robot.joints)),
         }
 
     def rollout(
         self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
     ) -> Array:
-        """Simulate runs from rest at the first command, shape (B, T, J) [rad]."""
-        own = {name: np.broadcast_to(v, command[:, 0].shape) for name, v in self._own.items()}
-        kp, kd, armature, friction, delay = ({**own, **values}[name] for name in PARAMETERS)
+        """Simulate runs from rest at the first command; see `Simulator.rollout`.
+
+        Args:
+            command: Target positions during each step [rad], shape (B, T, J).
+            values: Parameters that are not the robot's, each of shape (B, J).
+            locked: Joints that are held at their first command.
+
+        Returns:
+            Positions at the start of each step [rad], shape (B, T, J).
+        """
+        runs, steps, joints = command.shape
+        parameters = {}
+        for name in PARAMETERS:
+            value = values.get(name, self._robot_values[name])
+            parameters[name] = np.broadcast_to(value, (runs, joints))
+        timestep = self.info.timestep_s
+        inertia = LINK_INERTIA + parameters["armature"]
+        delay_steps = np.round(parameters["delay"] / timestep).astype(int)
+        friction_speed = timestep / inertia * parameters["frictionloss"]
         free = ~np.isin(self.joints, locked)
-        step, inertia = self.info.timestep_s, LINK_INERTIA + armature
-        late = np.round(delay / step).astype(int)
-        position, speed = command[:, 0].copy(), np.zeros_like(kp)
-        out = np.empty_like(command)
-        for k in range(command.shape[1]):
-            out[:, k] = position
-            at = np.maximum(k - late, 0)[:, None]
-            target = np.take_along_axis(command, at, axis=1)[:, 0]
-            speed = speed + step / inertia * (kp * (target - position) - kd * speed)
-            stop = step / inertia * friction
-            speed = free * np.sign(speed) * np.maximum(np.abs(speed) - stop, 0.0)
-            position = position + step * speed
-        return out
+
+        position = command[:, 0].copy()
+        speed = np.zeros((runs, joints))
+        positions = np.empty((runs, steps, joints))
+        for step in range(steps):
+            positions[:, step] = position
+            command_step = np.maximum(step - delay_steps, 0)[:, None]
+            target = np.take_along_axis(command, command_step, axis=1)[:, 0]
+            torque = parameters["stiffness"] * (target - position) - parameters["damping"] * speed
+            speed = speed + timestep / inertia * torque
+            speed = np.sign(speed) * np.maximum(np.abs(speed) - friction_speed, 0.0)
+            speed[:, ~free] = 0.0
+            position = position + timestep * speed
+        return positions

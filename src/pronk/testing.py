@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pronk.deploy.links.link import Codec, Transport
 from pronk.errors import HardwareError, LogError, PronkError
@@ -24,46 +25,68 @@ def check_simulator(simulator: Simulator) -> None:
 
     Two runs of 0.2 s are simulated several times: shapes, rest at the first command, causality,
     independent runs, repeatability, locked joints, and an effect of every parameter that it sets.
+
+    Raises:
+        PronkError: A rule of the protocol is broken; the message names it.
     """
-    info, joints = simulator.info, tuple(simulator.joints)
+    info = simulator.info
+    joints = tuple(simulator.joints)
+    parameters = set(simulator.parameters)
     _require(info.timestep_s > 0.0 and info.decimation >= 1, "info: timestep and decimation > 0")
     _require(bool(info.engine), "info: engine is named")
     _require(len(joints) > 0 and len(set(joints)) == len(joints), "joints: unique names")
-    unknown = set(simulator.parameters) - set(PARAMETERS)
+    unknown = parameters - set(PARAMETERS)
     _require(not unknown, f"parameters: {', '.join(sorted(unknown))} unknown to pronk")
-    _require({"stiffness", "damping"} <= set(simulator.parameters), "parameters: the gains")
+    _require({"stiffness", "damping"} <= parameters, "parameters: the gains")
+
+    # Two runs from rest at random positions, each with a step of the command in its middle.
     steps = max(40, round(0.2 / info.timestep_s))
-    rng = np.random.default_rng(0)
-    command = 0.1 * rng.standard_normal((2, 1, len(joints))) * np.ones((2, steps, 1))
-    command[:, steps // 2 :] += 0.05
+    middle = steps // 2
+    generator = np.random.default_rng(0)
+    start = 0.1 * generator.standard_normal((2, 1, len(joints)))
+    command = np.repeat(start, steps, axis=1)
+    command[:, middle:] += 0.05
     usual = {"stiffness": 20.0, "damping": 0.5, "armature": 0.01, "frictionloss": 0.1, "delay": 0.0}
     shape = (2, len(joints))
-    values = {n: np.full(shape, v) for n, v in usual.items() if n in simulator.parameters}
-    before = command.copy()
-    out = simulator.rollout(command, values)
-    _require(np.shape(out) == command.shape, "rollout: the shape of the command is returned")
-    _require(np.array_equal(command, before), "rollout: the command is left unchanged")
-    _require(bool(np.isfinite(out).all()), "rollout: usual gains give finite positions")
-    quarter = slice(steps // 4, steps // 2)
-    drift = np.abs(np.diff(out[:, quarter], axis=1)).max()
+    values = {}
+    for name in parameters:
+        values[name] = np.full(shape, usual[name])
+    command_before = command.copy()
+    position = simulator.rollout(command, values)
+    _require(np.shape(position) == command.shape, "rollout: the shape of the command is returned")
+    _require(np.array_equal(command, command_before), "rollout: the command stays unchanged")
+    _require(bool(np.isfinite(position).all()), "rollout: usual gains give finite positions")
+    drift = np.abs(np.diff(position[:, steps // 4 : middle], axis=1)).max()
     _require(float(drift) < 1e-3, "rollout: rest at the first command")
-    moved = np.abs(out[:, -1] - out[:, steps // 2]).max(axis=0)
-    _require(bool((moved > 1e-3).all()), "rollout: every joint follows its command")
-    _require(np.allclose(simulator.rollout(command, values), out), "rollout: repeatable")
-    single = simulator.rollout(command[:1], {k: v[:1] for k, v in values.items()})
-    _require(np.allclose(single, out[:1], atol=1e-6), "rollout: runs are independent")
-    later = command.copy()
-    later[:, -5:] += 0.1
-    early = simulator.rollout(later, values)[:, :-5]
-    _require(np.allclose(early, out[:, :-5], atol=1e-9), "rollout: no response before its command")
+    motion = np.abs(position[:, -1] - position[:, middle]).max(axis=0)
+    _require(bool((motion > 1e-3).all()), "rollout: every joint follows its command")
+
+    again = simulator.rollout(command, values)
+    _require(np.allclose(again, position), "rollout: repeatable")
+    first_values = {name: array[:1] for name, array in values.items()}
+    first_run = simulator.rollout(command[:1], first_values)
+    _require(np.allclose(first_run, position[:1], atol=1e-6), "rollout: runs are independent")
+    later_command = command.copy()
+    later_command[:, -5:] += 0.1
+    before_change = simulator.rollout(later_command, values)[:, :-5]
+    causal = np.allclose(before_change, position[:, :-5], atol=1e-9)
+    _require(causal, "rollout: no response before its command")
     if len(joints) > 1:
-        held = simulator.rollout(command, values, locked=joints[1:])
-        _require(bool(np.ptp(held[..., 0], axis=1).min() > 1e-3), "locked: the free joint moves")
-        _require(bool(np.isfinite(held).all()), "locked: positions stay finite")
-    other = {"stiffness": 10.0, "damping": 1.0, "armature": 0.05, "frictionloss": 0.5}
-    for name in sorted(simulator.parameters):
-        changed = {**values, name: np.full(shape, other.get(name, 0.02))}
-        effect = np.abs(simulator.rollout(command, changed) - out).max()
+        free_joint_alone = simulator.rollout(command, values, locked=joints[1:])
+        free_motion = np.ptp(free_joint_alone[..., 0], axis=1).min()
+        _require(bool(free_motion > 1e-3), "locked: the free joint moves")
+        _require(bool(np.isfinite(free_joint_alone).all()), "locked: positions stay finite")
+
+    other = {
+        "stiffness": 10.0,
+        "damping": 1.0,
+        "armature": 0.05,
+        "frictionloss": 0.5,
+        "delay": 0.02,
+    }
+    for name in sorted(parameters):
+        changed_values = {**values, name: np.full(shape, other[name])}
+        effect = np.abs(simulator.rollout(command, changed_values) - position).max()
         _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
 
 
@@ -94,7 +117,7 @@ def check_reader(
         empty.touch()
         for wrong in (missing, empty):
             rule = f"read: a file that is {wrong.stem} is refused with a LogError"
-            _refused(LogError, rule, partial(chosen.read, wrong, robot=robot, **options))
+            _require_refused(LogError, rule, partial(chosen.read, wrong, robot=robot, **options))
 
 
 def check_link(
@@ -107,33 +130,47 @@ def check_link(
 
     States decode to finite numbers of the robot's joints; cut, empty and foreign bytes are refused;
     commands encode to the same bytes every time, and impossible ones are refused; without an
-    interface the transport is local. `states` are two or more messages of a live robot; `transport`
-    opens the wire as an address without an interface does.
+    interface the transport is local.
+
+    Args:
+        robot: The robot behind the link.
+        codec: The codec.
+        states: Two or more messages of a live robot.
+        transport: Opens the wire as an address without an interface does.
+
+    Raises:
+        PronkError: A rule of the protocol is broken; the message names it.
     """
     joints = len(robot.joints)
     _require(len(states) >= 2, "states: two or more are given")
     for data in states:
         state = codec.decode(data)
-        sizes = dict.fromkeys(("position", "velocity", "torque"), joints)
-        for name, size in {**sizes, "gyro": 3, "accelerometer": 3, "orientation": 4}.items():
-            values = np.asarray(getattr(state, name))
-            _require(values.shape == (size,), f"decode: {name} has shape ({size},)")
-            _require(bool(np.isfinite(values).all()), f"decode: {name} is finite")
+        _require_finite("position", state.position, joints)
+        _require_finite("velocity", state.velocity, joints)
+        _require_finite("torque", state.torque, joints)
+        _require_finite("gyro", state.gyro, 3)
+        _require_finite("accelerometer", state.accelerometer, 3)
+        _require_finite("orientation", state.orientation, 4)
         norm = float(np.linalg.norm(state.orientation))
         _require(abs(norm - 1.0) < 0.02, "decode: orientation has length 1")
     for data in (b"", states[0][:-1], b"\xff" * len(states[0])):
         rule = f"decode: {len(data)} bytes that are no state are refused"
-        _refused(RefusedError, rule, partial(codec.decode, data))
+        _require_refused(RefusedError, rule, partial(codec.decode, data))
+
     pose = np.array([joint.default_position for joint in robot.joints])
     command = Command(position=pose, stiffness=np.full(joints, 10.0), damping=np.ones(joints))
-    encoded, damped = codec.encode(command), codec.encode(damping_command(joints))
-    _require(codec.encode(command) == encoded, "encode: repeatable")
-    _require(encoded != damped, "encode: commands differ")
+    message = codec.encode(command)
+    damping_message = codec.encode(damping_command(joints))
+    _require(codec.encode(command) == message, "encode: repeatable")
+    _require(message != damping_message, "encode: commands differ")
     for value in (np.nan, np.inf):
-        wrong = Command(position=pose + value, stiffness=pose * 0, damping=pose * 0)
+        impossible = Command(
+            position=pose + value, stiffness=np.zeros(joints), damping=np.zeros(joints)
+        )
         rule = f"encode: a position of {value} is refused"
-        _refused(HardwareError, rule, partial(codec.encode, wrong))
+        _require_refused(HardwareError, rule, partial(codec.encode, impossible))
     _require(codec.state_rate_hz > 0.0, "state_rate_hz > 0")
+
     if transport is not None:
         wire = transport()
         try:
@@ -143,13 +180,20 @@ def check_link(
             wire.close()
 
 
-def _require(kept: bool, rule: str) -> None:
-    """Raise if a rule of a protocol is not kept."""
-    if not kept:
+def _require(satisfied: bool, rule: str) -> None:
+    """Raise a PronkError if a rule of a protocol is broken."""
+    if not satisfied:
         raise PronkError(f"the conformance check failed at: {rule}.")
 
 
-def _refused(error: type[PronkError], rule: str, call: Callable[[], object]) -> None:
+def _require_finite(name: str, values: ArrayLike, size: int) -> None:
+    """Raise unless a field of a decoded state has `size` finite numbers."""
+    array = np.asarray(values)
+    _require(array.shape == (size,), f"decode: {name} has shape ({size},)")
+    _require(bool(np.isfinite(array).all()), f"decode: {name} is finite")
+
+
+def _require_refused(error: type[PronkError], rule: str, call: Callable[[], object]) -> None:
     """Raise unless a call is refused with this error."""
     try:
         call()

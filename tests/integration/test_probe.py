@@ -50,11 +50,13 @@ def probed(truth: Truth) -> Probe:
 def test_law_and_parameters(kind: str, law: DriveLaw) -> None:
     truth = replace(FAULTLESS, law=law, stated=law, kind=kind)
     probe = probed(truth)
-    assert (probe.law, probe.beside_explicit, probe.hold) == (law, False, 1)
+    assert probe.law.drive == law
+    assert not probe.law.beside_explicit
+    assert probe.law.soft_friction == (kind == "mujoco")
+    assert probe.hold == 1
     assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
     assert probe.frictionloss == pytest.approx(0.1, rel=1e-2)
     assert probe.delay_s == pytest.approx(0.0032, abs=1e-5)
-    assert probe.soft_friction == (kind == "mujoco")
     assert not probe.faults
 
 
@@ -107,7 +109,8 @@ def test_the_command_names_law_and_faults(tmp_path: Path) -> None:
     words = ["probe", "mujoco", "--robot", PENDULUM]
     accepted(*words, "--json", out)
     probe = json.loads(out.read_text())["probe"]
-    assert probe["law"] == {"kind": "explicit", "iterations": 1, "passive_damping": "implicit"}
+    drive = {"kind": "explicit", "iterations": 1, "passive_damping": "implicit"}
+    assert probe["law"]["drive"] == drive
     assert probe["faults"] == {}
     assert "swing" in refused(*words, "--joint", "knee")
 
@@ -123,6 +126,6 @@ def test_one_scale_of_gains_inertia_and_gravity_is_not_taken_for_another() -> No
         delay_s=0.0,
     )
     probe = probed(truth)
-    assert probe.law == DriveLaw()
+    assert probe.law.drive == DriveLaw()
     assert probe.stiffness_factor == pytest.approx(1.0, rel=1e-3)
     assert not probe.faults

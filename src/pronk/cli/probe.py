@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from pronk.cli import console
+from pronk.tables import Column, Table
 
 
 def probe(
@@ -29,31 +29,44 @@ def probe(
     from pronk.identify.simulators.probe import probe_joint
     from pronk.robots import load_robot
 
-    known = load_robot(robot)
-    made = load_simulator(simulator, known, threads=1, python=simulator_python)
-    found = probe_joint(made, known, joint)
-    info, one = made.info, known.joint(found.joint)
-    beside = "E, beside it " if found.beside_explicit else ""
+    robot_spec = load_robot(robot)
+    engine = load_simulator(simulator, robot_spec, threads=1, python=simulator_python)
+    result = probe_joint(engine, robot_spec, joint)
+    info = engine.info
+    probed_joint = robot_spec.joint(result.joint)
+    drive = probed_joint.drive
+    acting_law = result.law.drive.label
+    if result.law.beside_explicit:
+        acting_law = f"E, beside it {acting_law}"
+    acting_stiffness = probed_joint.stiffness * result.stiffness_factor
+    acting_damping = probed_joint.damping * result.damping_factor
     # Adding 0 makes -0 a 0.
-    passive, delay_ms = round(found.viscous_damping, 6) + 0.0, round(1e3 * found.delay_s, 4) + 0.0
-    rows: list[list[Any]] = [
-        ["law", info.drive_law.label, beside + found.law.label],
-        ["stiffness [N m/rad]", one.stiffness, one.stiffness * found.stiffness_factor],
-        ["damping [N m s/rad]", one.damping, one.damping * found.damping_factor],
-        ["armature [kg m^2]", found.armature_set, found.armature],
-        ["passive damping [N m s/rad]", one.drive.viscous_damping, passive],
-        ["dry friction [N m]", one.drive.frictionloss, found.frictionloss],
-        ["gravity [of the model's]", 1.0, max(found.gravity, 0.0)],
-        ["delay [ms]", 0.0, delay_ms],
-        ["hold [steps]", 1, found.hold],
-    ]
-    console.show_table(
-        "of the joint | set;4 | acts;4",
-        rows,
-        f"Steps of {1e3 * info.timestep_s:g} ms. {100.0 * found.residual:.2g} % of the motion is "
-        "not explained.",
-        title=f"{found.joint} in {info.engine} {info.version}",
+    viscous_damping = round(result.viscous_damping, 6) + 0.0
+    delay_ms = round(1e3 * result.delay_s, 4) + 0.0
+    table = Table(
+        title=f"{result.joint} in {info.engine} {info.version}",
+        columns=(
+            Column(heading="of the joint"),
+            Column(heading="set", digits=4),
+            Column(heading="acts", digits=4),
+        ),
+        rows=(
+            ("law", info.drive_law.label, acting_law),
+            ("stiffness [N m/rad]", probed_joint.stiffness, acting_stiffness),
+            ("damping [N m s/rad]", probed_joint.damping, acting_damping),
+            ("armature [kg m^2]", drive.armature, result.armature),
+            ("passive damping [N m s/rad]", drive.viscous_damping, viscous_damping),
+            ("dry friction [N m]", drive.frictionloss, result.frictionloss),
+            ("gravity [of the model's]", 1.0, max(result.gravity, 0.0)),
+            ("delay [ms]", 0.0, delay_ms),
+            ("hold [steps]", 1, result.hold),
+        ),
+        notes=(
+            f"Steps of {1e3 * info.timestep_s:g} ms. {100.0 * result.residual:.2g} % of the "
+            "motion is not explained.",
+        ),
     )
-    for sentence in found.faults.values():
-        console.warn(f"{found.joint}: {sentence}.")
-    return console.Outcome(figures={"probe": asdict(found)})
+    console.show(table)
+    for sentence in result.faults.values():
+        console.warn(f"{result.joint}: {sentence}.")
+    return console.Outcome(figures={"probe": asdict(result)})
