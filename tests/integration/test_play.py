@@ -21,14 +21,13 @@ import pytest
 from command_line import invoke
 from hopper import ROBOT, write_hopper
 from pronk.deploy.links.link import wait_for
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import PronkError
 from pronk.jump.play.page import WebPage, free_port, readout
-from pronk.jump.play.play import JUMP_S, Gauge, Joystick, play
+from pronk.jump.play.play import JUMP_S, Gauge, Joystick, play_in_real_time
 from pronk.jump.trial.jumps import JumpRules
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.policy.gamepad import GamepadButton, GamepadInput
 from pronk.policy.runtime import load_policy
 from pronk.robots.legged import legged
 from seen_jump import STANDING, Z_OFF, G, changed, seen_jump
@@ -39,14 +38,10 @@ RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 class Pad:
     """A gamepad whose state a test sets."""
 
-    state = OperatorCommand()
+    state = GamepadInput()
 
-    def command(self, now: float, mode: Mode) -> OperatorCommand:
+    def read(self, now: float) -> GamepadInput:
         return self.state
-
-    def notified(self, kind: str, text: str) -> None: ...
-
-    def leave(self) -> None: ...
 
 
 def test_page_and_gamepad_add_up_within_the_ranges() -> None:
@@ -54,9 +49,9 @@ def test_page_and_gamepad_add_up_within_the_ranges() -> None:
     joystick = Joystick(ranges=RANGES, gamepad=pad)
     joystick.set_velocity((0.5, 0.2, -1.0))
     assert joystick.commanded(0.0) == ((0.5, 0.2, -1.0), False)
-    pad.state = OperatorCommand(command=(3.0, -1.0, 0.0), jump=True)
+    pad.state = GamepadInput(velocity=(3.0, -1.0, 0.0), jump=True)
     assert joystick.commanded(0.02) == ((3.0, -0.8, -1.0), True)
-    pad.state = OperatorCommand(request=OperatorRequest.RESET)
+    pad.state = GamepadInput(pressed=(GamepadButton.START,))
     assert joystick.commanded(0.04)[1] is False
     assert joystick.take_reset()
     assert not joystick.take_reset()
@@ -79,25 +74,29 @@ def test_a_jump_lasts_as_long_as_in_the_trial_however_often_one_presses() -> Non
     assert joystick.take_reset()
     assert not joystick.commanded(0.0)[1]
 
-    # A policy without a jump input gets none.
+
+def test_a_policy_without_a_jump_input_gets_none() -> None:
     pad = Pad()
-    pad.state = OperatorCommand(jump=True)
+    pad.state = GamepadInput(jump=True)
     joystick = Joystick(ranges=RANGES, jumps=False, gamepad=pad)
     joystick.jump()
     assert not any(jumps(joystick, 0.0, 50))
 
 
-def seen_by_gauge(capture: Capture) -> Gauge:
+def gauge_of(capture: Capture) -> Gauge:
+    """A gauge that has seen every second sample."""
     gauge = Gauge(JumpRules(standing_height=STANDING))
-    for k in range(0, len(capture.time), 2):
-        arrays = {one.name: getattr(capture, one.name)[k : k + 1] for one in fields(Capture)}
+    for index in range(0, len(capture.time), 2):
+        arrays = {}
+        for entry in fields(Capture):
+            arrays[entry.name] = getattr(capture, entry.name)[index : index + 1]
         gauge.add(Capture(**arrays))
     return gauge
 
 
 def test_jumps_and_falls_are_measured() -> None:
     seen = seen_jump(up=2.0, speed=1.5)
-    gauge = seen_by_gauge(seen)
+    gauge = gauge_of(seen)
     (hop,) = gauge.hops
     assert hop.vertical == pytest.approx(2.0, abs=0.03)
     assert hop.apex == pytest.approx(Z_OFF + 2.0**2 / (2.0 * G), abs=1e-3)
@@ -105,8 +104,8 @@ def test_jumps_and_falls_are_measured() -> None:
     assert hop.distance == pytest.approx(1.5 * hop.duration, abs=0.005)
     # Less than the 3 cm over standing height of a jump.
     low = changed(seen, "position", (slice(None), 2), STANDING)
-    assert seen_by_gauge(low).hops == []
-    fallen = seen_by_gauge(changed(seen, "orientation", slice(7000, None), [0.7, 0.7, 0.0, 0.0]))
+    assert gauge_of(low).hops == []
+    fallen = gauge_of(changed(seen, "orientation", slice(7000, None), [0.7, 0.7, 0.0, 0.0]))
     assert (gauge.fallen, fallen.fallen) == (False, True)
     assert "fell" in readout(fallen, 1.0)
 
@@ -128,23 +127,30 @@ def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_robot_hops_and_resets_no_faster_than_real_time(
     hopper: Path, act: str, at: float, end: float
 ) -> None:
-    joystick, heights, done = Joystick(ranges=RANGES), Heights(), []
+    joystick = Joystick(ranges=RANGES)
+    heights = Heights()
+    acted = False
 
     def until(simulated: float) -> bool:
-        if simulated >= at and not done:
-            done.append(simulated)
-            getattr(joystick, act)()
+        nonlocal acted
+        if simulated >= at and not acted:
+            acted = True
+            if act == "jump":
+                joystick.jump()
+            else:
+                joystick.reset()
         return simulated >= end
 
-    figures = play(ROBOT, load_policy(hopper), load_sim_params(), joystick, heights, until=until)
-    assert figures["wall_s"] >= 0.97 * end
+    policy = load_policy(hopper)
+    run = play_in_real_time(ROBOT, policy, load_sim_params(), joystick, heights, until=until)
+    assert run.wall_s >= 0.97 * end
     assert heights[0] == pytest.approx(legged(ROBOT.source).standing_height, abs=0.06)
     if act == "jump":
-        assert figures["simulated_s"] == pytest.approx(1.0)
+        assert run.simulated_s == pytest.approx(1.0)
         assert max(heights) > heights[0] + 0.05
         assert len(heights) == 51
     else:
-        assert figures["resets"] == 1
+        assert run.resets == 1
         again = heights[11:]
         assert again == heights[: len(again)]
 
@@ -156,7 +162,9 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
     client = pytest.importorskip("websockets.sync.client")
     import msgspec
 
-    joystick, sim_params = Joystick(ranges=RANGES), load_sim_params()
+    joystick = Joystick(ranges=RANGES)
+    sim_params = load_sim_params()
+    policy = load_policy(hopper)
     server = WebPage(ROBOT, sim_params.ground, joystick, title="# virtual", port=18765)
     with closing(server) as page:
         assert page.server.get_host() == "127.0.0.1"
@@ -183,7 +191,7 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
             update = {"uuid": page.sliders[0]._impl.uuid, "updates": {"value": 1.25}}
             send("GuiUpdateMessage", update)
             assert wait_for(lambda: joystick.commanded(0.0)[0] == (1.25, 0.0, 0.0), 120.0)
-            play(ROBOT, load_policy(hopper), sim_params, joystick, page, until=lambda t: t > 0.2)
+            play_in_real_time(ROBOT, policy, sim_params, joystick, page, until=lambda t: t > 0.2)
             assert "trunk" in page.text.content
         page.reset()
         assert joystick.commanded(0.0)[0] == (0.0, 0.0, 0.0)

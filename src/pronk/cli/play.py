@@ -26,55 +26,69 @@ def play(
     Args:
         policy: policy.onnx.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
-        sim_params: Body of the virtual robot; the one that ships with pronk if left out.
-        port: Of the page; the next one that is free.
+        sim_params: Parameters of the virtual robot; those that ship with pronk if left out.
+        port: Port of the page; the next one that is free.
         host: Address to bind to. 0.0.0.0 admits every computer on your networks.
         gamepad: Use a gamepad that is plugged into this machine; if there is one, if left out.
-        seed: Of the virtual robot's noise.
+        seed: Seed of the virtual robot's noise.
     """
-    from pronk.deploy.runtime.teleop import Gamepad
-    from pronk.jump.play.page import WebPage, modules
-    from pronk.jump.play.play import Joystick
-    from pronk.jump.play.play import play as run
+    from pronk.jump.play.page import WebPage, require_viser
+    from pronk.jump.play.play import Joystick, play_in_real_time
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.policy.contract import check
+    from pronk.policy.gamepad import GamepadReader
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
 
-    modules()
-    loaded = load_policy(policy)
-    machine = load_robot(robot or loaded.contract.robot)
-    params = load_sim_params(sim_params, machine)
-    check(loaded.contract, machine)
-    ranges = loaded.contract.command_ranges
+    require_viser()
+    loaded_policy = load_policy(policy)
+    contract = loaded_policy.contract
+    spec = load_robot(robot or contract.robot)
+    params = load_sim_params(sim_params, spec)
+    check(contract, spec)
     title = (
-        f"## The virtual robot\nNot a real one. {machine.name}, policy `{policy.name}` "
-        f"({loaded.contract.gains} gains), in real time."
+        f"## The virtual robot\nNot a real one. {spec.name}, policy `{policy.name}` "
+        f"({contract.gains} gains), in real time."
     )
-    plugged = [] if gamepad is False else sorted(Path("/dev/input").glob("js*"))
-    devices = [path for path in plugged if os.access(path, os.R_OK)]
-    if gamepad and not devices:
+    device = None if gamepad is False else _find_gamepad()
+    if gamepad and device is None:
         raise PronkError(
             "--gamepad: there is no gamepad that can be read in /dev/input; plug one in, or leave "
             "the option out."
         )
     with ExitStack() as stack:
-        pad = stack.enter_context(closing(Gamepad(devices[0], ranges))) if devices else None
-        joystick = Joystick(ranges=ranges, jumps=loaded.contract.jump, gamepad=pad)
-        server = WebPage(machine, params.ground, joystick, title=title, host=host, port=port)
-        page = stack.enter_context(closing(server))
+        joystick = Joystick(ranges=contract.command_ranges, jumps=contract.jump)
+        if device is not None:
+            reader = GamepadReader(device, contract.command_ranges)
+            joystick.gamepad = stack.enter_context(closing(reader))
+        page = WebPage(spec, params.ground, joystick, title=title, host=host, port=port)
+        stack.enter_context(closing(page))
         console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
         if host != "127.0.0.1":
             console.warn(f"bound to {host}: every computer that reaches this one can play")
-        if pad is not None:
+        if device is not None:
             console.say(
-                f"gamepad: {devices[0]} (left stick walks, right stick turns, RB jumps, START "
+                f"gamepad: {device} (left stick walks, right stick turns, RB jumps, START "
                 "sets down anew)"
             )
-        played = run(machine, loaded, params, joystick, page, seed=seed)
-    simulated, wall = played["simulated_s"], played["wall_s"]
+        run = play_in_real_time(spec, loaded_policy, params, joystick, page, seed=seed)
     console.say(
-        f"{simulated:.0f} s of the virtual robot in {wall:.0f} s "
-        f"({simulated / max(wall, 1e-9):.2f} x real time), {len(played['hops'])} jumps"
+        f"{run.simulated_s:.0f} s of the virtual robot in {run.wall_s:.0f} s "
+        f"({run.simulated_s / max(run.wall_s, 1e-9):.2f} x real time), {len(run.hops)} jumps"
     )
-    return console.Outcome(figures=played)
+    return console.Outcome(
+        figures={
+            "simulated_s": run.simulated_s,
+            "wall_s": run.wall_s,
+            "resets": run.resets,
+            "hops": run.hops,
+        }
+    )
+
+
+def _find_gamepad() -> Path | None:
+    """Return the first gamepad of this machine that can be read; None without one."""
+    for path in sorted(Path("/dev/input").glob("js*")):
+        if os.access(path, os.R_OK):
+            return path
+    return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import select
-import struct
 import sys
 import termios
 import threading
@@ -17,6 +16,7 @@ from pathlib import Path
 from pronk.deploy.links.link import ClampOperator
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.errors import HardwareError, PronkError
+from pronk.policy.gamepad import JUMP_S, GamepadButton, GamepadReader
 from pronk.policy.script import STILL, Script, Velocity
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -182,8 +182,6 @@ _REQUESTS = {
     "r": OperatorRequest.RESET,
     "q": OperatorRequest.QUIT,
 }
-_JUMP_S = 0.5
-"""Length of the jump input of one press, as in training [s]."""
 _REPEAT_S = 0.8
 """A key counts as held for this long; keyboards repeat a key after 0.66 s at most [s]."""
 
@@ -263,29 +261,20 @@ class Keyboard(Device):
         forward, left, yaw = self._command
         return OperatorCommand(
             command=(forward, left, yaw),
-            jump=now - self._jump < _JUMP_S,
+            jump=now - self._jump < JUMP_S,
             held=now - self._held < _REPEAT_S,
             request=request,
         )
 
 
-_EVENT = struct.Struct("<IhBB")
-"""js_event of linux/joystick.h: time [ms], value, type, number."""
-_BUTTON, _AXIS, _INITIAL = 1, 2, 0x80
-_FULL = 32767.0
-_DEAD_ZONE = 0.1
-# Numbers of the kernel's xpad driver, to which other gamepads are mapped.
-_PAD_REQUESTS = {
-    0: OperatorRequest.STAND,
-    1: OperatorRequest.DAMP,
-    2: OperatorRequest.SIT,
-    3: OperatorRequest.WALK,
-    6: OperatorRequest.QUIT,
-    7: OperatorRequest.RESET,
+_PAD_REQUESTS: dict[int, OperatorRequest] = {
+    GamepadButton.A: OperatorRequest.STAND,
+    GamepadButton.B: OperatorRequest.DAMP,
+    GamepadButton.X: OperatorRequest.SIT,
+    GamepadButton.Y: OperatorRequest.WALK,
+    GamepadButton.BACK: OperatorRequest.QUIT,
+    GamepadButton.START: OperatorRequest.RESET,
 }
-_LEFT_BUMPER, _RIGHT_BUMPER = 4, 5
-_AXES = (1, 0, 3)
-"""Forward, left, turn."""
 
 PAD_HELP = """\
   hold LB      dead-man: releasing it damps the joints
@@ -294,51 +283,23 @@ PAD_HELP = """\
 """Buttons of the gamepad."""
 
 
-class Gamepad(Device):
+class Gamepad(Operator):
     """A gamepad through the kernel's joystick interface; unplugged counts as released."""
 
     def __init__(self, path: Path, ranges: Ranges) -> None:
         """Open a device such as /dev/input/js0; HardwareError if it cannot be opened."""
-        try:
-            fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        except OSError as error:
-            raise HardwareError(
-                f"gamepad {path}: {error.strerror}; plug it in, or name another "
-                "one (ls /dev/input/js*)."
-            ) from None
-        super().__init__(fd, ranges)
-        self._axes: dict[int, float] = {}
-        self._buttons: dict[int, bool] = {}
-        self._pressed = False
+        self._reader = GamepadReader(path, ranges)
 
     def close(self) -> None:
         """Close the device."""
-        os.close(self._fd)
+        self._reader.close()
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The input of sticks and buttons."""
+        """Return the input of sticks and buttons."""
+        pad = self._reader.read(now)
         request = OperatorRequest.NONE
-        for _, value, kind, number in _EVENT.iter_unpack(self._read()):
-            if kind & ~_INITIAL == _AXIS:
-                self._axes[number] = value / _FULL
-            elif kind & ~_INITIAL == _BUTTON:
-                self._buttons[number] = bool(value)
-                if value and not kind & _INITIAL:
-                    request = _PAD_REQUESTS.get(number, request)
-        if not self._connected:
-            return OperatorCommand(request=request)
-        pushed = (-self._axes.get(number, 0.0) for number in _AXES)
-        forward, left, yaw = (
-            0.0 if abs(push) <= _DEAD_ZONE else push * (high if push > 0.0 else -low)
-            for push, (low, high) in zip(pushed, self._ranges, strict=True)
-        )
-        pressed = self._buttons.get(_RIGHT_BUMPER, False)
-        if pressed and not self._pressed:
-            self._jump = now
-        self._pressed = pressed
+        for button in pad.pressed:
+            request = _PAD_REQUESTS.get(button, request)
         return OperatorCommand(
-            command=(forward, left, yaw),
-            jump=now - self._jump < _JUMP_S,
-            held=self._buttons.get(_LEFT_BUMPER, False),
-            request=request,
+            command=pad.velocity, jump=pad.jump, held=pad.dead_man, request=request
         )

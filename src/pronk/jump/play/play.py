@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from threading import Lock
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.teleop import Operator
 from pronk.jump.trial.jumps import JumpRules, fallen_at, jump_flights
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.policy.contract import COMMANDS
+from pronk.policy.gamepad import GamepadButton, GamepadInput
 from pronk.policy.rollout import ticks
 from pronk.policy.runtime import Policy
 from pronk.policy.script import STILL, Commanded, Script, Velocity
@@ -30,27 +29,34 @@ from pronk.robots.machine import State
 from pronk.robots.robot import RobotSpec
 
 JUMP_S = Script(command=STILL).jump_s
-"""How long the jump input lasts, as in the trial [s]."""
+"""Length of the jump input, as in the trial [s]."""
 _SAMPLE_S = 0.004
-"""Between two samples of the robot; a lift-off speed is off by less than 4 cm/s for it."""
+"""Time between two samples of the robot; a lift-off speed is off by less than 4 cm/s for it [s]."""
 _LATE_S = 0.25
-"""Delay that is not made up for: the robot then runs late instead of faster than real time."""
+"""Delay that is not made up for: the robot then runs late instead of faster than real time [s]."""
+
+
+class Pad(Protocol):
+    """A gamepad, as `pronk.policy.gamepad.GamepadReader` is one."""
+
+    def read(self, now: float) -> GamepadInput:
+        """Return the input at a time of a steady clock [s]."""
 
 
 @dataclass
 class Joystick:
-    """Operator command of the page, which writes it from threads of its own, and of a gamepad."""
+    """Command of the page, which writes it from threads of its own, and of a gamepad."""
 
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest command, by the names in `COMMANDS`."""
     jumps: bool = True
-    """Whether the policy has a jump input."""
-    gamepad: Operator | None = None
-    """Its velocity is added to the page's; it is read once a policy step."""
+    """The policy has a jump input."""
+    gamepad: Pad | None = None
+    """Gamepad that is read once a policy step; its velocity is added to the page's."""
     _velocity: Velocity = STILL
-    _jump: bool = False
-    _until: float = -math.inf
-    _reset: bool = False
+    _jump_requested: bool = False
+    _jump_until: float = -math.inf
+    _reset_requested: bool = False
     _lock: Lock = field(default_factory=Lock)
 
     def set_velocity(self, velocity: Velocity) -> None:
@@ -61,41 +67,52 @@ class Joystick:
     def jump(self) -> None:
         """Command a jump at the next tick, unless one is under way."""
         with self._lock:
-            self._jump = self.jumps
+            self._jump_requested = self.jumps
 
     def reset(self) -> None:
         """Request a reset of the robot."""
         with self._lock:
-            self._reset = True
+            self._reset_requested = True
 
     def take_reset(self) -> bool:
-        """Whether a reset was requested since the last call; clears it, and any jump."""
+        """Return whether a reset was requested since the last call; clear it, and any jump."""
         with self._lock:
-            requested, self._reset = self._reset, False
+            requested = self._reset_requested
+            self._reset_requested = False
             if requested:
-                self._jump, self._until = False, -math.inf
+                self._jump_requested = False
+                self._jump_until = -math.inf
             return requested
 
     def commanded(self, t: float) -> Commanded:
-        """Command at a time since the policy took over [s]: page plus gamepad, within the ranges.
+        """Return page plus gamepad, within the ranges.
 
         The gamepad's jump input is as long as its own timing makes it.
+
+        Args:
+            t: Time since the policy took over [s].
         """
-        added, pressed = STILL, False
+        pad = GamepadInput()
         if self.gamepad is not None:
-            pad = self.gamepad.command(time.monotonic(), Mode.POLICY)
-            added, pressed = pad.command, pad.jump and self.jumps
-            if pad.request is OperatorRequest.RESET:
+            pad = self.gamepad.read(time.monotonic())
+            if GamepadButton.START in pad.pressed:
                 self.reset()
         with self._lock:
-            if self._jump and t >= self._until:
-                self._until = t + JUMP_S
-            self._jump = False
-            forward, left, yaw = (
-                min(self.ranges[name][1], max(self.ranges[name][0], a + b))
-                for name, a, b in zip(COMMANDS, self._velocity, added, strict=True)
+            if self._jump_requested and t >= self._jump_until:
+                self._jump_until = t + JUMP_S
+            self._jump_requested = False
+            command = (
+                self._limited(0, pad.velocity),
+                self._limited(1, pad.velocity),
+                self._limited(2, pad.velocity),
             )
-            return (forward, left, yaw), pressed or t < self._until - 1e-9
+            jump = (pad.jump and self.jumps) or t < self._jump_until - 1e-9
+            return command, jump
+
+    def _limited(self, index: int, added: Velocity) -> float:
+        """Return one part of the velocity of page and gamepad together, within its range."""
+        low, high = self.ranges[COMMANDS[index]]
+        return min(high, max(low, self._velocity[index] + added[index]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +124,9 @@ class Hop:
     apex: float
     """Highest trunk over the floor [m]."""
     duration: float
-    """[s]"""
+    """Time in the air [s]."""
     distance: float
-    """Of the trunk from lift-off to touchdown [m]."""
+    """Distance of the trunk from lift-off to touchdown [m]."""
 
 
 @dataclass
@@ -118,67 +135,111 @@ class Gauge:
 
     rules: JumpRules
     hops: list[Hop] = field(default_factory=list)
+    """Jumps since the start, the last one at the end."""
     height: float = math.nan
-    """Of the trunk over the floor [m]."""
+    """Height of the trunk over the floor [m]."""
     speed: float = math.nan
-    """Horizontal [m/s]."""
+    """Horizontal speed of the trunk [m/s]."""
     fallen: bool = False
-    _seen: list[Capture] = field(default_factory=list)
-    """The samples of a flight under way."""
+    """The robot lies or leans too far."""
+    _flight: list[Capture] = field(default_factory=list)
+    """Samples of a flight under way."""
 
     def add(self, sample: Capture) -> None:
         """Take in a capture of one sample, of the present moment."""
         self.height = float(sample.position[0, 2])
         self.speed = float(np.hypot(*sample.velocity[0, :2]))
         self.fallen = fallen_at(sample) == 0
-        self._seen.append(sample)
-        if sample.contact.any() and len(self._seen) > 1:
+        self._flight.append(sample)
+        if sample.contact.any() and len(self._flight) > 1:
             self._land()
         if self.fallen or sample.contact.any():
             self.reset()
 
     def _land(self) -> None:
         """Keep the flight that the last sample has ended, if it was a jump."""
-        names = (entry.name for entry in fields(Capture))
-        joined = {k: np.concatenate([getattr(one, k) for one in self._seen]) for k in names}
-        seen = Capture(**joined)
-        if flight := jump_flights(seen, 0, self.rules, fallen_at(seen)).main:
-            up, down = flight
-            hop = Hop(
-                vertical=float(seen.velocity[up, 2]),
-                apex=float(seen.position[up:down, 2].max()),
-                duration=float(seen.time[down] - seen.time[up]),
-                distance=float(np.hypot(*(seen.position[down, :2] - seen.position[up, :2]))),
+        capture = joined(self._flight)
+        flight = jump_flights(capture, 0, self.rules, fallen_at(capture)).main
+        if flight is None:
+            return
+        liftoff, touchdown = flight
+        displacement = capture.position[touchdown, :2] - capture.position[liftoff, :2]
+        self.hops.append(
+            Hop(
+                vertical=float(capture.velocity[liftoff, 2]),
+                apex=float(capture.position[liftoff:touchdown, 2].max()),
+                duration=float(capture.time[touchdown] - capture.time[liftoff]),
+                distance=float(np.hypot(*displacement)),
             )
-            self.hops.append(hop)
+        )
 
     def reset(self) -> None:
         """Forget a flight under way."""
-        self._seen.clear()
+        self._flight.clear()
+
+
+def joined(captures: Sequence[Capture]) -> Capture:
+    """Return captures that follow one another as one."""
+    return Capture(
+        time=np.concatenate([capture.time for capture in captures]),
+        position=np.concatenate([capture.position for capture in captures]),
+        orientation=np.concatenate([capture.orientation for capture in captures]),
+        velocity=np.concatenate([capture.velocity for capture in captures]),
+        angular_velocity=np.concatenate([capture.angular_velocity for capture in captures]),
+        foot_position=np.concatenate([capture.foot_position for capture in captures]),
+        contact=np.concatenate([capture.contact for capture in captures]),
+        other_contact=np.concatenate([capture.other_contact for capture in captures]),
+        joint_position=np.concatenate([capture.joint_position for capture in captures]),
+        joint_velocity=np.concatenate([capture.joint_velocity for capture in captures]),
+        torque=np.concatenate([capture.torque for capture in captures]),
+        electrical_power=np.concatenate([capture.electrical_power for capture in captures]),
+        bus_voltage=np.concatenate([capture.bus_voltage for capture in captures]),
+    )
 
 
 class Page(Protocol):
     """What shows the robot to a person."""
 
     def show(self, sample: Capture, gauge: Gauge, factor: float) -> None:
-        """Draw robot, figures and simulated seconds per second; called once a policy step."""
+        """Draw the robot and its figures; called once a policy step.
+
+        Args:
+            sample: The present moment.
+            gauge: Height, speed and jumps.
+            factor: Simulated seconds per second.
+        """
 
 
-class _Sampled(VirtualRobot):
+class _SampledRobot(VirtualRobot):
     """A virtual robot that is sampled while it runs."""
 
     sampled: Callable[[Capture], None] | None = None
+    """Called with each sample; None for no samples."""
 
     def wait(self, until: float) -> list[State]:
         states: list[State] = []
-        while (now := self.now()) < until:
-            states += super().wait(min(until, now + _SAMPLE_S))
+        while self.now() < until:
+            states += super().wait(min(until, self.now() + _SAMPLE_S))
             if self.sampled is not None:
                 self.sampled(self.snapshot())
         return states
 
 
-def play(
+@dataclass(frozen=True, kw_only=True)
+class PlayedRun:
+    """What was played, when it has ended."""
+
+    simulated_s: float
+    """Simulated time [s]."""
+    wall_s: float
+    """Wall time [s]."""
+    resets: int
+    """Number of times the robot was set down anew."""
+    hops: list[Hop]
+    """All jumps."""
+
+
+def play_in_real_time(
     robot: RobotSpec,
     policy: Policy,
     sim_params: SimParams,
@@ -187,32 +248,50 @@ def play(
     *,
     seed: int = 0,
     until: Callable[[float], bool] = lambda simulated: False,
-) -> dict[str, Any]:
+) -> PlayedRun:
     """Run the robot in real time until Ctrl-C; a fallen one goes on until it is reset.
 
-    `until`, called with the simulated time [s], ends the run as well. Returns `simulated_s`,
-    `wall_s`, the number of `resets`, and `hops`.
+    Args:
+        robot: The robot.
+        policy: Its policy.
+        sim_params: Parameters of the virtual robot.
+        joystick: The commands.
+        page: Shows the robot.
+        seed: Seed of the virtual robot's noise.
+        until: Called with the simulated time [s]; ends the run as well.
     """
     gauge = Gauge(JumpRules.of(robot))
-    machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
-    began, simulated, resets, over = time.perf_counter(), 0.0, 0, False
+    machine = _SampledRobot(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
+    began = time.perf_counter()
+    simulated_s = 0.0
+    resets = 0
+    is_over = False
     with suppress(KeyboardInterrupt), closing(machine):  # the usual end
-        while not over:
+        while not is_over:
             machine.sampled = None
             machine.connect()
             machine.sampled = gauge.add
             gauge.reset()
-            before, start, late = simulated, time.perf_counter(), 0.0
+            before_s = simulated_s
+            start = time.perf_counter()
+            late_s = 0.0
             for since in ticks(machine, policy, robot, joystick.commanded):
-                simulated = before + since
-                wall = time.perf_counter() - start
-                page.show(machine.snapshot(), gauge, since / wall if since else 1.0)
-                over, again = until(simulated), joystick.take_reset()
-                if over or again:
-                    resets += again
+                simulated_s = before_s + since
+                wall_s = time.perf_counter() - start
+                page.show(machine.snapshot(), gauge, since / wall_s if since else 1.0)
+                is_over = until(simulated_s)
+                is_reset = joystick.take_reset()
+                if is_reset:
+                    resets += 1
+                if is_over or is_reset:
                     break
-                ahead = start + late + since - time.perf_counter()
-                time.sleep(max(0.0, ahead))
-                late -= ahead if ahead < -_LATE_S else 0.0
-    wall_s = time.perf_counter() - began
-    return {"simulated_s": simulated, "wall_s": wall_s, "resets": resets, "hops": gauge.hops}
+                ahead_s = start + late_s + since - time.perf_counter()
+                time.sleep(max(0.0, ahead_s))
+                if ahead_s < -_LATE_S:
+                    late_s -= ahead_s
+    return PlayedRun(
+        simulated_s=simulated_s,
+        wall_s=time.perf_counter() - began,
+        resets=resets,
+        hops=gauge.hops,
+    )
