@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import mujoco
 import numpy as np
 import tyro
+from mjlab.actuator import DcMotorActuator, DcMotorActuatorCfg
 from mjlab.envs import ManagerBasedRlEnv
 
 from benchmarks.runner import machine
@@ -29,7 +30,6 @@ from pronk.identify.simulators.profiles import Profile, profile
 from pronk.jump.train.devices import find_devices
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.jump.train.mdp import actions
-from pronk.jump.train.mdp.actuators import PositionDrive, PositionDriveCfg
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import DELAY_STEPS
@@ -49,7 +49,7 @@ _UNLIMITED = 1e6
 
 
 @dataclass(kw_only=True)
-class ImplicitDriveCfg(PositionDriveCfg):
+class ImplicitDriveCfg(DcMotorActuatorCfg):  # type: ignore[misc]
     """A drive whose damping MuJoCo integrates implicitly."""
 
     bias: float
@@ -59,12 +59,12 @@ class ImplicitDriveCfg(PositionDriveCfg):
 
     def build(
         self, entity: Entity, target_ids: list[int], target_names: list[str]
-    ) -> PositionDrive:
+    ) -> DcMotorActuator:
         """Build the actuator of an entity."""
         return ImplicitDrive(self, entity, target_ids, target_names)
 
 
-class ImplicitDrive(PositionDrive):
+class ImplicitDrive(DcMotorActuator):  # type: ignore[misc]
     """See `ImplicitDriveCfg`."""
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
@@ -105,7 +105,7 @@ def environment(
     return ManagerBasedRlEnv(cfg=cfg, device=device)
 
 
-def implicit(drive: PositionDriveCfg, law: DriveLaw, substep: float) -> ImplicitDriveCfg:
+def implicit(drive: DcMotorActuatorCfg, law: DriveLaw, substep: float) -> ImplicitDriveCfg:
     """A drive of training as one of an implicit law."""
     own = {name: getattr(drive, name) for name in drive.__dataclass_fields__}
     own |= {"damping": 0.0, "effort_limit": _UNLIMITED, "saturation_effort": _UNLIMITED}

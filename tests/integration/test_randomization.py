@@ -269,8 +269,8 @@ def test_stall_torque_is_in_proportion_to_the_voltage(batteries: Any) -> None:
         stall = drive.saturation_effort[:2, 0].tolist()
         assert stall == pytest.approx([rated.stall_torque, 0.75 * rated.stall_torque], rel=1e-5)
         # The torque lost to speed is the same, so the no-load speed falls alike.
-        slope = drive.back_emf[:2, 0].tolist()
-        assert slope == pytest.approx([rated.stall_torque / rated.no_load_speed] * 2, rel=1e-5)
+        no_load = drive.velocity_limit_motor[:2, 0].tolist()
+        assert no_load == pytest.approx([rated.no_load_speed, 0.75 * rated.no_load_speed], rel=1e-5)
 
 
 def test_physics_gone_wrong_leaves_a_battery(env: Any) -> None:

@@ -1,6 +1,6 @@
 """The drives of the robot and the battery that feeds them, as mjlab actuators.
 
-At the start of each physics step a drive gives
+A drive is mjlab's `DcMotorActuator`. At the start of each physics step it gives
 
     torque = clip(stiffness (command - q) - damping qdot, low, high),
     high = min(effort_limit, stall_torque (1 - qdot / no_load_speed)), low its mirror image,
@@ -16,14 +16,14 @@ drives draw. With the torques tau of the last physics step and the speeds omega 
 
 with U the voltage at no load, R the resistance, and V at least U / 2, where the power is greatest.
 tau^2 / back_emf is the heat in the windings: with motor constant K (no-load speed U / K, stall
-torque K U / r), back_emf = stall_torque / no_load_speed = K^2 / r. The stall torque changes in
-proportion to V. V follows over a few steps, since power and voltage depend on each other.
+torque K U / r), back_emf = stall_torque / no_load_speed = K^2 / r. Stall torque and no-load speed
+change in proportion to V. V follows over a few steps, since power and voltage depend on each other.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from mjlab.actuator import DcMotorActuator, DcMotorActuatorCfg
@@ -34,48 +34,13 @@ from pronk.jump.train.gains import TrainingGains
 from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
-    from mjlab.actuator.actuator import ActuatorCmd
     from mjlab.entity import Entity
 
 _VOLTAGE_STEP = 0.3
 """Fraction of the way to its new value that the voltage covers in a physics step."""
 
 
-class PositionDriveCfg(DcMotorActuatorCfg):
-    """mjlab's DC motor behind a PD law with position commands alone."""
-
-    def build(
-        self, entity: Entity, target_ids: list[int], target_names: list[str]
-    ) -> PositionDrive:
-        """Build the actuator of an entity."""
-        return PositionDrive(self, entity, target_ids, target_names)
-
-
-class PositionDrive(DcMotorActuator[PositionDriveCfg]):
-    """The law of mjlab's DC motor in 9 operations instead of 21, for every physics step."""
-
-    param_names = ("stiffness", "damping", "force_limit", "saturation_effort", "back_emf")
-
-    def initialize(self, *args: Any) -> None:
-        """Set up the parameters."""
-        super().initialize(*args)
-        self.back_emf = self.saturation_effort / self.velocity_limit_motor
-        """Torque lost to speed [N m s/rad]. (N, joints)"""
-
-    @staticmethod
-    def control_law(params: dict[str, Tensor], cmd: ActuatorCmd) -> Tensor:
-        """Torque [N m], (N, joints), of parameters (N, joints) and a command (N, joints)."""
-        stall, limit, back_emf = (
-            params[name] for name in ("saturation_effort", "force_limit", "back_emf")
-        )
-        commanded = params["stiffness"] * (cmd.position_target - cmd.pos)
-        commanded = torch.addcmul(commanded, params["damping"], cmd.vel, value=-1.0)
-        # Without the back-EMF both ends of the line are at the stall torque, whatever the speed.
-        torque = torch.addcmul(commanded, back_emf, cmd.vel).clamp(-stall, stall)
-        return torch.addcmul(torque, back_emf, cmd.vel, value=-1.0).clamp(-limit, limit)
-
-
-def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
+def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[DcMotorActuatorCfg, ...]:
     """Configure one actuator for each joint group, in the robot's order of groups.
 
     Args:
@@ -102,7 +67,7 @@ def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg
         if math.isnan(frictionloss):
             frictionloss = drive.frictionloss
         cfgs.append(
-            PositionDriveCfg(
+            DcMotorActuatorCfg(
                 target_names_expr=tuple(joint.name for joint in joints),
                 stiffness=group_gains.stiffness,
                 damping=group_gains.damping,
@@ -121,14 +86,16 @@ class Battery:
     """Batteries of N robots. Voltages are relative to the rated voltage of the drives."""
 
     def __init__(self, entity: Entity) -> None:
-        """Start at the rated voltage and without resistance; the drives are `PositionDrive`s."""
+        """Start at the rated voltage and without resistance."""
         self._entity = entity
-        drives = [drive for drive in entity.actuators if isinstance(drive, PositionDrive)]
-        self._drives = [(drive, drive.saturation_effort.clone()) for drive in drives]
+        self._drives = [drive for drive in entity.actuators if isinstance(drive, DcMotorActuator)]
+        self._rated_stall_torques = [drive.saturation_effort.clone() for drive in self._drives]
+        self._rated_speeds = [drive.velocity_limit_motor.clone() for drive in self._drives]
         # Heat in the windings per torque squared [rad/s per N m]. (N, joints)
         self._heat = torch.zeros_like(entity.data.joint_vel)
-        for drive in drives:
-            self._heat[:, drive.target_ids] = 1.0 / drive.back_emf
+        for drive in self._drives:
+            back_emf = drive.saturation_effort / drive.velocity_limit_motor
+            self._heat[:, drive.target_ids] = 1.0 / back_emf
         self.no_load = torch.ones_like(self._heat[:, :1])
         """U over the rated voltage. (N, 1)"""
         self.drop = torch.zeros_like(self.no_load)
@@ -139,7 +106,13 @@ class Battery:
         """All batteries hold the rated voltage, so that nothing is computed."""
 
     def set(self, voltage: Tensor, resistance: Tensor, rated: float) -> None:
-        """Give every robot its U [V] and R [ohm], (N, 1); `rated` is that of the drives [V]."""
+        """Give every robot its battery.
+
+        Args:
+            voltage: U of each robot [V], (N, 1).
+            resistance: R of each robot [ohm], (N, 1).
+            rated: Rated voltage of the drives [V].
+        """
         self.no_load.copy_(voltage / rated)
         self.drop.copy_(4.0 * resistance / rated**2)
         self.voltage.copy_(self.no_load)
@@ -147,22 +120,25 @@ class Battery:
         self._apply()
 
     def advance(self) -> None:
-        """Before a physics step: the power drawn in the last one lowers the voltage."""
+        """Lower the voltage by the power drawn in the last physics step, before the next one."""
         if self.ideal:
             return
         data = self._entity.data
         torque = data.qfrc_actuator
         power = (torch.addcmul(data.joint_vel, torque, self._heat) * torque).sum(1, keepdim=True)
         root = torch.addcmul(self.no_load.square(), self.drop, power, value=-1.0)
-        sagged = 0.5 * (self.no_load + root.clamp_min_(0.0).sqrt_())
-        self.voltage.lerp_(sagged, _VOLTAGE_STEP)
+        new_voltage = 0.5 * (self.no_load + root.clamp_min_(0.0).sqrt_())
+        self.voltage.lerp_(new_voltage, _VOLTAGE_STEP)
         self._apply()
 
     def reset(self, robots: Tensor | slice) -> None:
-        """Return some batteries to no load; a power that is not finite leaves no voltage."""
+        """Return some batteries to no load; a power that is not finite has spoiled the voltage."""
         if not self.ideal:
             self.voltage[robots] = self.no_load[robots]
 
     def _apply(self) -> None:
-        for drive, rated in self._drives:
-            torch.mul(rated, self.voltage, out=drive.saturation_effort)
+        """Scale the torque-speed lines of the drives by the voltage."""
+        # In place: mjlab computes with views of these tensors.
+        for i, drive in enumerate(self._drives):
+            torch.mul(self._rated_stall_torques[i], self.voltage, out=drive.saturation_effort)
+            torch.mul(self._rated_speeds[i], self.voltage, out=drive.velocity_limit_motor)
