@@ -15,7 +15,6 @@ import numpy as np
 from scipy.stats import binom
 
 from benchmarks.runner import Progress, finish
-from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
@@ -28,6 +27,7 @@ from pronk.identify.response.estimate import operators
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
+from tests.synthetic_log import Excitation, coloured_noise, synthetic_log
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")

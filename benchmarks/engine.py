@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.runner import finish
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.grid import axes, quick_search
@@ -22,6 +21,7 @@ from pronk.identify.match.simulated import SimRequest, responses
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from tests.synthetic_log import Excitation, synthetic_log
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")

@@ -19,7 +19,6 @@ import mujoco.rollout
 import numpy as np
 
 from benchmarks.runner import Progress, finish
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.grid import GridSearch, alike, axes, quick_search, search
@@ -29,6 +28,7 @@ from pronk.identify.match.settings import MatchSettings
 from pronk.identify.simulators.mujoco import JointTestRig, MujocoSimulator
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
+from tests.synthetic_log import Excitation, synthetic_log
 
 Gains = tuple[float, float]
 """Stiffness [N m/rad] and damping [N m s/rad]."""

@@ -24,7 +24,6 @@ from rich.table import Table
 
 from benchmarks.peers import POPULATION, Estimate, fit_cma, fit_sysid, import_peers
 from benchmarks.runner import Progress, finish, machine
-from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
@@ -33,6 +32,7 @@ from pronk.identify.match.pipeline import match_logs
 from pronk.identify.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from tests.synthetic_log import Excitation, coloured_noise, synthetic_log
 
 ROBOT = "mini_cheetah"
 JOINT = "FR_knee"

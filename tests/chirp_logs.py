@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
 from pronk.robots.robot import RobotSpec
+from synthetic_log import Excitation, synthetic_log
 
 
 def chirp_log(

@@ -31,7 +31,6 @@ from benchmarks import (
 )
 from benchmarks.peers import Estimate, Replay, fit_cma, fit_sysid
 from benchmarks.random_robots import HELD_OUT, Recorded, Steps, draw
-from benchmarks.synthetic_log import coloured_noise
 from benchmarks.time_fit import fit_plain, recordings
 from chirp_logs import chirp_log
 from hopper import ROBOT as HOPPER
@@ -51,6 +50,7 @@ from pronk.jump.trial.trial import (
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
+from tests.synthetic_log import coloured_noise
 
 ROBOT = load_robot("mini_cheetah")
 QUIET = known.Scenario(name="quiet", words="no noise", noise_rad=0.0)

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from chirp_logs import chirp_log
 from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
 from pronk.identify.excitation.signals import Multisine
@@ -23,6 +22,7 @@ from pronk.identify.match.result import JointFit, MatchResult
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.response import Estimator
 from pronk.robots import load_robot
+from synthetic_log import Excitation, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 QUICK = MatchSettings(

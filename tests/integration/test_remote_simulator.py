@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from command_line import accepted, invoke
 from log_files import write_mcap
 from pronk.cli.match import WARNING_STATUS
@@ -23,6 +22,7 @@ from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.load import joint_rigs, load_simulator
 from pronk.robots import load_robot
 from pronk.testing import check_simulator
+from synthetic_log import Excitation, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 EXAMPLE = f"{Path(__file__).parents[2] / 'examples' / 'my_simulator.py'}:Pendulum"

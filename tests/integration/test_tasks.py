@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import simulate
+from synthetic_log import simulate
 
 pytest.importorskip("mjlab")
 

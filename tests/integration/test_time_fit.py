@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
@@ -16,6 +15,7 @@ from pronk.identify.match.gains import load_gains, save_gains
 from pronk.identify.match.pipeline import match_logs
 from pronk.identify.match.result import HELD_OUT, NOT_BETTER, MatchResult, held_out_flags
 from pronk.robots import load_robot
+from synthetic_log import Excitation, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 MODEL = ROBOT.joint("FR_knee").drive

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.grid import (
     DIVERGED_DB,
@@ -32,6 +31,7 @@ from pronk.identify.simulators.linear import linearize
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
+from synthetic_log import Excitation, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks.engine import engine_gap
-from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.identify.match.parameters import GAINS
@@ -23,6 +22,7 @@ from pronk.identify.response.estimate import operators
 from pronk.identify.response.response import Estimator
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
+from synthetic_log import Excitation, coloured_noise, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 SHORT = MatchSettings(estimator=Estimator(segment_s=4.0))

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic_log import Excitation, simulate, synthetic_log
 from pronk.errors import LogError, PronkError
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
@@ -26,6 +25,7 @@ from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
 from pronk.testing import check_simulator
+from synthetic_log import Excitation, simulate, synthetic_log
 
 ROBOT = load_robot("mini_cheetah")
 EXAMPLE = f"{Path(__file__).parents[2] / 'examples' / 'my_simulator.py'}:Pendulum"

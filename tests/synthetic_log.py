@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,11 +66,18 @@ def simulate(
     It begins at rest where gravity leaves the joint with its first command. Gains [N m/rad,
     N m s/rad] are scalars or of shape (b,); the drive's armature and friction if None.
     """
-    gains = np.broadcast_arrays(np.atleast_1d(stiffness), np.atleast_1d(damping))
-    values = dict(zip(("stiffness", "damping"), (np.asarray(g, float) for g in gains), strict=True))
-    for name, value in (("armature", armature), ("frictionloss", frictionloss)):
-        if value is not None:
-            values[name] = np.full(len(values["stiffness"]), value)
+    stiffness_values, damping_values = np.broadcast_arrays(
+        np.atleast_1d(stiffness), np.atleast_1d(damping)
+    )
+    values = {
+        "stiffness": np.asarray(stiffness_values, dtype=np.float64),
+        "damping": np.asarray(damping_values, dtype=np.float64),
+    }
+    runs = len(values["stiffness"])
+    if armature is not None:
+        values["armature"] = np.full(runs, armature)
+    if frictionloss is not None:
+        values["frictionloss"] = np.full(runs, frictionloss)
     with MujocoSimulator(robot, threads=threads) as simulator:
         return simulator.play(trace, values)
 
@@ -87,7 +93,9 @@ def synthetic_log(
     noise: Sequence[Array] | None = None,
     delay_s: float = 0.0,
     simulator: JointRigs | None = None,
-    **options: Any,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+    threads: int = 2,
 ) -> JointLog:
     """Sweep one joint of the training simulator with known gains.
 
@@ -95,60 +103,74 @@ def synthetic_log(
         robot: The robot; with a finer `timestep_s` (and more `decimation`) a finer simulator.
         joint: The joint to excite.
         excitations: Signals, one after the other.
-        stiffness: Of the excited joint [N m/rad], one value or one for each repeat.
-        damping: Of the excited joint [N m s/rad], likewise.
+        stiffness: Stiffness of the excited joint [N m/rad], one value or one for each repeat.
+        damping: Damping of the excited joint [N m s/rad], one value or one for each repeat.
         rate_hz: Rate of the log [Hz].
         noise: Added to the position of the joint [rad], one array a segment in the order of the
             log (signal by signal, repeat by repeat), each at least as long as the segment.
-        delay_s: From a command to its effect [s], not necessarily whole steps.
+        delay_s: Delay from a command to its effect [s], not necessarily whole steps.
         simulator: Rigs of another simulator, which then also gives the timestep.
-        options: Those of `simulate`.
+        armature: Armature of the joint [kg m^2]; the drive's if None.
+        frictionloss: Dry friction of the joint [N m]; the drive's if None.
+        threads: Simulations at the same time.
 
     Returns:
         A log of this joint alone; its `stiffness` and `damping` are those of the robot's drive, not
         those simulated.
     """
-    robot = simulator.robot if simulator else robot
-    known = robot.joint(joint)
-    gains = np.atleast_1d(stiffness), np.atleast_1d(damping)
-    centre, tick = known.default_position, robot.timestep_s * robot.decimation
-    per_tick = round(tick * rate_hz)
-    rate = per_tick / tick
-    commands, positions = [], []
+    if simulator is not None:
+        robot = simulator.robot
+    excited_joint = robot.joint(joint)
+    centre = excited_joint.default_position
+    tick = robot.timestep_s * robot.decimation
+    samples_per_tick = round(tick * rate_hz)
+    rate = samples_per_tick / tick
+    commands = []
+    positions = []
     segments: list[Segment] = []
     begin = 0
-    for one in excitations:
-        rest = np.zeros(round(one.settle_s / tick))
-        ticks = centre + np.concatenate([rest, one.offsets, rest])
+    for excitation in excitations:
+        settling = np.zeros(round(excitation.settle_s / tick))
+        ticks = centre + np.concatenate([settling, excitation.offsets, settling])
         trace = CommandTrace(
             joint=joint,
             start=0.0,
             timestep=robot.timestep_s,
             command=np.repeat(ticks, robot.decimation),
-            pose=np.array([each.default_position for each in robot.joints]),
-            amplitude=float(np.abs(one.offsets).max()),
+            pose=np.array([robot_joint.default_position for robot_joint in robot.joints]),
+            amplitude=float(np.abs(excitation.offsets).max()),
         )
-        if simulator:
-            values = dict(zip(("stiffness", "damping"), gains, strict=True))
+        if simulator is not None:
+            values = {"stiffness": np.atleast_1d(stiffness), "damping": np.atleast_1d(damping)}
             simulated = simulator.play(trace, values)
         else:
-            simulated = simulate(robot, trace, *gains, **options)
-        count = len(ticks) * per_tick
+            simulated = simulate(
+                robot,
+                trace,
+                stiffness,
+                damping,
+                armature=armature,
+                frictionloss=frictionloss,
+                threads=threads,
+            )
+        count = len(ticks) * samples_per_tick
         times = np.clip(np.arange(count) / rate - delay_s, 0.0, trace.time[-1])
         position = make_interp_spline(trace.time, simulated, k=3, axis=1)(times)
-        for repeat in range(one.repeats):
-            extra = 0.0 if noise is None else noise[len(segments)][:count]
-            commands.append(np.repeat(ticks, per_tick))
-            positions.append(position[repeat % len(position)] + extra)
+        for repeat in range(excitation.repeats):
+            recorded = position[repeat % len(position)]
+            if noise is not None:
+                recorded = recorded + noise[len(segments)][:count]
+            commands.append(np.repeat(ticks, samples_per_tick))
+            positions.append(recorded)
             segment = Segment(
-                kind=one.kind,
+                kind=excitation.kind,
                 joints=(joint,),
                 start=begin / rate,
                 stop=(begin + count - 1) / rate,
                 amplitude=trace.amplitude,
                 repeat=repeat,
-                band_hz=one.band_hz,
-                clamped=known.clamped,
+                band_hz=excitation.band_hz,
+                clamped=excited_joint.clamped,
             )
             segments.append(segment)
             begin += count
@@ -159,8 +181,8 @@ def synthetic_log(
         command=np.concatenate(commands)[:, None],
         position=np.concatenate(positions)[:, None],
         segments=tuple(segments),
-        stiffness=np.array([known.stiffness]),
-        damping=np.array([known.damping]),
+        stiffness=np.array([excited_joint.stiffness]),
+        damping=np.array([excited_joint.damping]),
         pose=np.array([centre]),
         origin=LogOrigin(source=f"synthetic log of {joint}", virtual=True),
     )
