@@ -39,9 +39,10 @@ import pronk.identify.match.gains as gains_file
 from pronk.cli import console
 from pronk.cli.export import Target
 from pronk.cli.main import run
-from pronk.deploy.runtime.ipc import STEP, TICK
-from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
+from pronk.deploy.runtime.deploy_log import read_deploy_log
+from pronk.deploy.runtime.log import DeployLogWriter
 from pronk.deploy.runtime.modes import Mode
+from pronk.deploy.runtime.records import STEP, TICK
 from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.identify.logs.joint_log import JointLog
@@ -198,11 +199,12 @@ def _kinds() -> dict[str, _Kind]:
 
     def deploy(path: Path) -> None:
         found = read_deploy_log(path)
-        for use in (deploy_run.stretches, deploy_run.jumps, deploy_run.interventions):
-            use(found)
-        for look in (deploy_run.tracking, deploy_run.times):
-            look(found)
-        deploy_run.delay(found, None)
+        deploy_run.stretches(found)
+        deploy_run.jump_inputs(found)
+        deploy_run.interventions(found)
+        deploy_run.margins(found)
+        deploy_run.timed_parts(found)
+        deploy_run.measured_delay(found, None)
 
     def trial(kind: results.RunKind) -> _Kind:
         path = f"tree/trial/{kind.summary}"

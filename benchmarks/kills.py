@@ -31,8 +31,8 @@ from pronk.cli import console
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.lcm.codec import CHEETAH, decode_command
 from pronk.deploy.links.lcm.link import url_of
-from pronk.deploy.runtime.log import is_deploy_log, read_deploy_log
-from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.deploy_log import is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.run import Deployment
 from pronk.errors import PronkError
 from pronk.files import read_yaml
@@ -59,7 +59,7 @@ def operate(port: int, log: str) -> None:
     """Walk a virtual robot over LCM until SIGTERM; prints its processes when it walks."""
     link = Link(robot=sensor_faults.ROBOT, address=Address(kind="lcm", options={"port": port}))
     timing = sensor_faults.TIMING
-    plan = Plan(link=link, policy=_POLICY, timing=timing, ignore_latency=True, log=Path(log))
+    plan = RunPlan(link=link, policy=_POLICY, timing=timing, ignore_latency=True, log=Path(log))
     with Deployment(plan) as deployment:
         if not sensor_faults._walk(deployment):
             sys.exit("it does not walk")

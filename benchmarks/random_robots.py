@@ -18,7 +18,8 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.cli.sweep import AMPLITUDES
-from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.identify.excitation.plan import PlannedExcitation, SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp, Multisine, Signal
 from pronk.identify.logs.joint_log import JointLog
@@ -197,7 +198,7 @@ def recorded(
             out.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=out.parent) as partial:
                 task = SweepTask(plan=plan, out_dir=Path(partial) / "logs")
-                record(VirtualRobot(robot, drawn, seed=noise, legs=(leg,)), task)
+                record_sweep(VirtualRobot(robot, drawn, seed=noise, legs=(leg,)), task)
                 (Path(partial) / "logs").rename(out)
         logs.append([read_log(out / f"{joint}.mcap", robot=robot) for joint in plan.joints])
     found = []

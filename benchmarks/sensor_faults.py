@@ -40,11 +40,11 @@ from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
 from pronk.deploy.bench.server import RobotServer
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.realtime import Wanted, enter
-from pronk.deploy.runtime.ipc import Event
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.plan import Link, RunPlan
+from pronk.deploy.runtime.poses import RunTiming
+from pronk.deploy.runtime.records import Event
 from pronk.deploy.runtime.run import Deployment
-from pronk.deploy.runtime.state_machine import Timing
 from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import HardwareError
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
@@ -81,7 +81,7 @@ WALK_S = 1.0
 """Before a fault begins [s]."""
 TRIES = 4
 """For each run."""
-TIMING = Timing(damp_s=0.3, fold_s=0.5, check_s=0.0, rise_s=0.8)
+TIMING = RunTiming(damp_s=0.3, fold_s=0.5, check_s=0.0, rise_s=0.8)
 RISE_S = TIMING.fold_s + TIMING.rise_s + 0.2
 """In which the robot stands up [s]."""
 
@@ -188,7 +188,7 @@ def _walk(deployment: Deployment) -> bool:
     return deployment.mode is Mode.POLICY
 
 
-def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, float, str]]:
+def strike(plan: RunPlan, robot: Connection, faults: list[str]) -> list[tuple[str, float, str]]:
     """Name, time to damping on the robot's clock [s] and reason of faults, one after the other.
 
     A fault that is not found within `FOUND_S` has the time NaN. Of swapped legs the time is that
@@ -197,7 +197,7 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
     """
     rows: list[tuple[str, float, str]] = []
     if faults[0] in SWAPPED:
-        plan = replace(plan, timing=replace(TIMING, check_s=Timing().check_s))
+        plan = replace(plan, timing=replace(TIMING, check_s=RunTiming().check_s))
     with Deployment(plan) as deployment:
         for fault in faults:
             events = list[Event]()
@@ -276,7 +276,7 @@ def measure(
                 network = write_swaying(Path(folder) / "policy.onnx", load_robot(known))
             address, end = stack.enter_context(served(known, link))
             assert end is not None
-            plan = Plan(
+            plan = RunPlan(
                 link=Link(robot=known, address=address),
                 policy=network,
                 timing=TIMING,
@@ -315,7 +315,7 @@ def endure(
     runs = list[dict[str, Any]]()
     while walked < 60.0 * minutes and len(runs) < TRIES + len(faults):
         with served(ROBOT, link) as (address, _):
-            plan = Plan(
+            plan = RunPlan(
                 link=Link(robot=ROBOT, address=address),
                 policy=policy,
                 timing=TIMING,

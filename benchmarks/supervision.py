@@ -25,13 +25,15 @@ import numpy as np
 import tyro
 
 from benchmarks.runner import Row, finish, rows_in, rows_of
-from pronk.arrays import Array
 from pronk.cli import console
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
-from pronk.deploy.runtime.ipc import ACTIONS, fill
+from pronk.deploy.runtime.limits import Limits
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.safety import Decision, Limits, Reason, SafetyFilter
-from pronk.deploy.runtime.state_machine import StateMachine, Timing
+from pronk.deploy.runtime.poses import RunTiming
+from pronk.deploy.runtime.reasons import Decision, Reason
+from pronk.deploy.runtime.records import ACTIONS
+from pronk.deploy.runtime.safety import SafetyFilter
+from pronk.deploy.runtime.state_machine import StateMachine
 from pronk.errors import HardwareError
 from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot
@@ -60,39 +62,58 @@ SUPERVISED = (
 LIMITS = Limits.of(load_robot("mini_cheetah"))
 
 
-def _both(constant_s: Array) -> Any:
-    return constant_s.reshape(2, -1).min(axis=0)
+SENSORS = LIMITS.sensors
 
 
-def _path_share(path: float, turned: float) -> float:
-    return path / turned if turned > LIMITS.turned else math.inf
+def _attitude(safety: SafetyFilter) -> float:
+    return safety.sensors.attitude
+
+
+def _lean(safety: SafetyFilter) -> float:
+    return safety.sensors.lean
+
+
+def _encoder(safety: SafetyFilter) -> float:
+    return float(safety.sensors.encoder.max())
+
+
+def _path_share(safety: SafetyFilter) -> float:
+    path, turned = safety.sensors.paths
+    return path / turned if turned > SENSORS.turned else math.inf
+
+
+def _repeated(safety: SafetyFilter) -> float:
+    return max(safety.sensors.repeated.values())
+
+
+def _moved(safety: SafetyFilter) -> float:
+    is_constant = safety.sensors.constant_s > SENSORS.repeat_s
+    return float(np.where(is_constant, safety.sensors.moved, 0.0).max())
+
+
+def _others(safety: SafetyFilter) -> float:
+    both_constant_s = safety.sensors.constant_s.reshape(2, -1).min(axis=0)
+    return float(np.where(both_constant_s > SENSORS.repeat_s, safety.sensors.others, 0.0).max())
+
+
+def _blocked(safety: SafetyFilter) -> float:
+    return float(safety.targets.blocked_s.max())
+
+
+def _clipped(safety: SafetyFilter) -> float:
+    return safety.targets.clipped_s
 
 
 QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
-    "attitude less gyro [rad]": (LIMITS.attitude, lambda f: f.supervision.attitude),
-    "force off the vertical [rad]": (LIMITS.upright, lambda f: f.supervision.lean),
-    "position less velocity [rad]": (
-        LIMITS.encoder,
-        lambda f: float(f.supervision.encoder.max()),
-    ),
-    "least path of the attitude, share": (0.25, lambda f: _path_share(*f.supervision.paths)),
-    "unit repeats [s]": (LIMITS.repeat_s, lambda f: max(f.supervision.repeated.values())),
-    "moved while constant [rad]": (
-        LIMITS.moved,
-        lambda f: float(
-            np.where(f.supervision.constant_s > LIMITS.repeat_s, f.supervision.moved, 0.0).max()
-        ),
-    ),
-    "others moved while constant [rad]": (
-        LIMITS.others,
-        lambda f: float(
-            np.where(
-                _both(f.supervision.constant_s) > LIMITS.repeat_s, f.supervision.others, 0.0
-            ).max()
-        ),
-    ),
-    "limited by torque without moving [s]": (LIMITS.blocked_s, lambda f: float(f.blocked.max())),
-    "limited by torque [s]": (LIMITS.clipped_s, lambda f: f.clipped),
+    "attitude less gyro [rad]": (SENSORS.attitude, _attitude),
+    "force off the vertical [rad]": (SENSORS.upright, _lean),
+    "position less velocity [rad]": (SENSORS.encoder, _encoder),
+    "least path of the attitude, share": (SENSORS.stuck_share, _path_share),
+    "unit repeats [s]": (SENSORS.repeat_s, _repeated),
+    "moved while constant [rad]": (SENSORS.moved, _moved),
+    "others moved while constant [rad]": (SENSORS.others, _others),
+    "limited by torque without moving [s]": (LIMITS.blocked.blocked_s, _blocked),
+    "limited by torque [s]": (LIMITS.blocked.clipped_s, _clipped),
 }
 """Limit, and the quantity, of the filter."""
 
@@ -184,7 +205,7 @@ class Flight:
             robot, self.params, seed=self.seed, base="ground", capture_rate_hz=None, start=start
         )
         machine.connect()
-        safety, modes = SafetyFilter(limits=Limits.of(robot)), StateMachine(robot, Timing())
+        safety, modes = SafetyFilter(limits=Limits.of(robot)), StateMachine(robot, RunTiming())
         modes.enter(Mode.DAMP, 0.0)
         modes.request(OperatorRequest.STAND)
         command, jump, change = STILL, False, math.inf
@@ -246,8 +267,12 @@ class Flight:
                 given = (command, jump) if live else (STILL, False)
                 target = policy.step(measurement(newest), *given)
                 record = np.zeros((), ACTIONS)
-                fill(record, sequence=tick, state_sequence=newest.sequence, entry=entry)
-                fill(record, made=t, valid_for=0.05, position=target)
+                record["sequence"] = tick
+                record["state_sequence"] = newest.sequence
+                record["entry"] = entry
+                record["made"] = t
+                record["valid_for"] = 0.05
+                record["position"] = target
                 under_way.append((tick + LATE_TICKS, record))
 
 

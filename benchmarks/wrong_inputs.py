@@ -24,7 +24,8 @@ import numpy as np
 
 from benchmarks.runner import Progress, finish, in_parallel
 from pronk.cli import console
-from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.errors import PronkError
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.readers import read_logs
@@ -95,7 +96,7 @@ def recorded(robot: RobotSpec, seed: int, number: int, cache: Path) -> Case:
         plan = make_plan(robot, [joint], amplitudes=(0.25, 0.125), repeats=(2, 1))
         task = SweepTask(plan=plan, out_dir=folder, overwrite=True)
         legs = (leg_of(robot, joint),)
-        record(VirtualRobot(robot, params, seed=1000 * seed + number, legs=legs), task)
+        record_sweep(VirtualRobot(robot, params, seed=1000 * seed + number, legs=legs), task)
         done.touch()
     return Case(log=read_logs([path], robot=robot)[0], joint=joint, robot=robot)
 

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.files import write_text
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.mcap_reader import read_mcap
@@ -158,7 +159,7 @@ def matched(
     machine = VirtualRobot(robot, sim_params, legs=(name.split("_")[0],))
     with tempfile.TemporaryDirectory() as folder:
         task = SweepTask(plan=plan, out_dir=Path(folder))
-        logs = [read_mcap(path) for path in record(machine, task)]
+        logs = [read_mcap(path) for path in record_sweep(machine, task)]
     settings = MatchSettings(method="paper", exhaustive=exhaustive, zero_armature=False)
     found = match_logs(logs, robot, settings=settings).joints[name]
     return np.array([found.stiffness, found.damping]), found.error_db, found.naive_error_db

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from deploy_runs import PATIENT, QUICK
 from pronk.deploy.links.address import Address
-from pronk.deploy.runtime.ipc import Event
-from pronk.deploy.runtime.plan import Link, Plan
-from pronk.deploy.runtime.run import run
+from pronk.deploy.runtime.plan import Link, RunPlan
+from pronk.deploy.runtime.records import Event
+from pronk.deploy.runtime.run import run_plan
 from pronk.deploy.runtime.teleop import ScriptedOperator
 from pronk.policy.script import Script
 
@@ -24,16 +24,16 @@ def tell(notice: Event) -> None:
 
 
 def main() -> int:
-    plan = Plan(
+    plan = RunPlan(
         link=Link(robot="mini_cheetah", address=Address.parse("sim://bench")),
         policy=Path(sys.argv[1]),
         log=Path(sys.argv[2]),
         timing=QUICK,
-        limits=PATIENT,
+        ages=PATIENT,
         action_valid_s=2.0,
         ignore_latency=True,
     )
-    summary = run(plan, ScriptedOperator([Script(command=(0.5, 0.0, 0.0), run_s=60.0)]), tell)
+    summary = run_plan(plan, ScriptedOperator([Script(command=(0.5, 0.0, 0.0), run_s=60.0)]), tell)
     return 130 if summary.interrupted else 0
 
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from command_line import accepted
-from pronk.deploy.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, event, put_state
-from pronk.deploy.runtime.log import DeployLogWriter, read_deploy_log
+from pronk.deploy.runtime.deploy_log import read_deploy_log
+from pronk.deploy.runtime.log import DeployLogWriter
 from pronk.deploy.runtime.modes import Mode
-from pronk.deploy.runtime.safety import FilterAction, Reason
+from pronk.deploy.runtime.reasons import FilterAction, Reason
+from pronk.deploy.runtime.records import EVENT, REAL, STEP, TICK, VIRTUAL, event_record, put_state
 from pronk.errors import LogError
 from pronk.report import build, deploy_page, deploy_run
 from pronk.report.deploy_page import part
-from pronk.report.deploy_run import delay, drive_delay, quantiles
+from pronk.report.deploy_run import drive_delay, measured_delay, quantiles
 from virtual_robot import KP, POSE, ROBOT, rolled, still
 
 HEADER = {
@@ -25,7 +26,7 @@ HEADER = {
     "joints": list(ROBOT.joint_names),
     "link": "sim",
     "policy": {"file": "policy.onnx", "sha256": "ab" * 32, "delay_range_s": [0.0, 0.01]},
-    "limits": {"tilt": 0.8, "hold_s": 0.02, "damp_s": 0.05, "latch_s": 0.1},
+    "limits": {"operating": {"tilt": 0.8}, "ages": {"damp_s": 0.05}},
     "versions": {"pronk": "0"},
 }
 TICK_S = 0.002
@@ -44,7 +45,7 @@ def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
 
 
 def say(writer: DeployLogWriter, at: float, kind: str, text: str, **more: int) -> None:
-    writer.write(np.frombuffer(event(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
+    writer.write(np.frombuffer(event_record(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
 
 
 def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
@@ -107,14 +108,14 @@ def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
     latest = lag * TICK_S - 4e-4
     found = drive_delay(log, ROBOT)
     np.testing.assert_allclose(found, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
-    assert delay(log, ROBOT).longest == pytest.approx(0.003 + found[1])
+    assert measured_delay(log, ROBOT).longest == pytest.approx(0.003 + found[1])
     # A delay beyond that of training is a warning.
     assert (made.figures["delay"]["within"], made.warning) == (lag < 4, lag >= 4)
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
     path = flown(tmp_path / "run.mcap", torque=np.full(12, np.nan))
-    found = delay(read_deploy_log(path), ROBOT)
+    found = measured_delay(read_deploy_log(path), ROBOT)
     assert np.isnan(found.drives).all()
     assert (found.longest, found.within) == (pytest.approx(0.003), True)
 
@@ -122,29 +123,34 @@ def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> N
 def test_measures_of_a_fault(tmp_path: Path) -> None:
     log = read_deploy_log(faulted(tmp_path / "run.mcap"))
     found = deploy_run.stretches(log)
-    assert [mode for mode, _, _ in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
-    np.testing.assert_allclose([seconds for _, _, seconds in found], 0.2, atol=1e-9)
+    assert [stretch.mode for stretch in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
+    np.testing.assert_allclose([stretch.seconds for stretch in found], 0.2, atol=1e-9)
     moved, latched = deploy_run.interventions(log)
-    assert [moved[name] for name in ("reason", "level", "ticks")] == ["POSITION", "LIMIT", 100]
-    assert (moved["largest"], moved["joint"]) == (pytest.approx(0.25), ROBOT.joint_names[5])
-    assert moved["first"] == pytest.approx(0.2)
-    assert [latched[name] for name in ("reason", "ticks", "joint")] == ["TILT", 100, ""]
-    np.testing.assert_allclose(deploy_run.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
-    joints = deploy_run.tracking(log)
-    assert joints["standing"][0] == pytest.approx(0.01)
-    assert math.isnan(joints["torque"][0])  # all zeros: this robot reports none
-    assert len(deploy_run.times(log)["age of the state"][0]) == 201  # until the fault
+    assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
+    assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
+    assert moved.first == pytest.approx(0.2)
+    assert (latched.reason, latched.ticks, latched.joint) == (Reason.TILT, 100, "")
+    np.testing.assert_allclose(deploy_run.tilt_angles(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
+    standing = deploy_run.tracking_error(log, log.ticks.mode == Mode.STAND)
+    assert standing[0] == pytest.approx(0.01)
+    margins = {margin.quantity: margin for margin in deploy_run.margins(log)}
+    assert math.isnan(margins["joint torque"].largest)  # all zeros: this robot reports none
+    tilt = margins["tilt of the trunk"]
+    assert (tilt.largest, tilt.limit) == (pytest.approx(1.0), 0.8)
+    parts = {timed.name: timed.seconds for timed in deploy_run.timed_parts(log)}
+    assert len(parts["age of the state"]) == 201  # until the fault
     assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.verdict(log)
     content = part(tmp_path / "run.mcap").content
     assert (content["moved"], content["given"], list(content["damped"])) == (100, 200, [True] * 100)
 
 
-def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) -> None:
-    cold = flown(tmp_path / "cold.mcap", count=5)
-    hot = flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0)
-    panels = [len(deploy_page.overview(read_deploy_log(path)).axes) for path in (cold, hot)]
-    assert panels[1] == panels[0] + 1
-    np.testing.assert_array_equal(read_deploy_log(hot).temperature[4], np.arange(12.0) + 30.0)
+def test_the_hottest_motor_is_named(tmp_path: Path) -> None:
+    path = flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0)
+    log = read_deploy_log(path)
+    np.testing.assert_array_equal(log.ticks.state.temperature[4], np.arange(12.0) + 30.0)
+    margins = {margin.quantity: margin for margin in deploy_run.margins(log)}
+    hottest = margins["motor temperature"]
+    assert (hottest.largest, hottest.joint) == (41.0, ROBOT.joint_names[11])
 
 
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:

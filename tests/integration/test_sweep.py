@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pronk.deploy.runtime.safety import SafetyFilter
-from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.errors import HardwareError, PlanError
 from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp
@@ -52,7 +53,7 @@ def plan_of(*joints: str, **options: object) -> SweepPlan:
 
 def sweep(machine: Watched, plan: SweepPlan, out_dir: Path, **options: Any) -> list[Path]:
     progress = options.pop("progress", lambda share: None)
-    return record(machine, SweepTask(plan=plan, out_dir=out_dir, **options), progress)
+    return record_sweep(machine, SweepTask(plan=plan, out_dir=out_dir, **options), progress)
 
 
 @pytest.fixture(scope="module")

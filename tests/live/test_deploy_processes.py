@@ -21,11 +21,11 @@ from deploy_runs import DAMPED_S, PATIENT, QUICK, hold, met, notified
 from hopper import write_hopper
 
 # Reading a log for the first time would keep this process from holding the stick.
-from pronk.deploy.runtime.log import is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.deploy_log import is_deploy_log, read_deploy_log
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import Plan
+from pronk.deploy.runtime.plan import RunPlan
+from pronk.deploy.runtime.reasons import Reason
 from pronk.deploy.runtime.run import Deployment
-from pronk.deploy.runtime.safety import Reason
 from pronk.errors import ArtefactError, HardwareError
 from pronk.jump.virtual.capture import load as load_capture
 
@@ -87,7 +87,7 @@ def running(
     policy: Path, faults: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[Running]:
     wire, log = tmp_path / "wire.txt", tmp_path / "run.mcap"
-    plan = Plan(
+    plan = RunPlan(
         link=FaultyLink(wire=wire, loss=request.param, faults=faults),
         policy=policy,
         log=log,
@@ -113,11 +113,11 @@ def test_loss_and_killed_processes(running: Running) -> None:
     found = read_deploy_log(log)
     assert not found.complete
     assert found.virtual
-    assert killed - found.time[-1] < 1.0
-    assert (np.diff(found.tick) >= 1).all()
-    assert Mode.POLICY in found.mode
+    assert killed - found.ticks.begun[-1] < 1.0
+    assert (np.diff(found.ticks.tick) >= 1).all()
+    assert Mode.POLICY in found.ticks.mode
     # It was there from the first tick on, but for those that the servo missed.
-    assert found.tick[0] < 50
+    assert found.ticks.tick[0] < 50
     # The policy's process dies: damping.
     walk(deployment)
     os.kill(deployment.policy.pid or 0, signal.SIGKILL)
@@ -157,7 +157,7 @@ def test_states_that_cannot_be_believed(running: Running, faults: dict[str, Any]
     deployment.close()
     # The log of a run that ended badly is whole.
     found = read_deploy_log(log)
-    assert found.complete, (found.damage, found.figures["servo"]["dropped"], len(found.time))
+    assert found.complete, (found.damage, found.figures["servo"]["dropped"], len(found.ticks.begun))
     events = [event for event in found.events if event.kind == "fault"]
     assert [event.text for event in events] == deployment.summary.faults
     for name, struck in strikes.items():
@@ -165,18 +165,20 @@ def test_states_that_cannot_be_believed(running: Running, faults: dict[str, Any]
         old = {"NO_STATE", "STATE_LOST"}
         assert first.reason in ({"STATE_NOT_FINITE"} if name == "nan" else old), name
     # What the log says was sent is what was written: damping wherever no target was.
-    driven = found.mode != Mode.PREFLIGHT
-    assert (found.damped == np.isnan(found.sent[:, 0]))[driven].all()
+    driven = found.ticks.mode != Mode.PREFLIGHT
+    assert (found.ticks.damped == np.isnan(found.ticks.sent[:, 0]))[driven].all()
     when, damped = writes(wire)
-    assert abs(int(damped.sum()) - int(found.damped.sum())) <= 1
+    assert abs(int(damped.sum()) - int(found.ticks.damped.sum())) <= 1
     assert abs(len(when) - int(driven.sum())) <= 1
     # The policy's actions were followed, once blended in.
-    followed = (found.mode == Mode.POLICY) & (found.blend == 1.0) & (found.level == 0)
+    followed = (
+        (found.ticks.mode == Mode.POLICY) & (found.ticks.blend == 1.0) & (found.ticks.level == 0)
+    )
     assert followed.any()
     k = int(np.flatnonzero(followed)[0])
-    np.testing.assert_allclose(found.sent[k], found.target[int(found.action_number[k])])
-    assert np.isfinite(found.latency[found.mode == Mode.POLICY]).sum() > 10
-    assert found.figures["servo"]["ticks"] >= len(found.tick)
+    np.testing.assert_allclose(found.ticks.sent[k], found.steps.target[int(found.ticks.action[k])])
+    assert np.isfinite(found.ticks.latency[found.ticks.mode == Mode.POLICY]).sum() > 10
+    assert found.figures["servo"]["ticks"] >= len(found.ticks.tick)
 
 
 def test_a_plan_that_cannot_run_is_refused_before_anything_starts(
@@ -186,16 +188,16 @@ def test_a_plan_that_cannot_run_is_refused_before_anything_starts(
     names = tuple(f"joint_{i}" for i in range(12))
     other = write_hopper(tmp_path / "other.onnx", joint_names=names)
     with pytest.raises(ArtefactError, match="joint_names"):
-        Deployment(Plan(link=link, policy=other))
+        Deployment(RunPlan(link=link, policy=other))
     with pytest.raises(HardwareError, match="action_valid_s"):
-        Plan(link=link, policy=policy, action_valid_s=0.0)
+        RunPlan(link=link, policy=policy, action_valid_s=0.0)
 
 
 def test_an_operator_that_is_late_is_not_gone_and_one_that_is_stuck_is(
     policy: Path, tmp_path: Path
 ) -> None:
-    plan = Plan(
-        link=FaultyLink(wire=tmp_path / "wire.txt"), policy=policy, timing=QUICK, limits=PATIENT
+    plan = RunPlan(
+        link=FaultyLink(wire=tmp_path / "wire.txt"), policy=policy, timing=QUICK, ages=PATIENT
     )
     with Deployment(plan) as deployment:
         # On a busy computer a sleep may last too long itself.
@@ -228,13 +230,13 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
     found = read_deploy_log(log)
     assert found.complete
     assert found.virtual
-    modes = [Mode(mode) for mode, _ in itertools.groupby(found.mode.tolist())]
+    modes = [Mode(mode) for mode, _ in itertools.groupby(found.ticks.mode.tolist())]
     assert modes == [
         *(Mode.PREFLIGHT, Mode.DAMP, Mode.STAND, Mode.POLICY, Mode.HALT, Mode.SIT, Mode.DAMP)
     ]
     seen = load_capture(capture)
     height = seen.position[:, 2]
-    standing = found.time[found.mode == Mode.POLICY] - found.time[0]
+    standing = found.ticks.begun[found.ticks.mode == Mode.POLICY] - found.ticks.begun[0]
     upright = height[np.searchsorted(seen.time, standing[-1])]
     assert height[-1] < 0.15 < 0.25 < upright < 0.33
     assert json.loads(figures.read_text())["faults"] == []

@@ -19,9 +19,9 @@ import pytest
 from deploy_runs import DAMPED_S, FRESH, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
 from pronk.deploy.links.address import Address
-from pronk.deploy.runtime.log import read_deploy_log
+from pronk.deploy.runtime.deploy_log import read_deploy_log
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.run import Deployment
 from pronk.errors import HardwareError
 from wire import ROBOT, Wire, over_dds, over_lcm
@@ -43,13 +43,13 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
         yield Address.parse(f"{request.param}://?{word}={number}"), wire
 
 
-def patient_plan(address: Address, folder: Path) -> Plan:
+def patient_plan(address: Address, folder: Path) -> RunPlan:
     """A plan whose filter takes nothing for a fault that a busy computer may cause."""
-    return Plan(
+    return RunPlan(
         link=Link(robot=ROBOT.name, address=address, fresh=FRESH),
         policy=write_hopper(folder / "policy.onnx", strength=0.2),
         timing=QUICK,
-        limits=PATIENT | {"hold_s": 1.0},
+        ages=replace(PATIENT, hold_s=1.0),
         action_valid_s=2.0,
         operator_timeout_s=2.0,
         ignore_latency=True,
@@ -95,10 +95,10 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     assert found.complete, found.damage
     [event] = [event for event in found.events if event.kind == "fault"]
     assert (event.text, event.reason, event.level) == (why, "LINK", "LATCH")
-    struck = np.flatnonzero(found.damped & (found.time > wire.began))[0]
-    assert found.time[struck] - wire.began <= DAMPED_S
-    assert found.damped[struck:].all()
-    assert found.mode[struck - 5] == Mode.POLICY
+    struck = np.flatnonzero(found.ticks.damped & (found.ticks.begun > wire.began))[0]
+    assert found.ticks.begun[struck] - wire.began <= DAMPED_S
+    assert found.ticks.damped[struck:].all()
+    assert found.ticks.mode[struck - 5] == Mode.POLICY
 
 
 def test_the_standby_damps_after_a_servo_that_stopped(

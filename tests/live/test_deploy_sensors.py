@@ -6,6 +6,7 @@ benchmark measures each with both robots and both links.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ Several times what an idle computer takes, so that a busy one passes."""
 )
 def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> None:
     # Shorter than a walking robot takes to fall while it holds its last action.
-    patient = {"limits": PATIENT | {"hold_s": 1.0}, "action_valid_s": 0.3}
+    patient = {"ages": replace(PATIENT, hold_s=1.0), "action_valid_s": 0.3}
     patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
     rows = measure(robot, POLICY, link, faults, 0, **patient)
     assert {row["fault"] for row in rows} == set(faults)

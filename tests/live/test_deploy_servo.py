@@ -16,17 +16,17 @@ import pytest
 
 from deploy_faults import FaultyLink
 from deploy_runs import PATIENT
-from pronk.deploy.bench.paced import CaptureRecorder
 from pronk.deploy.links.address import Address
-from pronk.deploy.runtime.ipc import ACTIONS, OPERATOR, TICK, Shared, fill
+from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.plan import Link, RunPlan
+from pronk.deploy.runtime.poses import RunTiming
+from pronk.deploy.runtime.records import ACTIONS, OPERATOR, TICK
 from pronk.deploy.runtime.servo import Servo
-from pronk.deploy.runtime.state_machine import Timing
 from pronk.errors import HardwareError
 from virtual_robot import POSE
 
-QUICK = Timing(damp_s=0.05, fold_s=0.1, check_s=0.0, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
+QUICK = RunTiming(damp_s=0.05, fold_s=0.1, check_s=0.0, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
 """The servo knows nothing of the policy but its actions."""
 
@@ -40,7 +40,7 @@ def link(tmp_path: Path) -> FaultyLink:
 class Run:
     """A servo in a thread, and the operator's end of it."""
 
-    def __init__(self, plan: Plan, shared: Shared) -> None:
+    def __init__(self, plan: RunPlan, shared: Shared) -> None:
         self.servo = Servo(plan, shared, (0.0, 1.0))
         self.shared = shared
         self.said: list[tuple[str, str]] = []
@@ -91,7 +91,7 @@ class Run:
 @contextmanager
 def flown(link: Any, **more: Any) -> Iterator[Run]:
     shared, before = Shared(), sys.getswitchinterval()
-    plan = Plan(
+    plan = RunPlan(
         link=link, policy=NOWHERE, timing=QUICK, real_time=False, operator_timeout_s=10.0, **more
     )
     run = Run(plan, shared)
@@ -168,7 +168,7 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("no folder")
     ground = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
-    with flown(ground, recorder=CaptureRecorder(path=folder / "seen.npz")) as run:
+    with flown(ground, trajectory=folder / "seen.npz") as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")
     assert "Not a directory" in why or "exists" in why
@@ -186,7 +186,7 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
 
 def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> None:
     number, paused = 0, False
-    with flown(link, limits=PATIENT, ignore_latency=True) as run:
+    with flown(link, ages=PATIENT, ignore_latency=True) as run:
 
         def action() -> np.ndarray | None:
             """The policy acts during a pause of 15 ms, in the middle of the servo's tick."""
@@ -198,8 +198,13 @@ def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> No
             state, now = run.shared.state.read(), time.monotonic()
             if state is None:
                 return None
-            fill(record, sequence=number, state_sequence=state["sequence"], made=now)
-            fill(record, entry=run.servo.modes.entry, position=POSE, valid_for=2.0, state_time=now)
+            record["sequence"] = number
+            record["state_sequence"] = state["sequence"]
+            record["state_time"] = now
+            record["made"] = now
+            record["valid_for"] = 2.0
+            record["entry"] = run.servo.modes.entry
+            record["position"] = POSE
             return record
 
         run.shared.actions.read = action  # type: ignore[method-assign]

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from hopper import write_hopper
-from pronk.deploy.runtime.log import DeployLog, read_deploy_log
+from pronk.deploy.runtime.deploy_log import DeployLog, read_deploy_log
 from pronk.deploy.runtime.modes import Mode
 
 pytest.importorskip("onnxruntime")
@@ -73,14 +73,14 @@ def flown(policy: Path, log: Path) -> Iterator[Flight]:
 
 def course(log: DeployLog) -> list[Mode]:
     """The modes from where the policy took over."""
-    modes = [Mode(mode) for mode, _ in itertools.groupby(log.mode.tolist())]
+    modes = [Mode(mode) for mode, _ in itertools.groupby(log.ticks.mode.tolist())]
     return modes[modes.index(Mode.POLICY) :]
 
 
 def damped_at_the_end(log: DeployLog) -> float:
     """How long the joints were damped without a break before the log ended [s]."""
-    free = np.flatnonzero(~log.damped)
-    return float(log.time[-1] - log.time[free[-1]])
+    free = np.flatnonzero(~log.ticks.damped)
+    return float(log.ticks.begun[-1] - log.ticks.begun[free[-1]])
 
 
 def test_a_lost_connection_and_impatient_keys_damp_and_keep_the_log(
@@ -138,4 +138,4 @@ def test_a_killed_program_damps_and_the_log_holds_it(policy: Path, tmp_path: Pat
     assert damped_at_the_end(log) >= DAMPED_S
     texts = [event.text for event in log.events]
     assert "the operator's program has ended" in texts
-    assert log.time[log.damped & (log.time > killed - 0.5)][0] - killed < 0.5
+    assert log.ticks.begun[log.ticks.damped & (log.ticks.begun > killed - 0.5)][0] - killed < 0.5

@@ -24,6 +24,7 @@ from deploy_runs import DAMPED_S, FRESH, free_port, simulated
 from pronk.cli.console import RigOperator
 from pronk.cli.sweep import record_wire
 from pronk.deploy.links.address import Address
+from pronk.deploy.runtime.limits import AgeLimits
 from pronk.deploy.runtime.plan import Link
 from pronk.errors import HardwareError, LogError
 from pronk.identify.excitation.plan import SweepPlan, make_plan
@@ -35,7 +36,7 @@ from wire import ROBOT, over_lcm
 
 pytest.importorskip("lcm")
 
-PATIENT = dict.fromkeys(("hold_s", "damp_s", "latch_s", "expiry_s"), 10.0) | {"lag": 10000.0}
+PATIENT = AgeLimits(hold_s=10.0, damp_s=10.0, latch_s=10.0, expiry_s=10.0, lag=10000.0)
 
 
 @cache
@@ -57,7 +58,7 @@ def port() -> Iterator[int]:
 
 def swept(plan: SweepPlan, out: Path, port: int, **more: Any) -> dict[str, Any]:
     link = Link(robot=plan.robot.name, address=Address.parse("lcm", port=port), fresh=FRESH)
-    more = {"limits": PATIENT, "standby_s": 2.0, **more}
+    more = {"ages": PATIENT, "standby_s": 2.0, **more}
     return record_wire(plan, out, link, real_time=True, **more)
 
 
@@ -79,7 +80,7 @@ def written(path: Path) -> JointLog | None:
 def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
     plan = plan_of("gripper", "so101", 0.05)
     link = Link(robot="so101", address=Address.parse("sim://bench"))
-    recorded = record_wire(plan, tmp_path, link, limits=PATIENT, real_time=False)
+    recorded = record_wire(plan, tmp_path, link, ages=PATIENT, real_time=False)
     log = read_mcap(recorded["logs"][0])
     assert recorded["virtual"]
     assert log.origin.complete

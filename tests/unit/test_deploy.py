@@ -18,23 +18,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deploy_records import set_fields
 from pronk.deploy.bench.faults import SWAPPED, spoiled
 from pronk.deploy.links.realtime import Histogram, Pace
-from pronk.deploy.runtime import ipc
-from pronk.deploy.runtime.ipc import STEP, TICK, Event, event, fill
-from pronk.deploy.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.deploy_log import is_deploy_log, read_deploy_log
+from pronk.deploy.runtime.limits import Limits
+from pronk.deploy.runtime.log import SCHEMA, TOPICS, DeployLogWriter
+from pronk.deploy.runtime.memory import Mailbox, Ring, Shared, slots_dtype
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
+from pronk.deploy.runtime.poses import RunTiming, folded_pose, minimum_jerk, stand_up
 from pronk.deploy.runtime.preflight import delay_objection, refusals
-from pronk.deploy.runtime.run import RunSummary
-from pronk.deploy.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
-from pronk.deploy.runtime.state_machine import (
-    FIRST_ACTION_S,
-    StateMachine,
-    Timing,
-    folded_pose,
-    minimum_jerk,
-    stand_up,
+from pronk.deploy.runtime.reasons import FilterAction, Reason
+from pronk.deploy.runtime.records import (
+    ACTIONS,
+    STEP,
+    TEXT_SIZE,
+    TICK,
+    Event,
+    event_record,
+    get_state,
+    put_state,
 )
+from pronk.deploy.runtime.run import RunSummary
+from pronk.deploy.runtime.safety import SafetyFilter
+from pronk.deploy.runtime.state_machine import FIRST_ACTION_S, StateMachine
 from pronk.deploy.runtime.teleop import (
     Gamepad,
     Keyboard,
@@ -70,7 +77,7 @@ def pair(number: int) -> np.ndarray:
 
 @pytest.fixture
 def memory() -> Iterator[np.ndarray]:
-    kind = ipc.block(PAIR, 3)
+    kind = slots_dtype(PAIR, 3)
     shared = shared_memory.SharedMemory(create=True, size=kind.itemsize)
     yield np.ndarray((), kind, shared.buf)
     shared.unlink()
@@ -78,11 +85,11 @@ def memory() -> Iterator[np.ndarray]:
 
 def _write_many(memory: np.ndarray, count: int) -> None:
     for number in range(count):
-        ipc.Mailbox(memory).write(pair(number))
+        Mailbox(memory).write(pair(number))
 
 
 def test_a_mailbox_never_gives_half_a_record(memory: np.ndarray) -> None:
-    mailbox = ipc.Mailbox(memory)
+    mailbox = Mailbox(memory)
     assert mailbox.read() is None
     writer = get_context("fork").Process(target=_write_many, args=(memory, 20_000))
     writer.start()
@@ -99,7 +106,7 @@ def test_a_mailbox_never_gives_half_a_record(memory: np.ndarray) -> None:
 
 
 def test_a_half_written_slot_is_not_read(memory: np.ndarray) -> None:
-    ring = ipc.Ring(memory)
+    ring = Ring(memory)
     ring.put(pair(1))
     memory["slots"]["record"]["b"][2] += 1  # another record's slot
     assert [int(r["a"]) for r in ring.take()] == [1]
@@ -109,7 +116,7 @@ def test_a_half_written_slot_is_not_read(memory: np.ndarray) -> None:
 
 
 def test_a_full_ring_drops_the_new_and_counts_them(memory: np.ndarray) -> None:
-    ring, other = ipc.Ring(memory), ipc.Ring(memory)
+    ring, other = Ring(memory), Ring(memory)
     assert [ring.put(pair(i)) for i in range(5)] == [True] * 3 + [False] * 2
     assert other.dropped == 2
     assert [int(r["a"]) for r in other.take(2)] == [0, 1]
@@ -119,18 +126,18 @@ def test_a_full_ring_drops_the_new_and_counts_them(memory: np.ndarray) -> None:
 
 
 def test_shared_memory_is_attached_by_name_and_removed_once() -> None:
-    shared = ipc.Shared()
-    other = ipc.Shared(shared.name)
-    shared.events.put(event(2.5, "fault", "it is tilted", level=FilterAction.DAMP))
-    shared.events.put(event(0.0, "notice", "ä" * 2 * ipc.TEXT))
+    shared = Shared()
+    other = Shared(shared.name)
+    shared.events.put(event_record(2.5, "fault", "it is tilted", level=FilterAction.DAMP))
+    shared.events.put(event_record(0.0, "notice", "ä" * 2 * TEXT_SIZE))
     short, long = (Event.of(each) for each in other.events.take())
     assert short == Event(time=2.5, kind="fault", text="it is tilted", level="DAMP")
-    assert long.text == "?" * ipc.TEXT
+    assert long.text == "?" * TEXT_SIZE
     other.close()
     shared.close()
     shared.close()
     with pytest.raises(FileNotFoundError):
-        ipc.Shared(shared.name)
+        Shared(shared.name)
 
 
 @pytest.mark.parametrize("measured", [{}, {"temperature": np.arange(12.0), "robot_time": 5.0}])
@@ -138,8 +145,8 @@ def test_a_state_survives_the_way_through_memory(measured: dict[str, Any]) -> No
     position = np.random.default_rng(0).standard_normal(12)
     one = state(time=3.0, sequence=7, position=position, **measured)
     record = np.zeros((), dtype=TICK)
-    ipc.put_state(record, one)
-    back = ipc.get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
+    put_state(record, one)
+    back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
     for name, value in vars(one).items():
         np.testing.assert_array_equal(getattr(back, name), value)
 
@@ -176,7 +183,7 @@ def test_standing_up_begins_at_the_measured_pose_and_ends_at_the_default_pose() 
     assert [minimum_jerk(s) for s in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert minimum_jerk(0.25) == pytest.approx(10 / 64 - 15 / 256 + 6 / 1024)
     measured = LYING + 0.2 * np.random.default_rng(1).standard_normal(12)
-    path = stand_up(ROBOT, measured, 5.0, Timing(fold_s=1.0, rise_s=2.0, ramp_s=0.5))
+    path = stand_up(ROBOT, measured, 5.0, RunTiming(fold_s=1.0, rise_s=2.0, ramp_s=0.5))
     np.testing.assert_array_equal(path.target(5.0), measured)
     np.testing.assert_allclose(path.target(6.0), LYING)
     np.testing.assert_allclose(path.target(8.0), POSE)
@@ -187,7 +194,7 @@ def test_standing_up_begins_at_the_measured_pose_and_ends_at_the_default_pose() 
     fastest = 1.875 * max(np.abs(LYING - measured).max() / 1.0, np.abs(POSE - LYING).max() / 2.0)
     assert np.abs(np.diff(targets, axis=0)).max() * 500 <= fastest * 1.001
     with pytest.raises(RobotError, match="rise_s"):
-        Timing(rise_s=-1.0)
+        RunTiming(rise_s=-1.0)
 
 
 @pytest.mark.parametrize(
@@ -200,8 +207,8 @@ def test_the_folded_pose_has_the_feet_under_the_hips(name: str, thigh: float, sh
     assert abs(knee) > abs(robot.joint("FR_knee").default_position)
     assert abs(thigh * math.sin(pitch) + shank * math.sin(pitch + knee)) < 0.03
     assert 0.09 < thigh * math.cos(pitch) + shank * math.cos(pitch + knee) < 0.16
-    assert (limits.low + limits.margin < pose).all()
-    assert (limits.high - limits.margin > pose).all()
+    assert (limits.joints.low + limits.operating.margin < pose).all()
+    assert (limits.joints.high - limits.operating.margin > pose).all()
 
     with pytest.raises(RobotError, match="so101"):
         folded_pose(load_robot("so101"))
@@ -214,7 +221,7 @@ class Run:
     """A state machine on a clock of its own."""
 
     def __init__(self, *, check_s: float = 0.0, **times: float) -> None:
-        self.machine = StateMachine(ROBOT, Timing(check_s=check_s, **times))
+        self.machine = StateMachine(ROBOT, RunTiming(check_s=check_s, **times))
         self.safety = SafetyFilter(limits=LIMITS)
         self.t = 0.0
         self.action: Any = None
@@ -236,11 +243,11 @@ class Run:
         return desired
 
     def give(self, target: np.ndarray, entry: int | None = None) -> None:
-        made, self.action = self.action, np.zeros((), dtype=ipc.ACTIONS)
+        made, self.action = self.action, np.zeros((), dtype=ACTIONS)
         sequence = 0 if made is None else made["sequence"] + 1
         entry = self.machine.entry if entry is None else entry
-        fill(self.action, sequence=sequence, state_sequence=3, entry=entry, position=target)
-        fill(self.action, state_time=self.t, made=self.t, valid_for=0.05)
+        set_fields(self.action, sequence=sequence, state_sequence=3, entry=entry, position=target)
+        set_fields(self.action, state_time=self.t, made=self.t, valid_for=0.05)
 
     def standing(self) -> Run:
         self.machine.preflighted((), self.t)
@@ -579,9 +586,9 @@ HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
 
 def record(number: int, **changes: Any) -> np.void:
     one, t = np.zeros(1, dtype=TICK)[0], number / 500
-    ipc.put_state(one, state(time=t, sequence=number))
+    put_state(one, state(time=t, sequence=number))
     times = {"begun": t + 1e-4, "deadline": t, "done": t + 4e-4, "latency": np.nan}
-    fill(one, **{"tick": number, "desired": POSE, "sent": POSE} | times | changes)
+    set_fields(one, **{"tick": number, "desired": POSE, "sent": POSE} | times | changes)
     return one
 
 
@@ -598,7 +605,9 @@ def written(path: Path, ticks: int, every: int = 1000) -> None:
 def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
     path, count = tmp_path / "run.mcap", 600
     writer = DeployLogWriter(path, HEADER)
-    writer.write(event(0.5, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)[()])
+    writer.write(
+        event_record(0.5, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)[()]
+    )
     ticks, steps = [], np.zeros(count // 10, dtype=STEP)
     for k in range(count):
         damped = {"sent": np.nan, "damped": 1} if k >= 590 else {}
@@ -607,7 +616,7 @@ def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
         writer.write(ticks[-1])
         if k % 10 == 0:
             step = steps[k // 10]
-            fill(step, sequence=k // 10, begun=k / 500, action=k, live=1, jump=k > 300)
+            set_fields(step, sequence=k // 10, begun=k / 500, action=k, live=1, jump=k > 300)
             writer.write(step)
         if k % 70 == 0:
             writer.flush()
@@ -615,15 +624,21 @@ def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
     log = read_deploy_log(path)
     assert (log.complete, log.figures) == (True, {"servo": {"ticks": count}})
     assert log.joints == ROBOT.joint_names
-    for found, expected in ((log.ticks, np.array(ticks)), (log.steps, steps)):
-        for name in expected.dtype.names or ():
-            np.testing.assert_array_equal(found[name], expected[name])
-    for name, expected in (("lateness", 1e-4), ("work", 3e-4), ("state_age", 1e-4)):
-        np.testing.assert_allclose(getattr(log, name), expected, atol=1e-12)
-    np.testing.assert_array_equal(log.damped, np.arange(count) >= 590)
-    np.testing.assert_array_equal(log.state_time, np.arange(count) / 500)
-    np.testing.assert_array_equal(log.action, steps["action"])
-    assert (log.jump.dtype, log.jump.sum()) == (bool, 29)
+    table = np.array(ticks)
+    for name in vars(log.ticks):
+        if name != "state":
+            np.testing.assert_array_equal(getattr(log.ticks, name), table[name])
+    for name in vars(log.ticks.state):
+        np.testing.assert_array_equal(getattr(log.ticks.state, name), table[name])
+    for name in vars(log.steps):
+        np.testing.assert_array_equal(getattr(log.steps, name), steps[name])
+    np.testing.assert_allclose(log.ticks.lateness, 1e-4, atol=1e-12)
+    np.testing.assert_allclose(log.ticks.work, 3e-4, atol=1e-12)
+    np.testing.assert_allclose(log.ticks.state_age, 1e-4, atol=1e-12)
+    np.testing.assert_array_equal(log.ticks.damped, np.arange(count) >= 590)
+    np.testing.assert_array_equal(log.ticks.state.time, np.arange(count) / 500)
+    np.testing.assert_array_equal(log.steps.action, steps["action"])
+    assert (log.steps.jump.dtype, log.steps.jump.sum()) == (bool, 29)
     [first] = log.events
     assert (first.kind, first.reason, first.level) == ("fault", "TILT", "LATCH")
     assert not log.virtual
@@ -645,8 +660,9 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
     except LogError:
         assert share < 0.9
         return
-    assert len(log.tick) in (10, 20, 30, 40, 50, 60)
-    np.testing.assert_array_equal(log.tick, np.arange(len(log.tick)))
+    numbers = log.ticks.tick
+    assert len(numbers) in (10, 20, 30, 40, 50, 60)
+    np.testing.assert_array_equal(numbers, np.arange(len(numbers)))
     assert log.complete or share < 1.0
 
 

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 import pronk
+from deploy_records import set_fields
 from pronk.deploy.links.realtime import Pace
-from pronk.deploy.runtime.ipc import OPERATOR, Shared, fill, put_state, state_dtype
+from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode
-from pronk.deploy.runtime.plan import Link, Plan
+from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
+from pronk.deploy.runtime.records import OPERATOR, put_state, state_dtype
 from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
 from pronk.policy.script import STILL
@@ -34,7 +36,7 @@ DECIDED = ("observation", "action", "target", "contact", "linear_velocity", "com
 def running() -> Iterator[PolicyProcess]:
     shared = Shared()
     try:
-        plan = Plan(link=Link(robot="mini_cheetah"), policy=POLICY)
+        plan = RunPlan(link=Link(robot="mini_cheetah"), policy=POLICY)
         yield PolicyProcess(plan, shared, load_policy(POLICY))
     finally:
         shared.close()
@@ -60,9 +62,9 @@ def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> Non
     """What servo and operator write before a step."""
     record, operator = np.zeros((), dtype=state_dtype(12)), np.zeros((), dtype=OPERATOR)
     put_state(record, state)
-    fill(record, mode=mode, entry=entry)
+    set_fields(record, mode=mode, entry=entry)
     process.shared.state.write(record)
-    fill(operator, command=(1.0, -0.3, 99.0), jump=state.sequence % 3 == 0)
+    set_fields(operator, command=(1.0, -0.3, 99.0), jump=state.sequence % 3 == 0)
     process.shared.operator.write(operator)
 
 

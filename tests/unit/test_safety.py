@@ -12,17 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk.deploy.runtime.safety import (
-    LEAST_DAMPING_S,
-    Decision,
-    FilterAction,
-    Limits,
-    Reason,
-    SafetyFilter,
-    SafetyInput,
-    apply_rules,
-    tilt,
-)
+from pronk.deploy.runtime.limits import AgeLimits, Limits
+from pronk.deploy.runtime.reasons import Decision, FilterAction, Reason
+from pronk.deploy.runtime.rules import SafetyInput, apply_rules, tilt
+from pronk.deploy.runtime.safety import LEAST_DAMPING_S, SafetyFilter
 from pronk.errors import RobotError
 from pronk.robots.machine import Command, State
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
@@ -30,6 +23,11 @@ from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 LIMITS = Limits.of(ROBOT)
 N = len(ROBOT.joints)
 state = partial(still, sequence=100)
+
+
+def operating(**changes: float) -> Limits:
+    """The robot's limits with other operating limits."""
+    return replace(LIMITS, operating=replace(LIMITS.operating, **changes))
 
 
 def command(**changes: Any) -> Command:
@@ -42,7 +40,8 @@ def judged(
 ) -> tuple[Command | None, Decision, SafetyFilter]:
     """What a filter makes of a state and a command, and the filter."""
     held, earlier = more.pop("held", True), more.pop("earlier", [])
-    safety = SafetyFilter(limits=limits, **more)
+    safety = SafetyFilter(limits=limits)
+    safety.last = more.pop("last", None)
     sent, decision = safety.judge([*earlier, s], c, t, held=held)
     return sent, decision, safety
 
@@ -205,7 +204,7 @@ def test_targets_are_moved_into_each_limit() -> None:
 
     target, reason = moved(state(), POSE - 0.9, POSE + 0.5)
     assert reason is Reason.CHANGE
-    np.testing.assert_allclose(target, POSE + 0.5 - LIMITS.change)
+    np.testing.assert_allclose(target, POSE + 0.5 - LIMITS.operating.change)
 
     # In 20 ms at 10 rad/s the knee would pass its margin, 2.55 rad.
     q = at(POSE, 2.4, 2)
@@ -214,24 +213,28 @@ def test_targets_are_moved_into_each_limit() -> None:
     assert (target[2], reason) == (2.4, Reason.POSITION)
 
     # At rest all power is winding loss: the torques are equal still, and give the limit exactly.
-    target, reason = moved(state(), POSE + 0.8, limits=Limits.of(ROBOT, power_w=1000.0))
+    target, reason = moved(state(), POSE + 0.8, limits=operating(power_w=1000.0))
     torque = KP * (target - POSE)
     assert reason is Reason.POWER
     np.testing.assert_allclose(torque, torque[0])
-    assert float(torque**2 @ LIMITS.loss) == pytest.approx(1000.0)
+    assert float(torque**2 @ LIMITS.joints.loss) == pytest.approx(1000.0)
     # V / (gear kt stall torque), by hand for the hips: 24 / (6 0.05 62.43).
     stall = 1.5 * 6 * 0.05 * 24 / 0.173
-    assert LIMITS.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
+    assert LIMITS.joints.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("hold_s", 9.0)],
+    [("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("tilt", -1.0)],
 )
 def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
-    with pytest.raises(RobotError):
-        Limits.of(ROBOT, **{name: value})
-    assert Limits.of(ROBOT, tilt=math.inf).tilt == math.inf
+    with pytest.raises(RobotError, match=name):
+        operating(**{name: value})
+    assert not operating(tilt=math.inf).trunk_is_free
+    with pytest.raises(RobotError, match="must not fall"):
+        AgeLimits(hold_s=9.0)
+    with pytest.raises(RobotError, match="lag"):
+        AgeLimits(lag=0.0)
 
 
 def test_tilt_is_the_angle_of_the_z_axis() -> None:
@@ -281,42 +284,51 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
     slack = 1e-6
     q, v, kp, kd = given.position, given.velocity, given.stiffness, given.damping
     torque = kp * (target - q) - kd * v
-    top = limits.stall * (1.0 - v / limits.no_load)
-    bottom = -limits.stall * (1.0 + v / limits.no_load)
+    top = limits.joints.stall * (1.0 - v / limits.joints.no_load)
+    bottom = -limits.joints.stall * (1.0 + v / limits.joints.no_load)
     applied = np.clip(torque, bottom, top)
-    power = (np.maximum(applied * v, 0.0) + limits.loss * applied**2).sum(axis=-1)
+    power = (np.maximum(applied * v, 0.0) + limits.joints.loss * applied**2).sum(axis=-1)
     w, x, y, z = given.orientation.T
     upright = w * w - x * x - y * y + z * z
-    ahead = q + limits.horizon_s * v
-    out = (ahead > limits.high - limits.margin) & (target > q + slack)
-    out |= (ahead < limits.low + limits.margin) & (target < q - slack)
+    ahead = q + limits.operating.horizon_s * v
+    out = (ahead > limits.joints.high - limits.operating.margin) & (target > q + slack)
+    out |= (ahead < limits.joints.low + limits.operating.margin) & (target < q - slack)
     # Where the joint itself is beyond the margin its target may lead it back, no less.
-    inside = (q <= limits.high - limits.margin) & (q >= limits.low + limits.margin)
+    inside = (q <= limits.joints.high - limits.operating.margin) & (
+        q >= limits.joints.low + limits.operating.margin
+    )
+    bad_gains = (kp < 0) | (kp > limits.operating.stiffness)
+    bad_gains |= (kd < 0) | (kd > limits.operating.damping)
     return {
         "finite": ~np.isfinite(target).all(axis=-1),
         "position": (
-            (target < limits.low + limits.margin - slack)
-            | (target > limits.high - limits.margin + slack)
+            (target < limits.joints.low + limits.operating.margin - slack)
+            | (target > limits.joints.high - limits.operating.margin + slack)
             | (out & inside)
         ).any(axis=-1),
-        "change": (np.abs(target - given.last) > limits.change + slack).any(axis=-1),
-        "torque": (np.abs(torque) > limits.torque + slack).any(axis=-1),
-        "power": power > limits.power_w * (1.0 + slack),
-        "tilt": upright < math.cos(limits.tilt) - slack,
-        "speed": (np.abs(v) > limits.speed).any(axis=-1),
-        "temperature": (given.temperature > limits.temperature).any(axis=-1),
-        "age": given.state_age > limits.damp_s,
-        "expiry": given.command_age > np.minimum(given.valid_for, limits.expiry_s),
-        "lag": given.lag > limits.lag,
+        "change": (np.abs(target - given.last) > limits.operating.change + slack).any(axis=-1),
+        "torque": (np.abs(torque) > limits.joints.torque + slack).any(axis=-1),
+        "power": power > limits.operating.power_w * (1.0 + slack),
+        "tilt": upright < math.cos(limits.operating.tilt) - slack,
+        "speed": (np.abs(v) > limits.joints.speed).any(axis=-1),
+        "temperature": (given.temperature > limits.operating.temperature).any(axis=-1),
+        "age": given.state_age > limits.ages.damp_s,
+        "expiry": given.command_age > np.minimum(given.valid_for, limits.ages.expiry_s),
+        "lag": given.lag > limits.ages.lag,
         "dead man": ~given.held,
-        "gains": ((kp < 0) | (kp > limits.stiffness) | (kd < 0) | (kd > limits.damping)).any(-1),
+        "gains": (
+            (kp < 0)
+            | (kp > limits.operating.stiffness)
+            | (kd < 0)
+            | (kd > limits.operating.damping)
+        ).any(-1),
     }
 
 
 def test_a_million_states_and_commands_break_no_limit() -> None:
     rng = np.random.default_rng(240415096)
     chunk, met, passed = 5_000, np.zeros(len(Reason), dtype=int), np.zeros(5, dtype=int)
-    limits = Limits.of(ROBOT, power_w=2000.0)
+    limits = operating(power_w=2000.0)
     for _ in range(200):
         given = wild(rng, chunk)
         result = apply_rules(given, limits)
@@ -330,7 +342,7 @@ def test_a_million_states_and_commands_break_no_limit() -> None:
         same = result.level == FilterAction.PASS
         np.testing.assert_array_equal(result.target[same], given.target[same])
         held = result.level == FilterAction.HOLD
-        assert (given.state_age[held] > limits.hold_s).all()
+        assert (given.state_age[held] > limits.ages.hold_s).all()
     # Every rule acted, and enough passed for the test to mean something.
     silent = {Reason(i) for i in np.flatnonzero(met == 0)}
     over_time = {reason for reason in Reason if reason >= Reason.REPEATED}
@@ -361,6 +373,6 @@ def test_any_input_gives_a_command_within_the_limits_or_damping(
     assert (sent is None) == (decision.level >= FilterAction.DAMP) == safety.faulted
     if sent is not None:
         assert np.isfinite(sent.position).all()
-        assert (sent.position >= LIMITS.low).all()
-        assert (sent.position <= LIMITS.high).all()
+        assert (sent.position >= LIMITS.joints.low).all()
+        assert (sent.position <= LIMITS.joints.high).all()
         assert held

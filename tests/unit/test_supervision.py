@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
-from pronk.deploy.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
+from pronk.deploy.runtime.limits import Limits
+from pronk.deploy.runtime.reasons import FilterAction, Reason
+from pronk.deploy.runtime.safety import SafetyFilter
 from pronk.robots.machine import Command, State
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
@@ -139,7 +141,8 @@ def test_a_sensor_that_others_contradict_is_found(
 
 
 def test_on_a_stand_other_legs_may_be_clamped_and_no_inertial_unit_is_needed() -> None:
-    hung, still = Limits.of(ROBOT, tilt=math.inf), np.zeros(3)
+    hung = replace(LIMITS, operating=replace(LIMITS.operating, tilt=math.inf))
+    still = np.zeros(3)
     assert judged(spoil(stopped), swing=0.0, limits=hung)[0] is Reason.NONE
     states = (replace(state, gyro=still, accelerometer=still) for state in moving(1.0))
     assert judged(states, limits=hung)[0] is Reason.NONE
@@ -159,7 +162,7 @@ def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> 
             break
     if speed == 0.0:
         assert decision.reason is Reason.CLIPPED
-        assert 0.0 < state.time - safety.limits.blocked_s <= 0.02
+        assert 0.0 < state.time - safety.limits.blocked.blocked_s <= 0.02
     else:
         assert sent is not None, decision
 

@@ -10,19 +10,23 @@ import tyro
 
 from pronk.cli import console
 from pronk.cli.options import Base, LinkOptions
-from pronk.deploy.runtime.safety import Limits
-from pronk.deploy.runtime.state_machine import Timing
+from pronk.deploy.runtime.poses import RunTiming
 from pronk.errors import HardwareError, PronkError
+from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
-    from pronk.deploy.runtime.ipc import Event
+    from pronk.deploy.runtime.records import Event
     from pronk.deploy.runtime.run import RunSummary
     from pronk.deploy.runtime.teleop import Operator
     from pronk.policy.contract import Contract
     from pronk.policy.script import Script
 
 
-def deploy(
+_INTERRUPTED = 130
+"""Exit status of a run that was interrupted."""
+
+
+def deploy_command(
     policy: tyro.conf.Positional[Path],
     robot: str | None = None,
     machine: LinkOptions = LinkOptions(),  # noqa: B008
@@ -33,8 +37,8 @@ def deploy(
     log: Path | None = None,
     capture: Path | None = None,
     seconds: float | None = None,
-    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = Timing.blend_s,
-    tilt: float = Limits.tilt,
+    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = RunTiming.blend_s,
+    tilt: float | None = None,
     ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
 ) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
@@ -43,7 +47,7 @@ def deploy(
         policy: policy.onnx, as `pronk train` writes it.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
         machine: The machine.
-        base: Of the virtual robot; the ground if left out.
+        base: What holds the virtual robot; the ground if left out.
         script: Run this unattended: paper, or a command such as 1,0,0.
         walk_only: A script without jumps.
         gamepad: Gamepad, such as /dev/input/js0; a keyboard if left out.
@@ -51,13 +55,12 @@ def deploy(
         capture: What cameras around the virtual robot would measure, .npz (--link sim).
         seconds: Sit down after this time with the policy in charge.
         blend: Time in which the policy takes over, in s; 0 as in training.
-        tilt: Largest tilt of the trunk, in rad.
+        tilt: Largest tilt of the trunk, in rad; that of the robot's file if left out.
         ignore_latency: Start the policy even if the measured latency exceeds its training range.
     """
-    from pronk.deploy.bench.paced import CaptureRecorder
     from pronk.deploy.links.address import SIM
-    from pronk.deploy.runtime.plan import Link, Plan
-    from pronk.deploy.runtime.run import run
+    from pronk.deploy.runtime.plan import Link, RunPlan
+    from pronk.deploy.runtime.run import run_plan
     from pronk.deploy.runtime.teleop import (
         HELP,
         PAD_HELP,
@@ -72,13 +75,13 @@ def deploy(
     address = machine.address(base)
     if capture is not None and (address.kind != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
-    plan = Plan(
+    plan = RunPlan(
         link=Link(robot=robot or contract.robot, address=address, release=machine.release),
         policy=policy,
         log=log,
-        recorder=None if capture is None else CaptureRecorder(path=capture),
-        limits={"tilt": tilt},
-        timing=Timing(blend_s=blend),
+        trajectory=capture,
+        tilt=tilt,
+        timing=RunTiming(blend_s=blend),
         ignore_latency=ignore_latency,
         real_time=machine.real_time,
     )
@@ -87,75 +90,129 @@ def deploy(
         console.confirm(contract.robot, str(address))
     operator: Operator
     if scripts is not None:
-        operator = scripted = ScriptedOperator(scripts)
-        words = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
-        seconds = scripted.seconds if seconds is None else min(seconds, scripted.seconds)
+        scripted = ScriptedOperator(scripts)
+        operator = scripted
+        greeting = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
+        if seconds is None or seconds > scripted.seconds:
+            seconds = scripted.seconds
     elif gamepad is not None:
-        operator, words = Gamepad(gamepad, contract.command_ranges), PAD_HELP
+        operator = Gamepad(gamepad, contract.command_ranges)
+        greeting = PAD_HELP
     else:
-        operator, words = Keyboard(contract.command_ranges), HELP
-    with closing(operator if seconds is None else TimeLimit(operator, seconds)) as limited:
-        console.say(words)
-        summary = run(plan, limited, _notify)
+        operator = Keyboard(contract.command_ranges)
+        greeting = HELP
+    if seconds is not None:
+        operator = TimeLimit(operator, seconds)
+    with closing(operator):
+        console.say(greeting)
+        summary = run_plan(plan, operator, _notify)
     _report(summary)
-    lost = any(event.kind == "lost" for event in summary.events_seen)
-    again = f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
     if summary.log_error:
         console.warn(f"{summary.log_error}.")
-    failed = bool(summary.faults or summary.refusals or lost or summary.log_error)
-    whole = None if summary.log_error else log
+    capture_lost = any(event.kind == "lost" for event in summary.events_seen)
+    wrote = []
+    if log is not None and not summary.log_error:
+        wrote.append(log)
+    if capture is not None and not capture_lost:
+        wrote.append(capture)
+    next_command = f"pronk report {log}"
+    if log is None:
+        next_command = (
+            f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
+        )
+    status = 0
+    if summary.faults or summary.refusals or capture_lost or summary.log_error:
+        status = 1
+    elif summary.interrupted:
+        status = _INTERRUPTED
     return console.Outcome(
-        figures=summary.figures(),
-        wrote=[path for path in (whole, None if lost else capture) if path is not None],
-        following=[again if log is None else f"pronk report {log}"],
-        status=1 if failed else 130 if summary.interrupted else 0,
+        figures=summary.figures(), wrote=wrote, following=[next_command], status=status
     )
 
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
-    """The commands of an unattended run, those that the policy was trained for."""
-    from pronk.jump.trial.protocol import parse_cases
-    from pronk.policy.script import Script
+    """Return the scripts of an unattended run; PronkError if the policy was not trained for one."""
+    from pronk.policy.script import PAPER_VELOCITIES, Script, parse_velocity
 
-    cases = parse_cases([text])
-    ranges = contract.command_ranges
-    for case in cases:
-        for value, (name, (low, high)) in zip(case.command, ranges.items(), strict=True):
-            if not low <= value <= high:
+    velocities = PAPER_VELOCITIES
+    if text.strip() != "paper":
+        velocities = {text: parse_velocity(text)}
+    jump_s = Script.jump_s if contract.jump and not walk_only else 0.0
+    scripts = []
+    for name, velocity in velocities.items():
+        for component, (axis, (low, high)) in zip(
+            velocity, contract.command_ranges.items(), strict=True
+        ):
+            if not low <= component <= high:
                 raise PronkError(
-                    f"--script {text}: {name} {value:g} of {case.name!r} is outside of the "
-                    f"range that the policy was trained for, {low:g} to {high:g}."
+                    f"--script {text}: {axis} {component:g} of {name!r} is outside of the range "
+                    f"that the policy was trained for, {low:g} to {high:g}."
                 )
-    jump_s = 0.5 if contract.jump and not walk_only else 0.0
-    return [Script(command=case.command, jump_s=jump_s) for case in cases]
+        scripts.append(Script(command=velocity, jump_s=jump_s))
+    return scripts
 
 
 def _notify(event: Event) -> None:
     """Print one line for an event."""
-    bad = event.kind in ("fault", "refused", "notice", "lost")
-    (console.warn if bad else console.note)(f"{event.kind}: {event.text}")
+    line = f"{event.kind}: {event.text}"
+    if event.kind in ("fault", "refused", "notice", "lost"):
+        console.warn(line)
+    else:
+        console.note(line)
 
 
 def _report(summary: RunSummary) -> None:
     """Print the figures of the run."""
-    from pronk.deploy.runtime.ipc import REAL, VIRTUAL
-
-    servo, policy = summary.servo, summary.policy
-    times = {
-        "servo tick late": servo.get("lateness"),
-        "age of the state at a tick": servo.get("state_age"),
-        "state to command": servo.get("state_to_command"),
-        "policy step late": policy.get("lateness"),
-        "policy's decision": policy.get("decision"),
-        "the network alone": policy.get("network"),
-    }
-    keys = ("n", "p50_ms", "p95_ms", "p99_ms", "p99_9_ms", "max_ms")
-    rows = [(name, *(one[key] for key in keys)) for name, one in times.items() if one and one["n"]]
-    columns = "what [ms] | n | median | 95 % | 99 % | 99.9 % | largest"
-    title = f"Deployment on {VIRTUAL if servo.get('virtual') else REAL}"
-    console.show_table(columns, rows, title=title)
-    met = ", ".join(f"{name} {count}" for name, count in servo.get("interventions", {}).items())
-    console.say(f"safety filter: {met or 'no intervention'} (ticks of {servo.get('ticks', 0)})")
-    if dropped := sum(servo.get("dropped", {}).values()):
+    console.show(timing_table(summary))
+    interventions = summary.servo.get("interventions", {})
+    ticks = summary.servo.get("ticks", 0)
+    if interventions:
+        counts = [f"{name} {count}" for name, count in interventions.items()]
+        console.say(f"safety filter: {', '.join(counts)} (ticks of {ticks})")
+    else:
+        console.say(f"safety filter: no intervention (ticks of {ticks})")
+    dropped = sum(summary.servo.get("dropped", {}).values())
+    if dropped:
         console.warn(f"{dropped} records were dropped on their way to the log")
     console.say(summary.delay_words())
+
+
+def timing_table(summary: RunSummary) -> Table:
+    """Return the table of everything that was timed in a run."""
+    from pronk.deploy.runtime.records import REAL, VIRTUAL
+
+    figures = {
+        "servo tick late": summary.servo.get("lateness"),
+        "age of the state at a tick": summary.servo.get("state_age"),
+        "state to command": summary.servo.get("state_to_command"),
+        "policy step late": summary.policy.get("lateness"),
+        "policy's decision": summary.policy.get("decision"),
+        "the network alone": summary.policy.get("network"),
+    }
+    rows = []
+    for name, quantiles in figures.items():
+        if quantiles and quantiles["n"]:
+            row = (
+                name,
+                quantiles["n"],
+                quantiles["p50_ms"],
+                quantiles["p95_ms"],
+                quantiles["p99_ms"],
+                quantiles["p99_9_ms"],
+                quantiles["max_ms"],
+            )
+            rows.append(row)
+    robot = VIRTUAL if summary.servo.get("virtual") else REAL
+    return Table(
+        title=f"Deployment on {robot}",
+        columns=(
+            Column(heading="part"),
+            Column(heading="n"),
+            Column(heading="median", unit="ms"),
+            Column(heading="95 %", unit="ms"),
+            Column(heading="99 %", unit="ms"),
+            Column(heading="99.9 %", unit="ms"),
+            Column(heading="largest", unit="ms"),
+        ),
+        rows=tuple(rows),
+    )

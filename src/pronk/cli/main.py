@@ -42,7 +42,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
     "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
-    "deploy": ("pronk.cli.deploy:deploy", "Run a policy on a robot or the virtual robot."),
+    "deploy": ("pronk.cli.deploy:deploy_command", "Run a policy on a robot or the virtual robot."),
     "simulate": ("pronk.cli.simulate:simulate", "Run the virtual robot as a process of its own."),
     "robot": ("pronk.cli.robot:robot", "Write or check the robot.yaml of a model."),
     "report": ("pronk.cli.report:report", "Write one HTML page of matches, trials, deployments."),

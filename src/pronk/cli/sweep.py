@@ -14,12 +14,12 @@ from pronk.cli.options import LinkOptions
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
-    from pronk.deploy.runtime.ipc import Event
     from pronk.deploy.runtime.plan import Link
+    from pronk.deploy.runtime.records import Event
     from pronk.identify.excitation.plan import SweepPlan
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""Excitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for
+"""PlannedExcitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for
 `LogChirp`."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
@@ -58,7 +58,7 @@ def sweep(
         out: Folder for the logs, one MCAP per joint.
         machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
-        signal: Excitation signal.
+        signal: PlannedExcitation signal.
         amplitude: Peak of the command in rad; repeat it for several.
         repeats: Times each amplitude is repeated.
         plan_only: Show what it would do to the robot and leave.
@@ -86,7 +86,9 @@ def sweep(
         sizes = amplitude or AMPLITUDES
         plan = make_plan(known, names or None, kind(), amplitudes=sizes, repeats=repeats)
         report("forecast", 1.0)
-    title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
+    title = (
+        f"RunPlan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
+    )
     console.show_rows(title, COLUMNS, plan.rows())
     plan.check()
     figures: dict[str, Any] = {
@@ -144,14 +146,14 @@ def record_wire(
             killed. What was recorded until then stays readable, with the reason.
         KeyboardInterrupt: The run was interrupted; the joints were damped.
     """
-    from pronk.deploy.runtime.plan import Plan
-    from pronk.deploy.runtime.run import run
+    from pronk.deploy.runtime.plan import RunPlan
+    from pronk.deploy.runtime.run import run_plan
     from pronk.deploy.runtime.sweep import SweepTask
     from pronk.deploy.runtime.teleop import BenchOperator
 
-    metadata = {"link": str(link.address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
+    metadata = {"link": str(link.address), "servo_rate_hz": f"{RunPlan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    job, operator = Plan(link=link, sweep=task, **more), BenchOperator(console.RigOperator())
+    job, operator = RunPlan(link=link, sweep=task, **more), BenchOperator(console.RigOperator())
     whole: list[str] = []
 
     def notify(event: Event) -> None:
@@ -161,7 +163,7 @@ def record_wire(
             console.say(event.text)
 
     try:
-        summary = run(job, operator, notify, progress)
+        summary = run_plan(job, operator, notify, progress)
         servo = summary.servo
         if summary.interrupted:
             raise KeyboardInterrupt

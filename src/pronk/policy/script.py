@@ -12,6 +12,7 @@ Times count from the moment at which the policy starts on a standing robot:
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pronk.errors import PronkError
@@ -22,9 +23,35 @@ Velocity = tuple[float, float, float]
 Commanded = tuple[Velocity, bool]
 """Velocity command and jump input."""
 STILL: Velocity = (0.0, 0.0, 0.0)
+PAPER_VELOCITIES: Mapping[str, Velocity] = {
+    "forward 1": (1.0, 0.0, 0.0),
+    "forward 2": (2.0, 0.0, 0.0),
+    "side -1": (0.0, -1.0, 0.0),
+    "side +1": (0.0, 1.0, 0.0),
+    "back 2": (-2.0, 0.0, 0.0),
+}
+"""Velocity commands of the jumps of Table III of the paper, by name. Positive sideways is to the
+left: the paper does not define the side, and its robot is symmetric."""
 
 _SLACK = 1e-9
 """Tolerance for rounding in sums of times [s]."""
+
+
+def parse_velocity(text: str) -> Velocity:
+    """Read a velocity command such as `1,0` or `1,0,0`: forward, left [m/s], yaw rate [rad/s]."""
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) == 2:
+        values.append(0.0)
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise PronkError(
+            f"command {text!r}; expected two or three numbers between commas, forward and left "
+            'velocity [m/s] and yaw rate [rad/s], as in "1,0,0".'
+        )
+    forward, left, yaw = values
+    return forward, left, yaw
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pronk.deploy.runtime.log import is_deploy_log
+from pronk.deploy.runtime.deploy_log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
 from pronk.jump.trial.results import SUMMARY

@@ -1,24 +1,22 @@
-"""Measures of a deployment's log: modes, jumps, delays, interventions, tracking, timing."""
+"""Measures of a deployment's log: modes, jumps, delays, interventions, margins, timing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise, product
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 
 from pronk.arrays import Array, Mask
-from pronk.deploy.runtime.log import DeployLog
-from pronk.deploy.runtime.modes import Mode
-from pronk.deploy.runtime.safety import FilterAction, Reason
-from pronk.report.style import rms
+from pronk.deploy.runtime.deploy_log import DeployLog
+from pronk.deploy.runtime.modes import POLICY_MODES, Mode
+from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.robots.robot import RobotSpec
 
-POLICY_MODES = (Mode.POLICY, Mode.HALT)
-"""Modes in which the policy gives the targets."""
 QUANTILES = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "p99_9": 0.999}
+"""Names of quantiles, and their shares."""
+_STEP_S = 0.02
+"""Time between two steps of the policy [s]."""
 _MOVED = 1e-9
 """Smaller changes of a target are rounding [rad]."""
 _SHIFTS = np.arange(0.0, 0.0305, 0.00025)
@@ -29,121 +27,251 @@ _GENTLE = 0.5
 """Share of its effort limit below which a drive follows the law at any battery voltage."""
 _AS_GOOD = 1.1
 """Residuals up to this multiple of the least are no worse."""
-_LEAST = 250
+_FEWEST_TICKS = 250
 """Fewest ticks to fit: half a second."""
 _UNKNOWN = (float("nan"), float("nan"))
 
 
 def quantiles(values: Array) -> dict[str, float]:
     """Return `n`, `QUANTILES` and `max` of the finite values; NaN if fewer than one lies beyond."""
-    found = np.sort(values[np.isfinite(values)])
-    n, of = len(found), {}
+    ordered = np.sort(values[np.isfinite(values)])
+    count = len(ordered)
+    result: dict[str, float] = {"n": count}
     for name, share in QUANTILES.items():
-        beyond = n * (1.0 - share) > 1.0 - 1e-9
-        of[name] = found[int(np.ceil(share * n - 1e-9)) - 1] if beyond else np.nan
-    return {"n": n} | of | {"max": found[-1] if n else np.nan}
+        result[name] = np.nan
+        if count * (1.0 - share) > 1.0 - 1e-9:
+            result[name] = ordered[int(np.ceil(share * count - 1e-9)) - 1]
+    result["max"] = ordered[-1] if count else np.nan
+    return result
 
 
-def seconds(log: DeployLog, time: Array | float) -> Array:
+def since_start(log: DeployLog, time: Array | float) -> Array:
     """Return times on the log's clock as times since its first tick [s]."""
-    return np.asarray(np.asarray(time, dtype=float) - log.time[0])
+    return np.asarray(np.asarray(time, dtype=float) - log.ticks.begun[0])
 
 
 def policy_active(log: DeployLog) -> Mask:
     """Return the ticks in which the policy gave the targets, (T,)."""
-    return np.asarray(np.isin(log.mode, POLICY_MODES))
+    return np.asarray(np.isin(log.ticks.mode, POLICY_MODES))
 
 
-def stretches(log: DeployLog) -> list[tuple[Mode, float, float]]:
-    """Return the modes one after the other, with begin since the first tick and length [s]."""
-    edges = [0, *(np.flatnonzero(np.diff(log.mode)) + 1), len(log.time)]
-    period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
-    t = seconds(log, np.append(log.time, log.time[-1] + period))
-    return [(Mode(int(log.mode[a])), float(t[a]), float(t[b] - t[a])) for a, b in pairwise(edges)]
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """Time in one mode."""
+
+    mode: Mode
+    """Mode of the servo."""
+    begin: float
+    """Begin since the first tick [s]."""
+    seconds: float
+    """Length [s]."""
 
 
-def faults(log: DeployLog) -> list[float]:
+def stretches(log: DeployLog) -> list[Stretch]:
+    """Return the modes one after the other."""
+    begun = log.ticks.begun
+    period = float(np.median(np.diff(begun))) if len(begun) > 1 else 0.0
+    times = since_start(log, np.append(begun, begun[-1] + period))
+    changes = np.flatnonzero(np.diff(log.ticks.mode)) + 1
+    edges = [0, *changes.tolist(), len(begun)]
+    result = []
+    for first, end in pairwise(edges):
+        mode = Mode(int(log.ticks.mode[first]))
+        begin = float(times[first])
+        result.append(Stretch(mode=mode, begin=begin, seconds=float(times[end]) - begin))
+    return result
+
+
+def fault_times(log: DeployLog) -> list[float]:
     """Return when faults began, since the first tick [s]."""
-    return [float(seconds(log, one.time)) for one in log.events if one.kind == "fault"]
+    return [float(since_start(log, event.time)) for event in log.events if event.kind == "fault"]
 
 
-def jumps(log: DeployLog) -> list[tuple[float, float]]:
+def jump_inputs(log: DeployLog) -> list[tuple[float, float]]:
     """Return the begin and end of each jump input, since the first tick [s]."""
-    if not len(log.step_time):
+    begun = log.steps.begun
+    if not len(begun):
         return []
-    t = seconds(log, np.append(log.step_time, log.step_time[-1] + 0.02))
-    edges = np.diff(np.concatenate([[0], (log.jump & log.step_live).astype(int), [0]]))
-    ends = zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)
-    return [(float(t[a]), float(t[b])) for a, b in ends]
+    times = since_start(log, np.append(begun, begun[-1] + _STEP_S))
+    pressed = (log.steps.jump & log.steps.live).astype(int)
+    edges = np.diff(np.concatenate([[0], pressed, [0]]))
+    inputs = []
+    for first, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        inputs.append((float(times[first]), float(times[end])))
+    return inputs
 
 
-def missed(log: DeployLog) -> int:
+def missed_ticks(log: DeployLog) -> int:
     """Return the number of ticks left out because their time had passed."""
-    return int((np.diff(log.tick) - 1).sum())
+    return int((np.diff(log.ticks.tick) - 1).sum())
 
 
-def tilt(log: DeployLog) -> Array:
+def tilt_angles(log: DeployLog) -> Array:
     """Return the angle of the trunk's z axis from the vertical [rad]; NaN without an attitude."""
-    size = np.linalg.norm(log.orientation, axis=1)
-    x, y = log.orientation[:, 1], log.orientation[:, 2]
+    orientation = log.ticks.state.orientation
+    length = np.linalg.norm(orientation, axis=1)
+    x = orientation[:, 1]
+    y = orientation[:, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y) / size**2, -1.0, 1.0)))
+        cosine = 1.0 - 2.0 * (x * x + y * y) / length**2
+        return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def interventions(log: DeployLog) -> list[dict[str, Any]]:
-    """Return what the safety filter did, by level and reason; the mildest first.
+@dataclass(frozen=True, kw_only=True)
+class Intervention:
+    """What the safety filter did for one reason."""
 
-    `level` and `reason` are names, `why` is the reason in words; `ticks` is their number, `first`
-    the time since the first tick [s], `largest` the largest change of a target [rad] and `joint`
-    the one that was changed most often: NaN and empty while damped.
-    """
-    found = []
+    level: FilterAction
+    """What it did."""
+    reason: Reason
+    """Why."""
+    ticks: int
+    """Number of ticks."""
+    first: float
+    """Time of the first, since the first tick of the log [s]."""
+    largest: float
+    """Largest change of a target [rad]; NaN while damped."""
+    joint: str
+    """Joint whose target was changed most often; empty while damped."""
+
+
+def interventions(log: DeployLog) -> list[Intervention]:
+    """Return what the safety filter did, by level and reason; the mildest first."""
+    ticks = log.ticks
     with np.errstate(invalid="ignore"):
-        change = np.nan_to_num(np.abs(log.sent - log.desired))
-    for level, reason in product(list(FilterAction)[1:], Reason):
-        there = (log.level == level) & (log.reason == reason)
-        if there.any():
-            often = (change[there] > _MOVED).sum(axis=0)
-            moved = level < FilterAction.DAMP and bool(often.any())
-            one: dict[str, Any] = {"level": level.name, "reason": reason.name, "why": reason.text}
-            one |= {"ticks": int(there.sum()), "first": float(seconds(log, log.time[there][0]))}
-            one["largest"] = float(change[there].max()) if moved else float("nan")
-            one["joint"] = log.joints[int(often.argmax())] if moved else ""
-            found.append(one)
-    return found
+        change = np.nan_to_num(np.abs(ticks.sent - ticks.desired))
+    result = []
+    for level in FilterAction:
+        if level is FilterAction.PASS:
+            continue
+        for reason in Reason:
+            is_such = (ticks.level == level) & (ticks.reason == reason)
+            if not is_such.any():
+                continue
+            times_changed = (change[is_such] > _MOVED).sum(axis=0)
+            largest = float("nan")
+            joint = ""
+            if level < FilterAction.DAMP and times_changed.any():
+                largest = float(change[is_such].max())
+                joint = log.joints[int(times_changed.argmax())]
+            result.append(
+                Intervention(
+                    level=level,
+                    reason=reason,
+                    ticks=int(is_such.sum()),
+                    first=float(since_start(log, ticks.begun[is_such][0])),
+                    largest=largest,
+                    joint=joint,
+                )
+            )
+    return result
 
 
-def in_force(log: DeployLog) -> Array:
-    """Return the target of the drives when each state was measured [rad], (T, joints).
+def tracking_error(log: DeployLog, mask: Mask) -> Array:
+    """Return the RMS of target in force less position, of each joint [rad], (joints,).
 
-    The one of the tick before; NaN for the first tick and after a damped one.
+    The target in force is that of the tick before; NaN where there is none.
+
+    Args:
+        log: The log.
+        mask: Ticks that count, (T,).
     """
-    return np.vstack([np.full((1, log.sent.shape[1]), np.nan), log.sent[:-1]])
+    sent = log.ticks.sent
+    in_force = np.vstack([np.full((1, sent.shape[1]), np.nan), sent[:-1]])
+    error = (in_force - log.ticks.state.position)[mask]
+    is_known = np.isfinite(error)
+    count = is_known.sum(axis=0)
+    square = np.where(is_known, error, 0.0) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(square.sum(axis=0) / count))
 
 
-def _largest(values: Array) -> Array:
-    """Of the finite values of each column; NaN without any."""
-    size = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=0, initial=-1.0)
-    return np.where(size >= 0.0, size, np.nan)
+@dataclass(frozen=True, kw_only=True)
+class Margin:
+    """The largest value of a quantity beside its limit."""
+
+    quantity: str
+    """What was measured."""
+    unit: str
+    """Unit of it and of its limit."""
+    largest: float
+    """Largest value; NaN where it was not measured."""
+    limit: float
+    """Limit; NaN where it is not known."""
+    joint: str = ""
+    """Joint that came nearest to its limit; empty for a quantity of the trunk."""
 
 
-def tracking(log: DeployLog) -> dict[str, Array]:
-    """Return how each joint followed its targets, (joints,); NaN where there was no such time.
+def margins(log: DeployLog) -> list[Margin]:
+    """Return the largest values of the run, up to the first fault, beside their limits."""
+    limits = log.header.get("limits", {})
+    joints = limits.get("joints", {})
+    operating = limits.get("operating", {})
+    ages = limits.get("ages", {})
+    count = ticks_until_fault(log)
+    state = log.ticks.state
+    torque = state.torque[:count]
+    if not torque.any():
+        torque = np.full_like(torque, np.nan)  # this robot reports none
+    return [
+        _joint_margin(log, "joint speed", "rad/s", state.velocity[:count], joints.get("speed")),
+        _joint_margin(log, "joint torque", "N m", torque, joints.get("torque")),
+        _joint_margin(
+            log,
+            "motor temperature",
+            "deg C",
+            state.temperature[:count],
+            [operating.get("temperature", np.nan)] * len(log.joints),
+        ),
+        Margin(
+            quantity="tilt of the trunk",
+            unit="rad",
+            largest=_largest(tilt_angles(log)[:count]),
+            limit=float(operating.get("tilt") or np.nan),
+        ),
+        Margin(
+            quantity="age of the state",
+            unit="s",
+            largest=_largest(log.ticks.state_age[:count]),
+            limit=float(ages.get("damp_s", np.nan)),
+        ),
+    ]
 
-    `error`, `largest`: target in force less position while the policy was active, RMS and largest
-    [rad]; `standing`: RMS in the mode `STAND` [rad]; `torque`, `torque_largest`: as the robot
-    reports them [N m]; `speed_largest` [rad/s].
-    """
-    error, active = in_force(log) - log.position, policy_active(log)
-    torque = log.torque if log.torque.any() else np.full_like(log.torque, np.nan)
-    return {
-        "standing": rms(error[log.mode == Mode.STAND], axis=0),
-        "error": rms(error[active], axis=0),
-        "largest": _largest(error[active]),
-        "torque": rms(torque[active], axis=0),
-        "torque_largest": _largest(torque[active]),
-        "speed_largest": _largest(log.velocity[active]),
-    }
+
+def _joint_margin(
+    log: DeployLog, quantity: str, unit: str, values: Array, limits: list[float] | None
+) -> Margin:
+    """Return the margin of the joint that came nearest to its limit."""
+    largest = []
+    for column in range(len(log.joints)):
+        largest.append(_largest(values[:, column]))
+    if limits is None:
+        limits = [float("nan")] * len(log.joints)
+    shares = np.array(largest) / np.array(limits, dtype=float)
+    if not np.isfinite(shares).any():
+        shares = np.array(largest)
+    if not np.isfinite(shares).any():
+        return Margin(quantity=quantity, unit=unit, largest=float("nan"), limit=float("nan"))
+    nearest = int(np.nanargmax(shares))
+    return Margin(
+        quantity=quantity,
+        unit=unit,
+        largest=largest[nearest],
+        limit=float(limits[nearest]),
+        joint=log.joints[nearest],
+    )
+
+
+def _largest(values: Array) -> float:
+    """Return the largest size of the finite values; NaN without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.abs(finite).max()) if len(finite) else float("nan")
+
+
+def ticks_until_fault(log: DeployLog) -> int:
+    """Return the number of ticks up to the first that damped for a fault, that one included."""
+    is_fault = log.ticks.level >= FilterAction.DAMP
+    return int(is_fault.argmax()) + 1 if is_fault.any() else len(is_fault)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,10 +280,10 @@ class Delay:
 
     trained: tuple[float, float] | None
     """Range of the policy's training; None where the log does not hold it."""
-    command: Mapping[str, float]
+    command: dict[str, float]
     """Quantiles from a state to the first command that uses it, while the policy was active."""
     drives: tuple[float, float]
-    """From a command on the wire to its torque, bounds; NaN where it could not be estimated."""
+    """Bounds from a command on the wire to its torque; NaN where it could not be estimated."""
 
     @property
     def drives_known(self) -> bool:
@@ -180,12 +308,12 @@ class Delay:
         return bool(self.longest <= self.trained[1])
 
 
-def delay(log: DeployLog, robot: RobotSpec | None) -> Delay:
+def measured_delay(log: DeployLog, robot: RobotSpec | None) -> Delay:
     """Measure the delay; that of the drives with the gains of `robot`, unknown if None."""
     trained = log.header.get("policy", {}).get("delay_range_s")
     return Delay(
         trained=None if trained is None else (float(trained[0]), float(trained[1])),
-        command=quantiles(log.latency[policy_active(log)]),
+        command=quantiles(log.ticks.latency[policy_active(log)]),
         drives=_UNKNOWN if robot is None else drive_delay(log, robot),
     )
 
@@ -196,42 +324,81 @@ def drive_delay(log: DeployLog, robot: RobotSpec) -> tuple[float, float]:
     NaN where there is too little to fit, where torques are not measured, where the law explains
     too little of them, or where the longest delay tried is among the best.
     """
-    kp = np.array([joint.stiffness for joint in robot.joints])
-    kd = np.array([joint.damping for joint in robot.joints])
-    gentle = _GENTLE * np.array([joint.drive.effort_limit for joint in robot.joints])
-    wire = log.time + log.work
-    first = np.concatenate([[True], np.diff(log.state_sequence) > 0])  # each state once
-    use = policy_active(log) & first & (log.state_time - _SHIFTS[-1] > wire[0])
-    if use.sum() < _LEAST:
+    ticks = log.ticks
+    stiffness = np.array([joint.stiffness for joint in robot.joints])
+    damping = np.array([joint.damping for joint in robot.joints])
+    effort_limit = np.array([joint.drive.effort_limit for joint in robot.joints])
+    wire = ticks.begun + ticks.work
+    is_new = np.concatenate([[True], np.diff(ticks.state.sequence) > 0])  # each state once
+    used = policy_active(log) & is_new & (ticks.state.time - _SHIFTS[-1] > wire[0])
+    if used.sum() < _FEWEST_TICKS:
         return _UNKNOWN
-    t, q, v, measured = (a[use] for a in (log.state_time, log.position, log.velocity, log.torque))
+    time = ticks.state.time[used]
+    position = ticks.state.position[used]
+    velocity = ticks.state.velocity[used]
+    torque = ticks.state.torque[used]
     residuals = []
-    for by in _SHIFTS:
-        target = log.sent[np.searchsorted(wire, t - by, side="right") - 1]
-        expected = kp * (target - q) - kd * v
-        there = np.isfinite(measured) & (np.abs(expected) < gentle)  # false where damped
-        if there.sum() < _LEAST or np.var(measured[there]) == 0.0:
+    for shift in _SHIFTS:
+        target = ticks.sent[np.searchsorted(wire, time - shift, side="right") - 1]
+        expected = stiffness * (target - position) - damping * velocity
+        # False where damped.
+        compared = np.isfinite(torque) & (np.abs(expected) < _GENTLE * effort_limit)
+        variance = np.var(torque[compared]) if compared.any() else 0.0
+        if compared.sum() < _FEWEST_TICKS or variance == 0.0:
             return _UNKNOWN
-        residuals.append(np.mean((measured - expected)[there] ** 2) / np.var(measured[there]))
-    left = np.array(residuals)
-    good = _SHIFTS[left <= _AS_GOOD * left.min()]
-    if 1.0 - left.min() < _EXPLAINED or good[-1] == _SHIFTS[-1]:
+        residuals.append(np.mean((torque - expected)[compared] ** 2) / variance)
+    least = min(residuals)
+    good_shifts = _SHIFTS[np.array(residuals) <= _AS_GOOD * least]
+    if 1.0 - least < _EXPLAINED or good_shifts[-1] == _SHIFTS[-1]:
         return _UNKNOWN
-    return float(good[0]), float(good[-1])
+    return float(good_shifts[0]), float(good_shifts[-1])
 
 
-def times(log: DeployLog) -> dict[str, tuple[Array, str]]:
-    """Return everything that was timed [s] by name, and what it is."""
-    bad = log.level >= FilterAction.DAMP
-    until_fault = int(bad.argmax()) + 1 if bad.any() else len(bad)
-    live, age = log.step_live, log.state_age[:until_fault]
-    latency = log.latency[policy_active(log)]
-    found = {
-        "servo tick late": (log.lateness, "from a tick's deadline to its begin"),
-        "age of the state": (age, "from the newest state to the tick's begin, until a fault"),
-        "state to command": (latency, "from a state to the first command on the wire that uses it"),
-        "servo's work": (log.work, "from a tick's begin until its command was on the wire"),
-        "policy step late": (log.step_lateness[live], "from a step's deadline to its begin"),
-        "inference": (log.decision[live], "observation built and network run"),
-    }
-    return {name: one for name, one in found.items() if np.isfinite(one[0]).any()}
+@dataclass(frozen=True, kw_only=True)
+class TimedPart:
+    """Something that was timed in every tick or step."""
+
+    name: str
+    """Short name."""
+    meaning: str
+    """From when to when."""
+    seconds: Array
+    """Times [s]."""
+
+
+def timed_parts(log: DeployLog) -> list[TimedPart]:
+    """Return everything that was timed."""
+    live = log.steps.live
+    parts = [
+        TimedPart(
+            name="servo tick late",
+            meaning="from a tick's deadline to its begin",
+            seconds=log.ticks.lateness,
+        ),
+        TimedPart(
+            name="age of the state",
+            meaning="from the newest state to the tick's begin, until a fault",
+            seconds=log.ticks.state_age[: ticks_until_fault(log)],
+        ),
+        TimedPart(
+            name="state to command",
+            meaning="from a state to the first command on the wire that uses it",
+            seconds=log.ticks.latency[policy_active(log)],
+        ),
+        TimedPart(
+            name="servo's work",
+            meaning="from a tick's begin until its command was on the wire",
+            seconds=log.ticks.work,
+        ),
+        TimedPart(
+            name="policy step late",
+            meaning="from a step's deadline to its begin",
+            seconds=log.steps.lateness[live],
+        ),
+        TimedPart(
+            name="inference",
+            meaning="observation built and network run",
+            seconds=log.steps.decision[live],
+        ),
+    ]
+    return [part for part in parts if np.isfinite(part.seconds).any()]

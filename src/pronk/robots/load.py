@@ -23,6 +23,7 @@ from msgspec import Meta
 
 from pronk.errors import RobotError
 from pronk.files import converted, read_yaml
+from pronk.robots.limits import OperatingLimits
 from pronk.robots.model import set_inertia
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
@@ -132,6 +133,34 @@ class AboutEntry(_Entry, frozen=True):
     """Name of the training task with mjlab."""
 
 
+class LimitsEntry(_Entry, frozen=True):
+    """Limits of commands and measurements, as `pronk.robots.limits.OperatingLimits` has them."""
+
+    stiffness: _Positive = OperatingLimits.stiffness
+    damping: _Positive = OperatingLimits.damping
+    margin: _Positive = OperatingLimits.margin
+    horizon_s: _Positive = OperatingLimits.horizon_s
+    change: _Positive = OperatingLimits.change
+    power_w: _Positive = OperatingLimits.power_w
+    overrun: _Positive = OperatingLimits.overrun
+    tilt: _Positive = OperatingLimits.tilt
+    temperature: _Positive = OperatingLimits.temperature
+
+    def limits(self) -> OperatingLimits:
+        """Return the limits of the robot."""
+        return OperatingLimits(
+            stiffness=self.stiffness,
+            damping=self.damping,
+            margin=self.margin,
+            horizon_s=self.horizon_s,
+            change=self.change,
+            power_w=self.power_w,
+            overrun=self.overrun,
+            tilt=self.tilt,
+            temperature=self.temperature,
+        )
+
+
 class RobotFile(_Entry, frozen=True):
     """Content of a `robot.yaml`."""
 
@@ -151,6 +180,7 @@ class RobotFile(_Entry, frozen=True):
     grid_stiffness: _Band = (13.0, 27.0)
     grid_damping: _Band = (0.1, 0.7)
     about: AboutEntry = AboutEntry()
+    limits: LimitsEntry = LimitsEntry()
 
 
 @dataclass(frozen=True)
@@ -233,6 +263,7 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
         build_spec=build,
         base_body=base,
         **{name: getattr(file, name) for name in copied},
+        limits=file.limits.limits(),
     )
     _verify_mirrors(robot, model, source)
     return robot

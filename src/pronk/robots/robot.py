@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pronk.errors import RobotError
 from pronk.names import check_names
 from pronk.robots.drive_law import EXPLICIT, DriveLaw
+from pronk.robots.limits import OperatingLimits
 
 if TYPE_CHECKING:
     import mujoco
@@ -140,6 +141,8 @@ class RobotSpec:
     """Stiffness axis of the grid search [N m/rad] (paper F7)."""
     grid_damping: tuple[float, float] = (0.1, 0.7)
     """Damping axis of the grid search [N m s/rad] (paper F7)."""
+    limits: OperatingLimits = field(default_factory=OperatingLimits)
+    """Limits of its commands and measurements, for the safety filter of a deployment."""
 
     def __post_init__(self) -> None:
         """Check that names are unique and every reference resolves."""

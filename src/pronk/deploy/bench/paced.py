@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pronk.deploy.links.realtime import sleep_until
-from pronk.errors import HardwareError
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import load_sim_params
-from pronk.robots.machine import Command, Machine, State, TorqueKind
+from pronk.robots.machine import Command, State, TorqueKind
 from pronk.robots.robot import RobotSpec
 
 CAPTURE_RATE_HZ = 1000.0
@@ -20,7 +19,7 @@ CAPTURE_RATE_HZ = 1000.0
 
 
 class PacedRobot:
-    """A virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
+    """A virtual robot in real time, on CLOCK_MONOTONIC. Implements `TrajectoryMachine`.
 
     `wait` runs the physics to the given time and then sleeps until it comes: nothing can be sent in
     between, and the physics does not delay the loop.
@@ -71,6 +70,19 @@ class PacedRobot:
         """Damp and close; closing twice does no harm."""
         self.inner.close()
 
+    def keep_trajectory(self) -> None:
+        """Keep the trajectory from the connection on, as cameras around the robot would see it."""
+        self.inner.capture_rate_hz = CAPTURE_RATE_HZ
+
+    def save_trajectory(self, path: Path) -> None:
+        """Write the trajectory, an .npz of `pronk.jump.virtual.capture`.
+
+        Raises:
+            OSError: The file cannot be written.
+            PronkError: Nothing was captured.
+        """
+        capture.save(path, self.inner.capture())
+
     def _shifted(self, state: State) -> State:
         """Return a state with its time on CLOCK_MONOTONIC."""
         return replace(state, time=state.time + self._offset)
@@ -96,30 +108,3 @@ def open_sim(
     base: Any = interface or "ground"
     sim_params = load_sim_params(params, robot)
     return PacedRobot(VirtualRobot(robot, sim_params, seed=seed, base=base, capture_rate_hz=None))
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureRecorder:
-    """Records the trajectory of the virtual robot into a file. Implements `MachineRecorder`."""
-
-    path: Path
-    """File of the capture, .npz."""
-
-    def prepare(self, machine: Machine) -> None:
-        """Have a machine keep its trajectory from its connection on; HardwareError if it cannot."""
-        if not isinstance(machine, PacedRobot):
-            raise HardwareError(
-                f"the trajectory of {machine.robot} cannot be recorded; only the virtual robot in "
-                "this program (--link sim) keeps one."
-            )
-        machine.inner.capture_rate_hz = CAPTURE_RATE_HZ
-
-    def save(self, machine: Machine) -> None:
-        """Write the trajectory.
-
-        Raises:
-            OSError: The file cannot be written.
-            PronkError: Nothing was captured.
-        """
-        if isinstance(machine, PacedRobot):
-            capture.save(self.path, machine.inner.capture())

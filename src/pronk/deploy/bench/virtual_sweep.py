@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pronk.deploy.runtime.sweep import SweepTask, record
+from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.identify.excitation.plan import SweepPlan
 from pronk.jump.virtual.plant import leg_of, legs_of
 from pronk.jump.virtual.robot import VirtualRobot
@@ -44,4 +45,4 @@ def sweep_virtual(
 
 def _sweep_limb(job: tuple[SweepTask, SimParams, str, int]) -> list[Path]:
     task, sim_params, limb, seed = job
-    return record(VirtualRobot(task.plan.robot, sim_params, seed=seed, legs=(limb,)), task)
+    return record_sweep(VirtualRobot(task.plan.robot, sim_params, seed=seed, legs=(limb,)), task)

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.link import ClampOperator, Freshness
 from pronk.deploy.links.realtime import Wanted
-from pronk.deploy.runtime.safety import Limits
-from pronk.deploy.runtime.state_machine import Timing
+from pronk.deploy.runtime.limits import AgeLimits, Limits
+from pronk.deploy.runtime.poses import RunTiming
 from pronk.deploy.runtime.sweep import STALE_S, SweepTask
 from pronk.errors import HardwareError
 from pronk.robots import load_robot
 from pronk.robots.machine import Machine, TorqueKind
 from pronk.robots.robot import RobotSpec
 
-SERVO_PRIORITY, STANDBY_PRIORITY, POLICY_PRIORITY = 60, 55, 50
-"""Of SCHED_FIFO: the servo first, all below the kernel's own threads at 99."""
+# Priorities of SCHED_FIFO: the servo first, all below the kernel's own threads at 99.
+SERVO_PRIORITY = 60
+STANDBY_PRIORITY = 55
+POLICY_PRIORITY = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +28,11 @@ class Link:
     """A robot at an address. It is pickled and sent to the servo's process."""
 
     robot: str
+    """Name or path of the robot."""
     address: Address = field(default_factory=Address)
+    """Address of the machine."""
     release: bool = False
-    """Disable the robot's own controller first."""
+    """Whether the robot's own controller is disabled first."""
     fresh: Freshness | None = None
     """How fresh states must be at first; the usual if None."""
 
@@ -49,66 +52,87 @@ class Link:
         return str(self.address)
 
 
-class MachineRecorder(Protocol):
-    """Recorder of what a machine does besides its states; whoever makes the plan hands it in."""
+@runtime_checkable
+class TrajectoryMachine(Machine, Protocol):
+    """A machine that can record its own trajectory besides its states, as the virtual robot can."""
 
-    def prepare(self, machine: Machine) -> None:
-        """Have a machine that is not connected yet keep what is recorded."""
+    def keep_trajectory(self) -> None:
+        """Keep the trajectory from the connection on."""
 
-    def save(self, machine: Machine) -> None:
-        """Write what was recorded, once the run is over; an OSError or PronkError is reported."""
+    def save_trajectory(self, path: Path) -> None:
+        """Write the trajectory; an OSError or PronkError if that is not possible."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class RunPlan:
     """One run: a policy or a sweep on a machine."""
 
     link: Link
+    """Robot of the run."""
     policy: Path | None = None
+    """The policy, policy.onnx; None for a sweep."""
     sweep: SweepTask | None = None
-    """Instead of a policy."""
+    """The sweep; None for a policy."""
     log: Path | None = None
-    """MCAP file; None for no log."""
-    recorder: MachineRecorder | None = None
-    """Recorder of the machine's trajectory; None for none."""
-    limits: Mapping[str, float] = field(default_factory=dict)
-    """Other values for the scalar fields of `Limits`."""
-    timing: Timing = field(default_factory=Timing)
+    """File of a policy's log, MCAP; None for no log."""
+    trajectory: Path | None = None
+    """File of the machine's trajectory, written at the end; None for none."""
+    tilt: float | None = None
+    """Largest angle of the trunk from the vertical [rad]; None for that of the robot's file."""
+    ages: AgeLimits | None = None
+    """How old states and commands may be; None for the usual."""
+    timing: RunTiming = field(default_factory=RunTiming)
+    """Times of standing up, starting the policy and sitting down."""
     servo_rate_hz: float = 500.0
+    """Ticks of the servo per second [Hz]."""
     action_valid_s: float = 0.05
-    """How long an action of the policy is repeated: two and a half steps [s]."""
+    """Time for which an action of the policy is repeated: two and a half steps [s]."""
     operator_timeout_s: float = 0.3
-    """How long the operator's program may be silent [s]."""
+    """Time for which the operator's program may be silent [s]."""
     standby_s: float = 0.04
     """Silence of the servo after which the standby process damps the joints [s]."""
     ignore_latency: bool = False
-    """Start the policy even if the measured latency exceeds its training range."""
+    """Whether the policy starts even if the measured latency exceeds its training range."""
     real_time: bool = True
-    """Request real-time scheduling, a core and locked memory."""
+    """Whether real-time scheduling, a core and locked memory are requested."""
 
     def __post_init__(self) -> None:
+        """Refuse a plan without a task, and times that are not positive."""
         if (self.policy is None) == (self.sweep is None):
             raise HardwareError("a run needs either a policy or a sweep.")
-        for name in ("servo_rate_hz", "action_valid_s", "operator_timeout_s", "standby_s"):
-            if not getattr(self, name) > 0.0:
-                raise HardwareError(f"Plan.{name} is {getattr(self, name)}; it must be positive.")
+        numbers = {
+            "servo_rate_hz": self.servo_rate_hz,
+            "action_valid_s": self.action_valid_s,
+            "operator_timeout_s": self.operator_timeout_s,
+            "standby_s": self.standby_s,
+        }
+        for name, number in numbers.items():
+            if not number > 0.0:
+                raise HardwareError(f"RunPlan.{name} is {number}; it must be positive.")
 
     @property
     def robot(self) -> RobotSpec:
         """The robot of the link."""
-        return load_robot(self.link.robot) if self.sweep is None else self.sweep.plan.robot
-
-    def safety(self, torque_kind: TorqueKind = "absent") -> Limits:
-        """The limits of the safety filter, for a machine with such torques."""
         if self.sweep is not None:
-            return self.sweep.limits(torque_kind, **self.limits)
-        return Limits.of(self.robot, **self.limits)
+            return self.sweep.plan.robot
+        return load_robot(self.link.robot)
+
+    def limits(self, torque_kind: TorqueKind = "absent") -> Limits:
+        """Return the limits of the safety filter, for a machine with such torques."""
+        limits = Limits.of(self.robot)
+        if self.sweep is not None:
+            limits = self.sweep.limits(torque_kind)
+        if self.tilt is not None:
+            limits = replace(limits, operating=replace(limits.operating, tilt=self.tilt))
+        if self.ages is not None:
+            limits = replace(limits, ages=self.ages)
+        return limits
 
     @property
     def silence_s(self) -> float:
-        """Silence of the servo that is a fault; in a sweep that of the states, which is longer."""
+        """Silence of the servo that is a fault [s]; in a sweep that of the states, if longer."""
         return self.standby_s if self.sweep is None else max(self.standby_s, STALE_S)
 
     def wanted(self, priority: int, core: int) -> Wanted:
-        """What a process requests of the operating system."""
+        """Return what a process requests of the operating system."""
         return Wanted(priority=priority, core=core) if self.real_time else Wanted(lock=False)

@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
-from pronk.deploy.runtime.ipc import ACTIONS, STEP, Shared, event, fill, get_state, serve
-from pronk.deploy.runtime.modes import Mode
-from pronk.deploy.runtime.plan import POLICY_PRIORITY, Plan
+from pronk.deploy.runtime.memory import Shared
+from pronk.deploy.runtime.modes import POLICY_MODES, Mode
+from pronk.deploy.runtime.plan import POLICY_PRIORITY, RunPlan
+from pronk.deploy.runtime.process_body import run_to_end
+from pronk.deploy.runtime.records import ACTIONS, STEP, event_record, get_state
 from pronk.errors import PronkError
 from pronk.policy.contract import Contract, check
 from pronk.policy.observation import History
@@ -39,48 +41,64 @@ LEAD_S = 2e-3
 _FIRST_S = 1e-3
 """Time allowed for the first warm-up step [s]."""
 _SHARE = 0.5
-"""Time allowed for the next, as a share of what the last one took."""
+"""Time allowed for the next step, as a share of what the one before took."""
 _SPIN_S = 0.2e-3
-"""Shorter waits are spun; a sleep ends up to so much late [s]."""
+"""Longest wait that is spun; a sleep ends up to so much late [s]."""
 _PHASE_S = 0.4e-3
-"""After the servo's tick, when its state is there: nothing waits for the next tick [s]."""
-_LIVE = (Mode.POLICY, Mode.HALT)
+"""Time of a step after the servo's tick, when its state is there: nothing waits for the next tick
+[s]."""
 
 
 def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
     """Wait for a deadline, and repeat something in the last 2 ms before it.
 
     Nothing is begun in less than half of the time that it took before, because each repeat is
-    quicker than the one before. `deadline` is a time of CLOCK_MONOTONIC [s]; returns the number of
-    repeats.
+    quicker than the one before.
+
+    Args:
+        deadline: Time of CLOCK_MONOTONIC [s].
+        act: What is repeated.
+
+    Returns:
+        The number of repeats.
     """
     sleep_until(deadline - LEAD_S)
-    count, needed, now = 0, _FIRST_S, time.monotonic()
-    while now + needed < deadline:
+    repeats = 0
+    needed_s = _FIRST_S
+    now = time.monotonic()
+    while now + needed_s < deadline:
         act()
-        count += 1
+        repeats += 1
         done = time.monotonic()
-        needed, now = _SHARE * (done - now), done
+        needed_s = _SHARE * (done - now)
+        now = done
     sleep_until(deadline - _SPIN_S)
     while time.monotonic() < deadline:
         pass
-    return count
+    return repeats
 
 
-def serve_policy(plan: Plan, name: str, end: Connection) -> None:
-    """Body of the policy's process."""
+def serve_policy(plan: RunPlan, name: str, end: Connection) -> None:
+    """Run the policy's process.
+
+    Args:
+        plan: Plan of the run.
+        name: Name of the shared memory.
+        end: Pipe to the operator's process.
+    """
     leave()
     die_with_parent()
     assert plan.policy is not None
     shared = Shared(name, len(plan.robot.joints))
     process = PolicyProcess(plan, shared, load_policy(plan.policy))
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
-        shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
-    serve(process, shared, end)
+        notice = event_record(time.monotonic(), "system", f"policy: {line}")
+        shared.policy_events.put(notice)
+    run_to_end(process, shared, end)
 
 
 def standing(contract: Contract) -> State:
-    """The state of a robot that stands in its default pose."""
+    """Return the state of a robot that stands in its default pose."""
     count = len(contract.joint_names)
     return State(
         time=0.0,
@@ -97,28 +115,33 @@ def standing(contract: Contract) -> State:
 class PolicyProcess:
     """The loop and its figures."""
 
-    def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
+    def __init__(self, plan: RunPlan, shared: Shared, policy: Policy) -> None:
         """Warm the network up.
 
         Raises:
             ArtefactError: The policy is not for this robot, or its output is not finite.
         """
+        contract = policy.contract
+        check(contract, plan.robot)
         self.plan = plan
         self.shared = shared
-        check(policy.contract, plan.robot)
         self.policy = policy
-        self.rate_hz = policy.contract.policy_rate_hz
+        self.rate_hz = contract.policy_rate_hz
         self.lateness = Histogram()
+        """Lateness of steps [s]."""
         self.decision = Histogram()
-        """Observation built and network run."""
+        """Times in which the observation was built and the network run [s]."""
         self.network = Histogram()
-        """The network alone."""
+        """Times of the network alone [s]."""
         self._stand_in = policy.sibling()
-        self._standing = measurement(standing(policy.contract))
-        self._history = History(policy.contract.default_position)
-        self._jumps = policy.contract.jump
-        self._least, self._most = zip(*policy.contract.command_ranges.values(), strict=True)
+        self._standing = measurement(standing(contract))
+        self._history = History(contract.default_position)
+        self._jumps = contract.jump
+        ranges = contract.command_ranges.values()
+        self._lowest_command = [low for low, _ in ranges]
+        self._highest_command = [high for _, high in ranges]
         self._pace: Pace | None = None
+        """Pace of the steps, once the servo has written a state."""
         self._entry = -1
         self._mode = Mode.IDLE
         self._stopping = False
@@ -127,6 +150,7 @@ class PolicyProcess:
         self._action = np.zeros((), dtype=ACTIONS)
         self._step = np.zeros((), dtype=STEP)
         self._count = 0
+        """Actions given."""
         for _ in range(WARM_UP):
             self.warm_up()
 
@@ -157,11 +181,10 @@ class PolicyProcess:
         self._stand_in.step(self._standing, STILL)
 
     def figures(self) -> dict[str, Any]:
-        """Of the run so far."""
-        pace = self._pace
+        """Return the figures of the run since it started."""
         return {
             "steps": self.decision.count,
-            "missed_steps": 0 if pace is None else pace.missed,
+            "missed_steps": 0 if self._pace is None else self._pace.missed,
             "lateness": self.lateness.figures(),
             "decision": self.decision.figures(),
             "network": self.network.figures(),
@@ -169,12 +192,15 @@ class PolicyProcess:
 
     def step(self, pace: Pace) -> None:
         """Compute an action from the newest state."""
-        begun, deadline = time.monotonic(), pace.deadline
+        begun = time.monotonic()
+        deadline = pace.deadline
         self.lateness.add(begun - deadline)
         record = self.shared.state.read()
         if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
-            mode, entry = Mode(int(record["mode"])), int(record["entry"])
-            if entry != self._entry and not (mode is Mode.HALT and self._mode is Mode.POLICY):
+            mode = Mode(int(record["mode"]))
+            entry = int(record["entry"])
+            keeps_history = mode is Mode.HALT and self._mode is Mode.POLICY
+            if entry != self._entry and not keeps_history:
                 self.policy.reset()
                 self._history.reset()
                 self._entry = entry
@@ -185,23 +211,29 @@ class PolicyProcess:
                 # Without an action the last one expires in the servo's filter.
                 if str(error) != self._last_error:
                     self._last_error = str(error)
-                    notice = event(time.monotonic(), "policy", self._last_error)
+                    notice = event_record(time.monotonic(), "policy", self._last_error)
                     self.shared.policy_events.put(notice)
         pace.advance(time.monotonic())
 
     def _act(self, record: np.void, deadline: float, begun: float) -> None:
+        """Send the action of a state record, then log the step."""
         state = get_state(record)
         velocity, jump = self._commanded()
-        now = time.monotonic()
+        observed = time.monotonic()
         target = self.policy.step(measurement(state), velocity, jump)
         inferred = time.monotonic()
-        self.decision.add(inferred - now)
+        self.decision.add(inferred - observed)
         self.network.add(self.policy.network_s)
         outputs = self.policy.inference
         assert outputs is not None
-        action, of = self._action, {"state_sequence": state.sequence, "state_time": state.time}
-        fill(action, **of, sequence=self._count, entry=self._entry, position=target)
-        fill(action, made=begun, valid_for=self.plan.action_valid_s)
+        action = self._action
+        action["sequence"] = self._count
+        action["state_sequence"] = state.sequence
+        action["state_time"] = state.time
+        action["entry"] = self._entry
+        action["position"] = target
+        action["made"] = begun
+        action["valid_for"] = self.plan.action_valid_s
         self.shared.actions.write(action)
         done = time.monotonic()
         self._count += 1
@@ -209,18 +241,30 @@ class PolicyProcess:
         observation = self._history.observe(measurement(state), velocity)
         self._history.acted(outputs.action[0])
         step = self._step
-        fill(step, **of, sequence=action["sequence"], observation=observation)
-        fill(step, deadline=deadline, begun=begun, observed=now, inferred=inferred, done=done)
-        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, target=target)
-        for name in ("action", "contact", "linear_velocity"):
-            step[name] = getattr(outputs, name)[0]
+        step["sequence"] = action["sequence"]
+        step["state_sequence"] = state.sequence
+        step["state_time"] = state.time
+        step["live"] = self._mode in POLICY_MODES
+        step["deadline"] = deadline
+        step["begun"] = begun
+        step["observed"] = observed
+        step["inferred"] = inferred
+        step["done"] = done
+        step["command"] = velocity
+        step["jump"] = jump
+        step["target"] = target
+        step["observation"] = observation
+        step["action"] = outputs.action[0]
+        step["contact"] = outputs.contact[0]
+        step["linear_velocity"] = outputs.linear_velocity[0]
         self.shared.steps.put(step)
         self._last_error = ""
 
     def _commanded(self) -> Commanded:
-        """The operator's command within the ranges of training; zero unless the policy is live."""
+        """Return the operator's command within the ranges of training; zero unless it is live."""
         record = self.shared.operator.read()
         if record is None or self._mode is not Mode.POLICY:
             return STILL, False
-        forward, left, yaw = np.clip(record["command"], self._least, self._most).tolist()
+        command = np.clip(record["command"], self._lowest_command, self._highest_command)
+        forward, left, yaw = command.tolist()
         return (forward, left, yaw), bool(record["jump"]) and self._jumps

@@ -11,7 +11,8 @@ from itertools import chain
 
 import numpy as np
 
-from pronk.deploy.runtime.safety import Limits, tilt
+from pronk.deploy.runtime.limits import Limits
+from pronk.deploy.runtime.rules import tilt
 from pronk.policy.rollout import projected_gravity
 from pronk.robots.machine import State
 from pronk.robots.robot import RobotSpec
@@ -25,8 +26,6 @@ ATTITUDE_SLACK = 0.2
 """Between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
 """Of the attitude's quaternion."""
-OVERRUN = Limits.overrun
-"""Farthest that a joint may rest beyond its range; also of a sweep, whose own limit is tighter."""
 REST_SPEED = 1.0
 """Fastest that a joint of a robot at rest may turn [rad/s]."""
 BATTERY_SHARE = 0.85
@@ -67,12 +66,12 @@ def _stream(
             "many, use a cable or another interface."
         )
     age = now - states[-1].time
-    if age > limits.hold_s:
+    if age > limits.ages.hold_s:
         yield (
-            f"the newest state is {1e3 * age:.0f} ms old, expected {1e3 * limits.hold_s:.0f} at "
-            "most; the stream has stopped or is queued somewhere."
+            f"the newest state is {1e3 * age:.0f} ms old, expected at most "
+            f"{1e3 * limits.ages.hold_s:.0f}; the stream has stopped or is queued somewhere."
         )
-    if age < -limits.future_s:
+    if age < -limits.ages.future_s:
         yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; correct the link's clock."
     measured = np.array([np.concatenate((state.position, state.gyro)) for state in states])
     if seconds >= 0.1 and len(states) > 10 and (measured == measured[0]).all():
@@ -80,7 +79,7 @@ def _stream(
             "no number changed in all states, not even the gyro's noise; the sensors or the "
             "program that reads them have stopped."
         )
-    elif seconds >= 0.1 and len(states) > 10 and np.isfinite(limits.tilt):
+    elif seconds >= 0.1 and len(states) > 10 and limits.trunk_is_free:
         for name in ("gyro", "accelerometer", "orientation"):
             values = np.array([getattr(state, name) for state in states])
             if (values == values[0]).all():
@@ -113,21 +112,23 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
             "and the axes of the attitude."
         )
     lean = tilt(quaternion)
-    if lean > limits.tilt:
+    if lean > limits.operating.tilt:
         yield (
-            f"the trunk is tilted by {lean:.2f} rad, expected {limits.tilt:.2f} at most; put the "
-            "robot on its feet or its belly."
+            f"the trunk is tilted by {lean:.2f} rad, expected at most "
+            f"{limits.operating.tilt:.2f}; put the robot on its feet or its belly."
         )
 
 
 def _joints_and_battery(states: Sequence[State], robot: RobotSpec, limits: Limits) -> Iterator[str]:
     last = states[-1]
+    # Also of a sweep, whose own limit is tighter.
+    overrun = robot.limits.overrun
     for i, joint in enumerate(robot.joints):
         q, v = float(last.position[i]), float(last.velocity[i])
-        if not limits.low[i] - OVERRUN <= q <= limits.high[i] + OVERRUN:
+        if not limits.joints.low[i] - overrun <= q <= limits.joints.high[i] + overrun:
             yield (
-                f"{joint.name} is at {q:.2f} rad, outside {limits.low[i]:.2f} to "
-                f"{limits.high[i]:.2f} rad; zero its encoder."
+                f"{joint.name} is at {q:.2f} rad, outside {limits.joints.low[i]:.2f} to "
+                f"{limits.joints.high[i]:.2f} rad; zero its encoder."
             )
         if not abs(v) <= REST_SPEED:
             yield f"{joint.name} turns at {v:.1f} rad/s; let the robot come to rest first."
@@ -138,10 +139,10 @@ def _joints_and_battery(states: Sequence[State], robot: RobotSpec, limits: Limit
         yield f"the battery gives {volts:.1f} V, expected {least:.1f} V at least; charge it."
     hot = last.temperature
     for joint, degrees in zip(robot.joints, () if hot is None else hot, strict=hot is not None):
-        if degrees > limits.temperature:
+        if degrees > limits.operating.temperature:
             yield (
                 f"the motor of {joint.name} has {degrees:.0f} deg C, expected "
-                f"{limits.temperature:.0f} at most; let it cool."
+                f"{limits.operating.temperature:.0f} at most; let it cool."
             )
 
 

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -18,11 +18,12 @@ import orjson
 
 from pronk.deploy.links.address import SIM
 from pronk.deploy.links.realtime import Interrupts, sleep_until, terminal_blocked
-from pronk.deploy.runtime.ipc import OPERATOR, Event, Shared, fill
 from pronk.deploy.runtime.log import READY, write_log
+from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import SERVO_PRIORITY, Plan
+from pronk.deploy.runtime.plan import SERVO_PRIORITY, RunPlan
 from pronk.deploy.runtime.policy_process import serve_policy
+from pronk.deploy.runtime.records import OPERATOR, Event
 from pronk.deploy.runtime.servo import serve_robot
 from pronk.deploy.runtime.standby import serve_standby
 from pronk.deploy.runtime.teleop import Operator, OperatorCommand
@@ -32,16 +33,16 @@ from pronk.policy.runtime import Policy, load_policy
 from pronk.version import VERSION
 
 _RATE_HZ = 50.0
-"""Of the operator's program."""
+"""Rate of the operator's program [Hz]."""
 _BEAT_S = 0.01
-"""Between two heartbeats of the operator's program [s]."""
+"""Time between two heartbeats of the operator's program [s]."""
 _STALL_S = 0.7
-"""Longest that the operator's program may be late, on a busy computer or at a slow terminal, before
-its heartbeat ends; `Plan.operator_timeout_s` follows [s]."""
+"""Longest time that the operator's program may be late, on a busy computer or at a slow terminal,
+before its heartbeat ends; `RunPlan.operator_timeout_s` follows [s]."""
 _START_S = 30.0
-"""In which the servo must have opened the link."""
+"""Time in which the servo must have opened the link [s]."""
 _END_S = 10.0
-"""In which each process must have ended."""
+"""Time in which each process must have ended [s]."""
 
 _QUIT = OperatorCommand(request=OperatorRequest.QUIT)
 
@@ -51,10 +52,11 @@ class RunSummary:
     """Figures and events of a run."""
 
     servo: dict[str, Any] = field(default_factory=dict)
-    """Of the servo; empty if it was killed."""
+    """Figures of the servo; empty if it was killed."""
     policy: dict[str, Any] = field(default_factory=dict)
-    """Of the policy's process; empty if it was killed."""
+    """Figures of the policy's process; empty if it was killed."""
     events_seen: list[Event] = field(default_factory=list)
+    """Events of the servo."""
     log_error: str = ""
     """Why the log could not be written to its end."""
     standby: bool = False
@@ -71,24 +73,29 @@ class RunSummary:
 
     @property
     def refusals(self) -> list[str]:
-        """Results of the pre-flight checks and of opening the link."""
+        """Refusals of the pre-flight checks and of opening the link."""
         return [event.text for event in self.events_seen if event.kind == "refused"]
 
     def delay_words(self) -> str:
-        """The measured delay and the range that the policy was trained for, in one line."""
-        low, high = (1e3 * edge for edge in self.trained_delay_s)
+        """Return the measured delay and the range that the policy was trained for, in one line."""
+        low_ms = 1e3 * self.trained_delay_s[0]
+        high_ms = 1e3 * self.trained_delay_s[1]
         measured = self.servo.get("state_to_command", {})
         if not measured.get("n"):
-            return f"no delay was measured; the policy was trained for {low:g} to {high:g} ms."
-        p50, p95 = measured["p50_ms"], measured["p95_ms"]
-        where = "within" if p95 <= high else "BEYOND"
+            return (
+                f"no delay was measured; the policy was trained for {low_ms:g} to {high_ms:g} ms."
+            )
+        median_ms = measured["p50_ms"]
+        late_ms = measured["p95_ms"]
+        verdict = "within" if late_ms <= high_ms else "BEYOND"
         return (
-            f"state to command {p50:.1f} ms (median), {p95:.1f} ms (95 %), n = {measured['n']}: "
-            f"{where} the {low:g} to {high:g} ms trained for; the drives' own delay comes on top."
+            f"state to command {median_ms:.1f} ms (median), {late_ms:.1f} ms (95 %), n = "
+            f"{measured['n']}: {verdict} the {low_ms:g} to {high_ms:g} ms trained for; the drives' "
+            "own delay comes on top."
         )
 
     def figures(self) -> dict[str, Any]:
-        """For JSON and the end of the log."""
+        """Return the figures for JSON and the end of the log."""
         return {
             "servo": self.servo,
             "policy": self.policy,
@@ -104,14 +111,14 @@ class RunSummary:
 class Deployment:
     """Runs the processes of a plan. A context manager; leaving it damps, then ends them all."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: RunPlan) -> None:
         """Check what can be checked before any process starts.
 
         Raises:
             ArtefactError: The policy cannot be read, or is not for this robot.
             PronkError: ONNX Runtime is not installed.
         """
-        plan.safety()
+        plan.limits()
         self.plan = plan
         self.summary = RunSummary()
         self._header: dict[str, Any] = {}
@@ -119,18 +126,20 @@ class Deployment:
             policy = load_policy(plan.policy)
             check(policy.contract, plan.robot)
             self.summary.trained_delay_s = policy.contract.delay_range_s
-            self._header = _header(plan, policy)
+            self._header = log_header(plan, policy)
         if plan.sweep is not None:
             plan.sweep.check()
         self.servo: BaseProcess
         self.policy: BaseProcess | None = None
         self.logger: BaseProcess | None = None
         self.standby: BaseProcess | None = None
-        """Of a robot behind a network."""
+        """Standby process of a robot behind a network."""
         self._ends: dict[BaseProcess, Connection] = {}
         """This end of the pipe to each process."""
         self._record = np.zeros((), dtype=OPERATOR)
-        self._written, self._beating = threading.Event(), False
+        """Newest command of the operator."""
+        self._written = threading.Event()
+        self._beating = False
         self._heart = threading.Thread(target=self._beat, name="pronk heartbeat", daemon=True)
         self._open = False
         self._interrupts = Interrupts()
@@ -155,17 +164,17 @@ class Deployment:
         self._open = True
         try:
             with terminal_blocked():
-                for started in (self.policy, self.logger, self.standby):
-                    if started is not None:
-                        started.start()
+                for process in (self.policy, self.logger, self.standby):
+                    if process is not None:
+                        process.start()
             if self.logger is not None:
                 silent = f"{plan.log}: the process that writes the log did not start."
-                reply = self._first(self.logger, LogError(silent))
+                reply = self._first_message(self.logger, LogError(silent))
                 if reply != READY:
                     raise LogError(reply.decode())
             if self.standby is not None:
                 silent = "the process that damps in place of the servo did not start."
-                self._first(self.standby, HardwareError(silent))
+                self._first_message(self.standby, HardwareError(silent))
             # Last, so that its first tick is logged.
             with terminal_blocked():
                 self.servo.start()
@@ -176,28 +185,42 @@ class Deployment:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close."""
         self.close()
 
-    def _process(self, what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
-        """A process that is not started yet; the pipe's other end is its last argument."""
+    def _process(
+        self, name: str, body: Callable[..., None], argument: object = None
+    ) -> BaseProcess:
+        """Return a process that is not started yet.
+
+        Args:
+            name: Name of the process.
+            body: Called with the plan, the name of the shared memory, `argument` unless it is None,
+                and the other end of the pipe.
+            argument: Further argument of the body.
+        """
         context = get_context("spawn")
-        end, other = context.Pipe()
-        given = (self.plan, self.shared.name, *given, other)
-        process = context.Process(target=body, args=given, name=f"pronk {what}")
+        end, other_end = context.Pipe()
+        arguments: list[object] = [self.plan, self.shared.name]
+        if argument is not None:
+            arguments.append(argument)
+        arguments.append(other_end)
+        process = context.Process(target=body, args=tuple(arguments), name=f"pronk {name}")
         self._ends[process] = end
         return process
 
     @property
     def mode(self) -> Mode:
         """Mode of the servo; `ENDED` too if its process is gone or the standby took over."""
-        gone = not self.servo.is_alive() or self.shared.standby.written > 0
-        return Mode.ENDED if gone else self.shared.mode or Mode.IDLE
+        if not self.servo.is_alive() or self.shared.standby.written > 0:
+            return Mode.ENDED
+        return self.shared.mode or Mode.IDLE
 
     def events_seen(self) -> list[Event]:
-        """Events of the servo since the last call; the summary keeps them too."""
-        found = [Event.of(record) for record in self.shared.events_seen.take()]
-        self.summary.events_seen += found
-        return found
+        """Return events of the servo since the last call; the summary keeps them too."""
+        events = [Event.of(record) for record in self.shared.events_seen.take()]
+        self.summary.events_seen += events
+        return events
 
     def write(self, command: OperatorCommand) -> None:
         """Send the operator's command to servo and policy; call it at about 50 Hz.
@@ -211,20 +234,23 @@ class Deployment:
         if command.request is not OperatorRequest.NONE:
             record["request"] = command.request
             record["requests"] += 1
-        fill(record, time=time.monotonic(), held=command.held, jump=command.jump)
+        record["time"] = time.monotonic()
+        record["held"] = command.held
+        record["jump"] = command.jump
         record["command"] = command.command
         # Replaced as a whole; the heartbeat alone writes to the mailbox.
         self._record = record
         self._written.set()
 
     def _beat(self) -> None:
-        """Body of a thread: write the newest command with the time, as promptly as the servo."""
+        """Write the newest command with the time, as promptly as the servo; runs in a thread."""
         if self.plan.real_time:
             with suppress(AttributeError, OSError):  # of this thread alone
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVO_PRIORITY))
         while self._beating:
             self._written.clear()
-            record, now = self._record.copy(), time.monotonic()
+            record = self._record.copy()
+            now = time.monotonic()
             if now - float(record["time"]) <= _STALL_S:
                 record["time"] = now
                 self.shared.operator.write(record)
@@ -233,27 +259,37 @@ class Deployment:
     def run(
         self,
         operator: Operator,
-        notify: Callable[[Event], None] = lambda event: None,
-        progress: Callable[[float], None] = lambda share: None,
+        notify: Callable[[Event], None] | None = None,
+        progress: Callable[[float], None] | None = None,
     ) -> RunSummary:
         """Send the operator's commands until the servo ends.
 
-        `progress` gets the share of a sweep that is done, 0 to 1.
+        Args:
+            operator: Gives the commands.
+            notify: Called with each event of the servo.
+            progress: Called with the share of a sweep that is done, 0 to 1.
+
+        Returns:
+            The summary, whose figures come when the run is closed.
         """
         wake = time.monotonic()
         while True:
             mode = self.mode
             for event in self.events_seen():
                 operator.notified(event.kind, event.text)
-                notify(event)
+                if notify is not None:
+                    notify(event)
             if mode is Mode.ENDED:
                 return self.summary
-            record = self.shared.state.read()
-            progress(0.0 if record is None else float(record["progress"]))
+            if progress is not None:
+                record = self.shared.state.read()
+                progress(0.0 if record is None else float(record["progress"]))
             try:
                 command = operator.command(time.monotonic(), mode)
-                logging = self.logger is not None and self.logger.is_alive()
-                self.write(command if logging or self.plan.sweep is None else _QUIT)
+                is_logging = self.logger is not None and self.logger.is_alive()
+                if self.plan.sweep is not None and not is_logging:
+                    command = _QUIT
+                self.write(command)
             except KeyboardInterrupt:
                 self.summary.interrupted = True
                 self.write(_QUIT)
@@ -305,17 +341,21 @@ class Deployment:
             self.servo.join(_END_S)
 
     def _figures(self, process: BaseProcess | None) -> dict[str, Any]:
-        """What a process sent when it ended; {} if it was killed."""
+        """Return what a process sent when it ended; {} if it was killed."""
         if process is None:
             return {}
         end = self._ends[process]
         try:
-            return dict(orjson.loads(end.recv_bytes())) if end.poll(1.0) else {}
+            if end.poll(1.0):
+                return dict(orjson.loads(end.recv_bytes()))
         except (EOFError, OSError):
-            return {}
+            pass
+        return {}
 
     def _stop_logger(self, logger: BaseProcess) -> None:
-        summary, end = self.summary, self._ends[logger]
+        """Have the logger finish its log; note in the summary what it lacks."""
+        summary = self.summary
+        end = self._ends[logger]
         figures = summary.figures()
         if not summary.servo:
             figures["reason"] = "the servo's process was killed"
@@ -335,13 +375,14 @@ class Deployment:
         if dropped and not summary.log_error:
             summary.log_error = f"the log lacks {dropped} records: its process was too slow"
         elif summary.log_error and self.plan.log is not None and self.plan.log.exists():
-            lacking = ended - self.plan.log.stat().st_mtime
-            where = f"{self.plan.log} ends {max(lacking, 0.0):.1f} s before the run"
-            summary.log_error = f"{summary.log_error.rstrip('.')}; {where}"
+            lacking_s = max(ended - self.plan.log.stat().st_mtime, 0.0)
+            extent = f"{self.plan.log} ends {lacking_s:.1f} s before the run"
+            summary.log_error = f"{summary.log_error.rstrip('.')}; {extent}"
 
-    def _first(self, process: BaseProcess, silent: PronkError) -> bytes:
-        """The first message of a process; raises `silent` if none comes."""
-        end, until = self._ends[process], time.monotonic() + _START_S
+    def _first_message(self, process: BaseProcess, silent: PronkError) -> bytes:
+        """Return the first message of a process; raise `silent` if none comes."""
+        end = self._ends[process]
+        until = time.monotonic() + _START_S
         while not end.poll(0.05):
             self.write(OperatorCommand())
             if process.exitcode is not None or time.monotonic() > until:
@@ -349,53 +390,72 @@ class Deployment:
         return end.recv_bytes()
 
     def _await_servo(self) -> None:
+        """Wait until the servo has opened the link."""
         until = time.monotonic() + _START_S
         while self.shared.state.written == 0:
             self.write(OperatorCommand())
             self.servo.join(0.05)
             self.events_seen()
             if self.servo.exitcode is not None:
-                why = " ".join(self.summary.refusals) or "its process ended without an error."
-                raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
+                reason = " ".join(self.summary.refusals) or "its process ended without an error."
+                raise HardwareError(f"the link {self.plan.link.robot} was not opened: {reason}")
             if time.monotonic() > until:
                 raise HardwareError(
                     f"the link was not open after {_START_S:.0f} s; check the robot and the cable."
                 )
 
 
-def run(
-    plan: Plan,
+def run_plan(
+    plan: RunPlan,
     operator: Operator,
-    notify: Callable[[Event], None],
-    progress: Callable[[float], None] = lambda share: None,
+    notify: Callable[[Event], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> RunSummary:
-    """Run a plan from beginning to end; HardwareError if it could not start."""
+    """Run a plan from beginning to end.
+
+    Args:
+        plan: The plan.
+        operator: Gives the operator's commands.
+        notify: Called with each event of the servo.
+        progress: Called with the share of a sweep that is done, 0 to 1.
+
+    Returns:
+        Figures and events of the run.
+
+    Raises:
+        HardwareError: It could not start, or the servo's process was killed.
+    """
     with Deployment(plan) as deployment:
         summary = deployment.run(operator, notify, progress)
     if not summary.servo:
         damped = (
-            "the standby process damped the joints"
-            if summary.standby
-            else "only the robot's own watchdog damps the joints now: secure them before anything "
-            "else"
+            "only the robot's own watchdog damps the joints now: secure them before anything else"
         )
+        if summary.standby:
+            damped = "the standby process damped the joints"
         raise HardwareError(f"the servo's process was killed; {damped}.")
     return summary
 
 
-def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
-    """Of a policy's log."""
+def log_header(plan: RunPlan, policy: Policy) -> dict[str, Any]:
+    """Return the header of a policy's log."""
     import onnxruntime
 
     contract = policy.contract
-    shown = ("gains", "gains_sha256", "delay_range_s", "jump", "virtual")
     return {
         "robot": plan.robot.name,
         "joints": list(plan.robot.joint_names),
         "link": str(plan.link),
-        "policy": {"file": str(plan.policy), "sha256": policy.sha256}
-        | {name: getattr(contract, name) for name in shown},
-        "limits": vars(plan.safety()),
-        "timing": vars(plan.timing),
+        "policy": {
+            "file": str(plan.policy),
+            "sha256": policy.sha256,
+            "gains": contract.gains,
+            "gains_sha256": contract.gains_sha256,
+            "delay_range_s": contract.delay_range_s,
+            "jump": contract.jump,
+            "virtual": contract.virtual,
+        },
+        "limits": asdict(plan.limits()),
+        "timing": asdict(plan.timing),
         "versions": {"pronk": VERSION, "onnxruntime": onnxruntime.__version__},
     }

@@ -20,18 +20,22 @@ from typing import Any
 import numpy as np
 
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
-from pronk.deploy.runtime import ipc
-from pronk.deploy.runtime.ipc import Shared
+from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
-from pronk.deploy.runtime.plan import SERVO_PRIORITY, Plan
+from pronk.deploy.runtime.plan import SERVO_PRIORITY, RunPlan, TrajectoryMachine
 from pronk.deploy.runtime.preflight import delay_objection, refusals
-from pronk.deploy.runtime.safety import (
-    LEAST_DAMPING_S,
-    Decision,
-    FilterAction,
-    Reason,
-    SafetyFilter,
+from pronk.deploy.runtime.process_body import run_to_end
+from pronk.deploy.runtime.reasons import Decision, FilterAction, Reason
+from pronk.deploy.runtime.records import (
+    REAL,
+    TICK,
+    VIRTUAL,
+    Record,
+    event_record,
+    put_state,
+    state_dtype,
 )
+from pronk.deploy.runtime.safety import LEAST_DAMPING_S, SafetyFilter
 from pronk.deploy.runtime.state_machine import PREFLIGHT_S, DesiredCommand, StateMachine
 from pronk.deploy.runtime.sweep import SweepController
 from pronk.errors import HardwareError, PronkError
@@ -39,56 +43,81 @@ from pronk.processes import die_with_parent
 from pronk.robots.machine import Command, Machine, State
 
 _SWITCH_S = 0.5e-3
-"""Longest that a thread of the link keeps the loop waiting [s]."""
+"""Longest time that a thread of the link keeps the loop waiting [s]."""
+_START_S = 0.01
+"""Time from the first state to the first tick [s]."""
 _DECIDING = (Mode.STAND, Mode.POLICY, Mode.HALT)
 """Modes in which the policy's latency is measured; while standing its actions are not used."""
 
 
-def serve_robot(plan: Plan, name: str, trained: tuple[float, float], end: Connection) -> None:
-    """Body of the servo's process.
+def serve_robot(
+    plan: RunPlan, name: str, trained_delay_s: tuple[float, float], end: Connection
+) -> None:
+    """Run the servo's process.
 
-    `trained` are the command delays that the policy was trained for [s].
+    Args:
+        plan: Plan of the run.
+        name: Name of the shared memory.
+        trained_delay_s: Command delays that the policy was trained for [s].
+        end: Pipe to the operator's process.
     """
     leave()  # the operator's process decides
     die_with_parent(signal.SIGTERM)  # damp and end
     shared = Shared(name, len(plan.robot.joints))
-    ipc.serve(Servo(plan, shared, trained), shared, end)
+    run_to_end(Servo(plan, shared, trained_delay_s), shared, end)
 
 
 class Servo:
     """The loop and its figures."""
 
-    def __init__(self, plan: Plan, shared: Shared, trained: tuple[float, float]) -> None:
+    def __init__(self, plan: RunPlan, shared: Shared, trained_delay_s: tuple[float, float]) -> None:
         """Read the plan; nothing is opened yet."""
-        self.plan, self.shared, self.trained = plan, shared, trained
-        self.modes = StateMachine(plan.robot, plan.timing)
-        self.safety = SafetyFilter(limits=plan.safety())
-        self.action: ipc.Record | None = None
-        """The policy's newest, a record of `ACTIONS`."""
+        self.plan = plan
+        self.shared = shared
+        self.trained_delay_s = trained_delay_s
+        self.modes = StateMachine(plan.robot, plan.timing, sweeps=plan.sweep is not None)
+        self.safety = SafetyFilter(limits=plan.limits())
+        self.action: Record | None = None
+        """Newest action of the policy, a record of `ACTIONS`."""
         self.machine: Machine | None = None
-        """Once connected."""
+        """The machine, once connected."""
         self.pace = Pace(plan.servo_rate_hz)
-        self.lateness, self.latency, self.age = Histogram(), Histogram(), Histogram()
-        """Of ticks; from a state to the command computed from it; of the newest state at a tick."""
+        self.lateness = Histogram()
+        """Lateness of ticks [s]."""
+        self.latency = Histogram()
+        """Times from a state to the command computed from it [s]."""
+        self.age = Histogram()
+        """Ages of the newest state at a tick [s]."""
         self.interventions: Counter[str] = Counter()
+        """Ticks in which a target was held or moved, by reason."""
         self.faults: list[str] = []
+        """Faults, one line each."""
         self.refusals: tuple[str, ...] = ()
-        """Of the pre-flight checks."""
-        self.states = self.lost = self.repeated = 0
-        """States received; missing by their numbers; equal to the one before to the last bit."""
-        self._state_record = np.zeros((), dtype=ipc.state_dtype(len(plan.robot.joints)))
-        self._tick_record = np.zeros((), dtype=ipc.TICK)
+        """Refusals of the pre-flight checks."""
+        self.states = 0
+        """States received."""
+        self.lost = 0
+        """States missing by their numbers."""
+        self.repeated = 0
+        """States equal to the one before to the last bit."""
+        self._state_record = np.zeros((), dtype=state_dtype(len(plan.robot.joints)))
+        self._tick_record = np.zeros((), dtype=TICK)
         self._offset = 0.0
+        """CLOCK_MONOTONIC less the machine's clock [s]."""
         self._requests = 0
+        """Requests of the operator that were read."""
         self._state: State | None = None
-        self._met: list[State] = []
+        """Newest state."""
+        self._new_states: list[State] = []
         """States since the last tick."""
         self._preflight_states: list[State] = []
-        self._stopping = self._alone = False
+        self._stopping = False
+        self._alone = False
+        """Whether the operator's program has ended."""
         self._parent = os.getppid()
         self._sweep: SweepController | None = None
-        self._progress = 0.0
         self._finished = False
+        """Whether the sweep came to its end."""
         self._clamped = threading.Event()
 
     def stop(self) -> None:
@@ -99,8 +128,8 @@ class Servo:
         """Open the machine, tick until stopped, damp, close."""
         try:
             machine = self.plan.link(self._clamp)
-            if self.plan.recorder is not None:
-                self.plan.recorder.prepare(machine)
+            if self.plan.trajectory is not None:
+                self._keep_trajectory(machine)
             self._open(machine)
             while not self._over():
                 self._tick(machine)
@@ -112,7 +141,7 @@ class Servo:
                 self._close(self.machine)
 
     def figures(self) -> dict[str, Any]:
-        """Of the run so far."""
+        """Return the figures of the run since it started."""
         return {
             "virtual": None if self.machine is None else self.machine.virtual,
             "ticks": self.lateness.count,
@@ -151,7 +180,7 @@ class Servo:
 
     def _report(self, kind: str, text: str, *, reason: int = 0, level: int = 0) -> None:
         """Send an event to logger and operator."""
-        record = ipc.event(time.monotonic(), kind, text, reason=reason, level=level)
+        record = event_record(time.monotonic(), kind, text, reason=reason, level=level)
         self.shared.events.put(record)
         self.shared.events_seen.put(record)
 
@@ -159,14 +188,18 @@ class Servo:
         """Write the newest state and the mode for the other processes; zeros without a state."""
         record = self._state_record
         if self._state is not None:
-            ipc.put_state(record, self._state)
-        ipc.fill(record, now=now, start=self.pace.start, progress=self._progress)
-        ipc.fill(record, mode=self.modes.mode, entry=self.modes.entry)
+            put_state(record, self._state)
+        record["now"] = now
+        record["start"] = self.pace.start
+        record["progress"] = 0.0 if self._sweep is None else self._sweep.progress
+        record["mode"] = self.modes.mode
+        record["entry"] = self.modes.entry
         self.shared.state.write(record)
 
     # --- the loop ---------------------------------------------------------------------------------
 
     def _open(self, machine: Machine) -> None:
+        """Connect the machine and begin the pre-flight checks."""
         # Before the link starts threads: they inherit the priority, and so never hold the
         # interpreter's lock while something less urgent runs.
         for line in enter(self.plan.wanted(SERVO_PRIORITY, 0)):
@@ -175,13 +208,13 @@ class Servo:
         machine.connect()
         self.machine = machine
         self.safety = SafetyFilter(
-            limits=self.plan.safety(machine.torque_kind), state_rate_hz=machine.state_rate_hz
+            limits=self.plan.limits(machine.torque_kind), state_rate_hz=machine.state_rate_hz
         )
-        self._report("robot", ipc.VIRTUAL if machine.virtual else ipc.REAL)
+        self._report("robot", VIRTUAL if machine.virtual else REAL)
         # The states' clock may be another; everything here is on CLOCK_MONOTONIC.
         self._offset = time.monotonic() - machine.now()
         machine.wait(machine.now())
-        self.pace = Pace(self.plan.servo_rate_hz, time.monotonic() + 0.01)
+        self.pace = Pace(self.plan.servo_rate_hz, time.monotonic() + _START_S)
         self.modes.enter(Mode.PREFLIGHT, self.pace.start)
 
     def _over(self) -> bool:
@@ -196,15 +229,18 @@ class Servo:
         return self.modes.quitting and (self.modes.silent or (damped and long_enough))
 
     def _tick(self, machine: Machine) -> None:
-        deadline, link_error = self.pace.deadline, ""
+        """Wait for the tick's deadline; then take states, decide and send."""
+        deadline = self.pace.deadline
+        link_error = ""
         try:
-            met = machine.wait(deadline - self._offset)
+            states = machine.wait(deadline - self._offset)
         except PronkError as error:
-            met, link_error = [], str(error)
+            states = []
+            link_error = str(error)
             sleep_until(deadline)
         begun = time.monotonic()
         self.lateness.add(begun - deadline)
-        self._take(met)
+        self._take(states)
         if self.modes.mode is Mode.PREFLIGHT:
             self._preflight(machine, begun)
         if self._state is not None:
@@ -215,23 +251,25 @@ class Servo:
             self._publish(begun)
         self.pace.advance(time.monotonic())
 
-    def _take(self, met: list[State]) -> None:
-        """Note the new states of a tick."""
-        self._met = []
-        for each in met:
-            state, before = replace(each, time=each.time + self._offset), self._state
+    def _take(self, states: list[State]) -> None:
+        """Note the new states of a tick, on CLOCK_MONOTONIC."""
+        self._new_states = []
+        for machine_state in states:
+            state = replace(machine_state, time=machine_state.time + self._offset)
+            before = self._state
             if before is not None:
-                if _same(state, before):
+                if _same_measurement(state, before):
                     # Repeated data with new stamps: the last real state must grow old.
                     self.repeated += 1
                     continue
                 self.lost += max(0, state.sequence - before.sequence - 1)
             self._state = state
             self.states += 1
-            self._met.append(state)
+            self._new_states.append(state)
 
     def _preflight(self, machine: Machine, now: float) -> None:
-        self._preflight_states += self._met
+        """Collect states; once there are enough, check them and leave the pre-flight checks."""
+        self._preflight_states += self._new_states
         seconds = now - self.modes.since
         if seconds < PREFLIGHT_S:
             return
@@ -252,30 +290,34 @@ class Servo:
             self._sweep = SweepController(
                 self.plan.sweep,
                 machine,
-                self.safety,
+                self.safety.limits,
                 self.shared.samples.put,
                 state=self._state,
                 start=now,
                 real_time=True,
-                progress=lambda share: setattr(self, "_progress", share),
-                written=lambda name: self._report("log", name),
             )
-            self.modes.sweep = self._excite
         self.modes.preflighted(self.refusals, now)
         self._report("mode", self.modes.mode.name)
 
     def _decide(self, machine: Machine, state: State, begun: float, link_error: str) -> None:
-        """From the states of a tick to what is written to the machine."""
+        """Decide from the newest state what is written to the machine, and write it.
+
+        Args:
+            machine: The machine.
+            state: Newest state.
+            begun: Time at which the tick began [s].
+            link_error: Error of the link in this tick; empty if there was none.
+        """
         self.age.add(max(0.0, begun - state.time))
-        mode, level = self.modes.mode, self.safety.level
+        mode = self.modes.mode
+        level = self.safety.level
         held, gone = self._operator(begun)
-        action, before = self.shared.actions.read(), self.action
-        fresh = action is not None and (before is None or action["sequence"] != before["sequence"])
-        self.action = action if fresh else before
+        fresh = self._read_action()
         # An action may be younger than the begin of a tick that was interrupted.
         now = time.monotonic()
-        damped = self.shared.standby.written > 0
-        if damped:
+
+        standby_damps = self.shared.standby.written > 0
+        if standby_damps:
             # Its commands are another program's to the link.
             self.safety.fault(Reason.STANDBY, begun)
         elif link_error:
@@ -284,25 +326,42 @@ class Servo:
             self.safety.fault(Reason.ENDED, begun)
         objection = ""
         if mode is Mode.STAND and not self.plan.ignore_latency:
-            measured = self.latency.quantile(0.95), self.latency.count
-            objection = delay_objection(*measured, self.trained)
-        desired = self.modes.step(now, state.position, self.safety, self.action, objection)
+            objection = delay_objection(
+                self.latency.quantile(0.95), self.latency.count, self.trained_delay_s
+            )
+
+        self.modes.grant(now, state.position, self.safety, objection)
+        limits = self.safety.limits
+        if self._sweep is not None and self.modes.mode is Mode.SWEEP:
+            desired = self.modes.follow_sweep(now, self._sweep_command(self._sweep, now))
+            limits = self._sweep.limits
+        else:
+            desired = self.modes.desired(now, state.position, self.safety, self.action)
         if self.modes.notice:
             self._report("notice", self.modes.notice)
         self._publish(begun)
-        held = held or self.modes.mode is not Mode.POLICY
+
+        sent: Command | None = None
         if desired.command is None:
-            sent, decision = None, self.safety.damped()
+            decision = self.safety.damped()
         else:
-            states = self._met or [state]
-            sent, decision = self.safety.judge(states, desired.command, now, held=held)
-        why = self._send(machine, sent) or link_error
+            sent, decision = self.safety.judge(
+                self._new_states or [state],
+                desired.command,
+                now,
+                held=held or self.modes.mode is not Mode.POLICY,
+                limits=limits,
+            )
+        send_error = self._send(machine, sent)
         done = time.monotonic()
-        if damped:
-            why = ""
-        elif why:
+
+        fault_text = decision.text if decision.detail else ""
+        if standby_damps:
+            pass  # errors of the link are those of two writers
+        elif send_error or link_error:
             self.safety.fault(Reason.LINK, done)
-        self._act_on_faults(level, begun, why or (decision.detail and decision.text))
+            fault_text = send_error or link_error
+        self._act_on_faults(level, begun, fault_text)
         if self._sweep is not None and mode is Mode.SWEEP:
             if sent is not None:
                 self._sweep.sent(now, sent.position)
@@ -317,20 +376,32 @@ class Servo:
             latency = done - float(self.action["state_time"])
             self.latency.add(max(0.0, latency))
         if self.plan.sweep is None:  # the log of a sweep is of its samples
-            times = {"begun": begun, "done": done, "latency": latency}
-            self._log_tick(state, desired, sent, decision, times)
+            self._tick_record["begun"] = begun
+            self._tick_record["done"] = done
+            self._tick_record["latency"] = latency
+            self._log_tick(state, desired, sent, decision)
 
-    def _act_on_faults(self, level: FilterAction, begun: float, why: str) -> None:
+    def _read_action(self) -> bool:
+        """Read the policy's mailbox; whether the action is a new one."""
+        action = self.shared.actions.read()
+        if action is None:
+            return False
+        if self.action is not None and action["sequence"] == self.action["sequence"]:
+            return False
+        self.action = action
+        return True
+
+    def _act_on_faults(self, level: FilterAction, begun: float, text: str) -> None:
         """Report a fault that is worse than the `level` before the tick, and leave the mode."""
         safety = self.safety
         if safety.faulted:
             if safety.level > level:
-                self.faults.append(why or safety.reason.text)
+                self.faults.append(text or safety.reason.text)
                 self._report("fault", self.faults[-1], reason=safety.reason, level=safety.level)
             self.modes.faulted(begun)
 
     def _send(self, machine: Machine, sent: Command | None) -> str:
-        """Write to the machine; returns the link's error, or ""."""
+        """Write to the machine; return the link's error, or ""."""
         try:
             if sent is not None:
                 machine.send(replace(sent, made=sent.made - self._offset))
@@ -346,23 +417,22 @@ class Servo:
         desired: DesiredCommand,
         sent: Command | None,
         decision: Decision,
-        times: dict[str, float],
     ) -> None:
-        """Put a tick into the logger's queue."""
-        tick, action, wanted = self._tick_record, self.action, desired.command
-        ipc.put_state(tick, state)
-        ipc.fill(tick, **times, tick=self.pace.tick, deadline=self.pace.deadline)
-        ipc.fill(tick, mode=self.modes.mode, level=decision.level, reason=decision.reason)
-        ipc.fill(
-            tick,
-            damped=sent is None and not self.modes.silent,
-            action=-1 if action is None else action["sequence"],
-            action_state=-1 if action is None else action["state_sequence"],
-            blend=desired.blend,
-            stiffness=0.0 if sent is None else desired.stiffness,
-            desired=np.nan if wanted is None else wanted.position,
-            sent=np.nan if sent is None else sent.position,
-        )
+        """Put a tick, of which the times are set, into the logger's queue."""
+        tick = self._tick_record
+        put_state(tick, state)
+        tick["tick"] = self.pace.tick
+        tick["deadline"] = self.pace.deadline
+        tick["mode"] = self.modes.mode
+        tick["level"] = decision.level
+        tick["reason"] = decision.reason
+        tick["damped"] = sent is None and not self.modes.silent
+        tick["action"] = -1 if self.action is None else self.action["sequence"]
+        tick["action_state"] = -1 if self.action is None else self.action["state_sequence"]
+        tick["blend"] = desired.blend
+        tick["stiffness"] = 0.0 if sent is None else desired.stiffness
+        tick["desired"] = np.nan if desired.command is None else desired.command.position
+        tick["sent"] = np.nan if sent is None else sent.position
         self.shared.ticks.put(tick)
 
     def _close(self, machine: Machine) -> None:
@@ -375,41 +445,60 @@ class Servo:
                 while time.monotonic() < until:
                     machine.damp()
                     machine.wait(machine.now() + 1.0 / self.plan.servo_rate_hz)
-            self._save_recording(machine)
+            self._save_trajectory(machine)
         finally:
             machine.close()
             self.modes.enter(Mode.ENDED, time.monotonic())
             self._report("mode", self.modes.mode.name)
             self._publish(time.monotonic())
 
-    def _save_recording(self, machine: Machine) -> None:
-        """Save what the plan's recorder kept; an error is reported, not raised."""
-        if self.plan.recorder is None:
+    def _keep_trajectory(self, machine: Machine) -> None:
+        """Have a machine keep its trajectory; HardwareError if it cannot."""
+        if not isinstance(machine, TrajectoryMachine):
+            raise HardwareError(
+                f"the trajectory of {machine.robot} cannot be recorded over this link; only the "
+                "virtual robot in this program (--link sim) keeps one."
+            )
+        machine.keep_trajectory()
+
+    def _save_trajectory(self, machine: Machine) -> None:
+        """Save the machine's trajectory; an error is reported, not raised."""
+        path = self.plan.trajectory
+        if path is None or not isinstance(machine, TrajectoryMachine):
             return
         try:
-            self.plan.recorder.save(machine)
+            machine.save_trajectory(path)
         except (OSError, PronkError) as error:
             self._report("lost", f"the trajectory was not written: {error}")
 
     # --- a sweep ----------------------------------------------------------------------------------
 
-    def _excite(self, t: float) -> Command | None:
-        """The sweep's command at a tick; None once it is over."""
-        assert self._sweep is not None
+    def _sweep_command(self, sweep: SweepController, t: float) -> Command | None:
+        """Return the sweep's command at a tick; None once it is over."""
         if self.shared.samples.dropped:
             raise HardwareError(
                 "the process that writes the log fell behind; the joints were damped; see that "
                 "the disk is not busy."
             )
-        command = self._sweep.command(t, self._met, slack=0.5 / self.plan.servo_rate_hz)
+        logs = len(sweep.complete)
+        try:
+            command = sweep.command(t, self._new_states, slack=0.5 / self.plan.servo_rate_hz)
+        finally:
+            for path in sweep.complete[logs:]:
+                self._report("log", path.name)
         self._finished = command is None
         return command
 
     def _end_sweep(self) -> None:
         """End a log that is still open, with the reason."""
-        if self._sweep is not None:
-            parent = "the program that started the sweep ended" if self._alone else "interrupted"
-            self._sweep.end(self.faults[-1] if self.faults else parent)
+        if self._sweep is None:
+            return
+        if self.faults:
+            self._sweep.end(self.faults[-1])
+        elif self._alone:
+            self._sweep.end("the program that started the sweep ended")
+        else:
+            self._sweep.end("interrupted")
 
     def _clamp(self, joints: tuple[str, ...]) -> None:
         """Have the operator clamp joints and wait; runs in a thread of its own."""
@@ -418,9 +507,11 @@ class Servo:
         self._clamped.wait()
 
 
-def _same(one: State, other: State) -> bool:
+def _same_measurement(state: State, other: State) -> bool:
     """Whether two states are equal to the last bit, which states of live sensors never are."""
-    return all(
-        np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("gyro", "accelerometer", "position", "velocity")
+    return (
+        np.array_equal(state.gyro, other.gyro)
+        and np.array_equal(state.accelerometer, other.accelerometer)
+        and np.array_equal(state.position, other.position)
+        and np.array_equal(state.velocity, other.velocity)
     )

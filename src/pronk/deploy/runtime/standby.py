@@ -1,9 +1,9 @@
 """The standby process: damps the joints when the servo's process has stopped or was killed.
 
 It has a transport of its own and reads the time that the servo writes into shared memory at every
-tick. A servo that has been silent for `Plan.silence_s` while it drove the joints has stopped, and
-with it the thread of its link that damps when a command expires. A servo that goes on later finds
-the commands of another writer, and damps too.
+tick. A servo that has been silent for `RunPlan.silence_s` while it drove the joints has stopped,
+and with it the thread of its link that damps when a command expires. A servo that goes on later
+finds the commands of another writer, and damps too.
 
 A wire that has one writer (a link of one's own without `open_damper`) and the virtual robot in this
 program have no standby.
@@ -20,19 +20,27 @@ import numpy as np
 
 from pronk.deploy.links.link import NetworkLink
 from pronk.deploy.links.realtime import Wanted, enter, leave, sleep_until
-from pronk.deploy.runtime.ipc import STANDBY, Shared
+from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import DRIVEN, Mode
-from pronk.deploy.runtime.plan import STANDBY_PRIORITY, Plan
+from pronk.deploy.runtime.plan import STANDBY_PRIORITY, RunPlan
+from pronk.deploy.runtime.records import STANDBY
 
 _POLL_S = 0.004
+"""Time between two looks at the servo [s]."""
 _REPEAT_S = 0.01
-"""Between two messages of damping [s]."""
+"""Time between two messages of damping [s]."""
 _LEAST_S = 3.0
 """Shortest time of damping, in which any robot here comes to rest [s]."""
 
 
-def serve_standby(plan: Plan, name: str, end: Connection) -> None:
-    """Body of the standby process; `end` gets one byte: whether the link can have one."""
+def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
+    """Run the standby process.
+
+    Args:
+        plan: Plan of the run.
+        name: Name of the shared memory.
+        end: Pipe to the operator's process; gets one byte: whether the link can have a standby.
+    """
     leave()
     stopping = False
 
@@ -47,24 +55,28 @@ def serve_standby(plan: Plan, name: str, end: Connection) -> None:
     if damp is None:
         return
     enter(Wanted(priority=STANDBY_PRIORITY) if plan.real_time else Wanted(lock=False))
-    shared, parent = Shared(name, len(plan.robot.joints)), os.getppid()
-    begun, due = None, 0.0
+    shared = Shared(name, len(plan.robot.joints))
+    parent = os.getppid()
     record = np.zeros((), STANDBY)
+    damping_since: float | None = None
+    next_message = 0.0
     while True:
-        now, seen = time.monotonic(), shared.state.read()
-        mode = None if seen is None else Mode(int(seen["mode"]))
-        orphan = os.getppid() != parent
-        if begun is None:
+        now = time.monotonic()
+        state = shared.state.read()
+        mode = None if state is None else Mode(int(state["mode"]))
+        orphaned = os.getppid() != parent
+        if damping_since is None:
             # A servo that drove the joints and has not ended may yet fall silent.
-            if mode is Mode.ENDED or ((stopping or orphan) and mode not in DRIVEN):
+            if mode is Mode.ENDED or ((stopping or orphaned) and mode not in DRIVEN):
                 break
-            if seen is not None and mode in DRIVEN and now - float(seen["now"]) > plan.silence_s:
-                begun = record["time"] = now
+            if state is not None and mode in DRIVEN and now - float(state["now"]) > plan.silence_s:
+                damping_since = now
+                record["time"] = now
                 shared.standby.write(record)
-        elif now - begun > _LEAST_S and (stopping or orphan or mode is Mode.ENDED):
+        elif now - damping_since > _LEAST_S and (stopping or orphaned or mode is Mode.ENDED):
             break
-        if begun is not None and now >= due:
+        if damping_since is not None and now >= next_message:
             damp()
-            due = now + _REPEAT_S
+            next_message = now + _REPEAT_S
         sleep_until(now + _POLL_S)
     shared.close()

@@ -1,8 +1,18 @@
-"""The state machine of the servo, and the paths on which the robot stands up and sits down.
+"""The state machine of the servo: from mode and request to the desired command of a tick.
 
-    Idle -> Preflight -> Damp -> Stand -> Policy -> Halt -> Sit -> Damp
-                      -> Sweep -> Damp
-                                   any fault -> Fault (damped) -> Damp -> ...
+    mode        left when                                              for
+    IDLE        (the servo enters PREFLIGHT)                           PREFLIGHT
+    PREFLIGHT   the states were checked                                DAMP, SWEEP or IDLE
+    DAMP        STAND is requested, after `RunTiming.damp_s`              STAND
+    STAND       WALK is requested, once the robot has risen            POLICY
+                SIT is requested                                       SIT
+    POLICY      SIT is requested                                       HALT
+    HALT        `RunTiming.halt_s` has passed                             SIT
+    SIT         the robot has reached the folded pose                  DAMP
+    SWEEP       the sweep is over                                      DAMP
+    FAULT       RESET or STAND is requested and the fault is over      DAMP
+    any driven  DAMP or QUIT is requested                              DAMP
+    any driven  the safety filter damps                                FAULT
 
 It gives the desired command; the safety filter decides what is sent. Time, states and requests are
 arguments.
@@ -11,159 +21,111 @@ arguments.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.deploy.runtime.ipc import Record
-from pronk.deploy.runtime.modes import SILENT, Mode, OperatorRequest
-from pronk.deploy.runtime.safety import FilterAction, Reason, SafetyFilter
-from pronk.errors import RobotError
+from pronk.deploy.runtime.modes import POLICY_MODES, SILENT, Mode, OperatorRequest
+from pronk.deploy.runtime.poses import (
+    PosePath,
+    RunTiming,
+    folded_pose,
+    last_joints,
+    minimum_jerk,
+    stand_up,
+)
+from pronk.deploy.runtime.reasons import FilterAction, Reason
+from pronk.deploy.runtime.records import Record
+from pronk.deploy.runtime.safety import SafetyFilter
 from pronk.robots.machine import Command
 from pronk.robots.robot import RobotSpec
 
 PREFLIGHT_S = 0.5
-"""How long states are checked before anything is sent [s]."""
+"""Time for which states are checked before anything is sent [s]."""
 VALID_S = 0.05
-"""How long a target of the servo's own may be repeated [s]."""
-SWING = 0.15
-"""Of each leg's last joint towards the default pose and back, to know that its encoder is its own
-[rad]. In the folded pose on the ground it moves by 0.010 to 0.020, any other by 0.47 of that at
-most, where the motions out and back are averaged: a robot that still sinks moves all of them."""
-STRAY, STRAY_SHARE = 0.005, 1.4
-"""Such a motion of another joint that is wrong: in rad, and as a share of that of the swung one."""
+"""Time for which a target of the servo's own may be repeated [s]."""
 FIRST_ACTION_S = 0.2
-"""In which the policy must give its first action [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timing:
-    """Times of standing up, starting the policy and sitting down [s]."""
-
-    damp_s: float = 1.0
-    """Least time in damping before the robot stands up; it sinks to the ground meanwhile."""
-    fold_s: float = 1.0
-    """From the measured pose to the folded pose."""
-    check_s: float = 0.15
-    """Of each half swing of a leg in the folded pose, before the first rise; 0 for no check."""
-    rise_s: float = 1.5
-    """From there to the default pose."""
-    ramp_s: float = 0.5
-    """In which the stiffness grows from none to that of the robot's drives."""
-    blend_s: float = 0.4
-    """In which the policy's targets replace the pose; 0 as in training."""
-    halt_s: float = 1.0
-    """With a zero command before the robot sits down."""
-    sit_s: float = 1.5
-    """From the measured pose to the folded pose."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 <= value < math.inf:
-                raise RobotError(f"Timing.{name} is {value}; it must be finite, not negative.")
-
-
-def minimum_jerk(share: float) -> float:
-    """Share of a minimum-jerk path at a share of its time: `10 s^3 - 15 s^4 + 6 s^5`.
-
-    Flash and Hogan, 1985. `share` is clipped to 0 to 1.
-    """
-    s = min(max(share, 0.0), 1.0)
-    return s * s * s * (10.0 + s * (6.0 * s - 15.0))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Path:
-    """Minimum-jerk joint targets through poses, at rest at each, with a growing stiffness."""
-
-    began: float
-    """[s]"""
-    poses: tuple[Array, ...]
-    """Joint positions, the measured ones first [rad]. Each (joints,)."""
-    seconds: tuple[float, ...]
-    """From each pose to the next [s]."""
-    ramp_s: float = 0.0
-    """In which the stiffness grows [s]."""
-
-    def target(self, t: float) -> Array:
-        """Joint targets at a time [rad]. (joints,)."""
-        left = t - self.began
-        for start, goal, seconds in zip(self.poses, self.poses[1:], self.seconds, strict=False):
-            if left < seconds:
-                return start + (goal - start) * minimum_jerk(left / seconds)
-            left -= seconds
-        return self.poses[-1]
-
-    def stiffness(self, t: float) -> float:
-        """Share of the drives' stiffness at a time, 0 to 1."""
-        return minimum_jerk((t - self.began) / self.ramp_s) if self.ramp_s > 0.0 else 1.0
-
-    def done(self, t: float) -> bool:
-        """Whether the target has reached the last pose."""
-        return t >= self.began + sum(self.seconds)
-
-
-def last_joints(robot: RobotSpec) -> list[int]:
-    """Number of each leg's last joint."""
-    names = robot.joint_names
-    return [max(i for i, n in enumerate(names) if n.startswith(f"{leg}_")) for leg in robot.legs]
-
-
-def folded_pose(robot: RobotSpec) -> Array:
-    """[rad], (joints,); RobotError if the robot file gives none."""
-    pose = [joint.folded_position for joint in robot.joints]
-    if any(position is None for position in pose):
-        raise RobotError(
-            f"{robot.name} has no folded pose, so it cannot stand up; give each of its joints a "
-            "folded position."
-        )
-    return np.array(pose, dtype=float)
-
-
-def stand_up(
-    robot: RobotSpec, measured: Array, began: float, timing: Timing, *, swing: bool = False
-) -> Path:
-    """From the measured pose through the folded to the default pose, with growing stiffness.
-
-    With `swing` each leg's last joint swings by `SWING` in the folded pose, one leg after another.
-    """
-    default = np.array([joint.default_position for joint in robot.joints])
-    folded = folded_pose(robot)
-    poses, seconds = [measured.copy(), folded], [timing.fold_s]
-    for i in last_joints(robot) if swing else ():
-        swung = folded.copy()
-        swung[i] += math.copysign(SWING, default[i] - folded[i])
-        poses += [swung, folded]
-        seconds += [timing.check_s, timing.check_s]
-    return Path(
-        began=began,
-        poses=(*poses, default),
-        seconds=(*seconds, timing.rise_s),
-        ramp_s=timing.ramp_s,
-    )
+"""Time in which the policy must give its first action [s]."""
+STRAY = 0.005
+"""Motion of another joint than the swung one that is a fault [rad]."""
+STRAY_SHARE = 1.4
+"""Motion of another joint that is a fault, as a share of that of the swung one."""
 
 
 class DesiredCommand(NamedTuple):
     """The command of a tick, before the safety filter."""
 
     command: Command | None = None
-    """None: damp, or send nothing in a mode of `SILENT`."""
+    """Command; None to damp, or to send nothing in a mode of `SILENT`."""
     blend: float = 0.0
     """Share of the policy in the targets."""
     stiffness: float = 0.0
     """Share of the drives' own stiffness."""
 
 
+class SwingCheck:
+    """Whether the encoders of the legs are their own.
+
+    In the folded pose each leg's last joint swings, one leg after another. The motion of every
+    joint is the difference of its position at the largest swing and the mean of those before and
+    after. If another joint moves by more than `STRAY` and by more than `STRAY_SHARE` of the swung
+    one, encoders are swapped.
+    """
+
+    def __init__(self, robot: RobotSpec, timing: RunTiming) -> None:
+        """Begin without a position."""
+        self._timing = timing
+        self._swung = last_joints(robot)
+        self.needed = timing.check_s > 0.0 and len(self._swung) > 0
+        """Whether the check is still to be passed."""
+        self._positions = np.full((3, len(self._swung), len(robot.joints)), np.nan)
+        """Positions before each leg's swing, at its largest, and after it [rad]."""
+
+    def begin(self) -> None:
+        """Forget the positions of an earlier rise."""
+        self._positions[:] = np.nan
+
+    def finds_swapped(self, t: float, began: float, position: Array) -> bool:
+        """Note the position while legs swing; after it, whether another joint moved.
+
+        Args:
+            t: Time [s].
+            began: Time at which the robot began to stand up [s].
+            position: Measured joint positions [rad], (joints,).
+        """
+        half_swings = math.floor((t - began - self._timing.fold_s) / self._timing.check_s)
+        leg, back = divmod(half_swings, 2)
+        if leg < 0:
+            return False
+        if leg < len(self._swung):
+            of_leg = self._positions[:, leg]
+            of_leg[0] = np.where(np.isnan(of_leg[0]), position, of_leg[0])
+            of_leg[1 + back] = position
+            return False
+        before, largest, after = self._positions
+        motion = np.abs(largest - 0.5 * (before + after))
+        swung_motion = motion[np.arange(len(motion)), self._swung]
+        swapped = bool((motion > np.maximum(STRAY, STRAY_SHARE * swung_motion[:, None])).any())
+        self.needed = swapped
+        return swapped
+
+
 class StateMachine:
     """The modes of one run, a policy's or a sweep's."""
 
-    def __init__(self, robot: RobotSpec, timing: Timing) -> None:
-        """Begin idle."""
+    def __init__(self, robot: RobotSpec, timing: RunTiming, *, sweeps: bool = False) -> None:
+        """Begin idle.
+
+        Args:
+            robot: The robot.
+            timing: Times of standing up, starting the policy and sitting down.
+            sweeps: Whether the run is a sweep's.
+        """
         self.robot = robot
         self.timing = timing
+        self.sweeps = sweeps
         self.mode = Mode.IDLE
         self.entry = 0
         """Number of mode changes."""
@@ -171,18 +133,14 @@ class StateMachine:
         """Time of the last one [s]."""
         self.notice = ""
         """Why the last request was not granted; empty if it was."""
-        self.sweep: Callable[[float], Command | None] | None = None
-        """The command of a sweep at a time [s]; None once the sweep is over."""
-        self._kp = np.array([joint.stiffness for joint in robot.joints])
-        self._kd = np.array([joint.damping for joint in robot.joints])
-        self._path: Path | None = None
-        self._last = last_joints(robot)
-        self._known = timing.check_s == 0.0 or not self._last
-        """Whether the encoders of the legs are known to be their own."""
-        self._swings = np.full((3, len(self._last), len(robot.joints)), np.nan)
-        """Positions before each leg's swing, at its largest, and after it [rad]."""
-        self._blending: float | None = None
-        self._first_entry = 0
+        self._stiffness = np.array([joint.stiffness for joint in robot.joints])
+        self._damping = np.array([joint.damping for joint in robot.joints])
+        self._path: PosePath | None = None
+        self._swing_check = SwingCheck(robot, timing)
+        self._blending_since: float | None = None
+        """Time of the policy's first action in this run of it [s]; None before it."""
+        self._policy_entry = 0
+        """Number of the mode change that started the policy."""
         self._request = OperatorRequest.NONE
 
     @property
@@ -197,13 +155,18 @@ class StateMachine:
 
     def enter(self, mode: Mode, t: float) -> None:
         """Change the mode."""
-        self.mode, self.since = mode, t
+        self.mode = mode
+        self.since = t
         self.entry += 1
 
     def preflighted(self, refusals: Sequence[str], t: float) -> None:
         """Leave the pre-flight checks: idle if there are refusals, else damp or begin the sweep."""
-        go = Mode.DAMP if self.sweep is None else Mode.SWEEP
-        self.enter(Mode.IDLE if refusals else go, t)
+        if refusals:
+            self.enter(Mode.IDLE, t)
+        elif self.sweeps:
+            self.enter(Mode.SWEEP, t)
+        else:
+            self.enter(Mode.DAMP, t)
 
     def request(self, request: OperatorRequest) -> None:
         """Take a request; it is kept until it can be granted or another comes."""
@@ -211,12 +174,13 @@ class StateMachine:
 
     def faulted(self, t: float) -> None:
         """Enter `FAULT`, because the filter damps; a fault ends a sweep."""
-        if self.mode is not Mode.FAULT and not self.silent:
-            if self.sweep is not None:
-                self._request = OperatorRequest.QUIT
-            elif not self.quitting:
-                self._request = OperatorRequest.NONE
-            self.enter(Mode.FAULT, t)
+        if self.mode is Mode.FAULT or self.silent:
+            return
+        if self.sweeps:
+            self._request = OperatorRequest.QUIT
+        elif not self.quitting:
+            self._request = OperatorRequest.NONE
+        self.enter(Mode.FAULT, t)
 
     def step(
         self,
@@ -226,36 +190,22 @@ class StateMachine:
         action: Record | None,
         objection: str = "",
     ) -> DesiredCommand:
-        """Compute the desired command of one tick.
+        """Grant the request and return the desired command of one tick.
 
-        `position` is measured, `action` the policy's newest, a record of `ACTIONS`; `objection`
-        says why the policy may not start. May release a fault of the filter, or add one.
+        Args:
+            t: Time of the tick [s].
+            position: Measured joint positions [rad], (joints,).
+            safety: The filter, of which a fault may be released, or to which one may be added.
+            action: Newest action of the policy, a record of `ACTIONS`.
+            objection: Why the policy may not start; empty if it may.
         """
-        self._grant(t, position, safety, objection)
-        if self.mode is Mode.SWEEP and self.sweep is not None:
-            command = self.sweep(t)
-            if command is not None:
-                return DesiredCommand(command, stiffness=1.0)
-            self._request = OperatorRequest.QUIT
-            self.enter(Mode.DAMP, t)
-        if self.mode is Mode.HALT and t - self.since >= self.timing.halt_s:
-            self._sit(t, position)
-        if self._path is not None and self.mode in (Mode.POLICY, Mode.HALT):
-            return self._follow(t, self._path.target(t), action, safety)
-        if self._path is not None and self.mode in (Mode.STAND, Mode.SIT):
-            if self.mode is Mode.STAND and not self._known and self._swapped(t, position):
-                safety.fault(Reason.SWAPPED, t)
-                return DesiredCommand()
-            if self.mode is Mode.STAND or not self._path.done(t):
-                return self._pose(t, self._path.target(t), self._path.stiffness(t))
-            self.enter(Mode.DAMP, t)
-        return DesiredCommand()
+        self.grant(t, position, safety, objection)
+        return self.desired(t, position, safety, action)
 
-    def _grant(self, t: float, position: Array, safety: SafetyFilter, objection: str) -> None:
-        """Carry out the request as far as the mode allows."""
-        request, mode = self._request, self.mode
-        stand, reset = OperatorRequest.STAND, OperatorRequest.RESET
-        risen = self._path is not None and self._path.done(t)
+    def grant(self, t: float, position: Array, safety: SafetyFilter, objection: str = "") -> None:
+        """Carry out the request as far as the mode allows; arguments as of `step`."""
+        request = self._request
+        mode = self.mode
         self.notice = ""
         if request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
             if mode not in (*SILENT, Mode.FAULT, Mode.DAMP):
@@ -264,77 +214,108 @@ class StateMachine:
             self.enter(Mode.HALT, t)
         elif request is OperatorRequest.SIT and mode is Mode.STAND:
             self._sit(t, position)
-        elif request in (stand, reset) and mode is Mode.FAULT:
-            safety.release(t, acknowledged=request is reset)
+        elif request in (OperatorRequest.STAND, OperatorRequest.RESET) and mode is Mode.FAULT:
+            safety.release(t, acknowledged=request is OperatorRequest.RESET)
             if not safety.faulted:
                 self.enter(Mode.DAMP, t)
-            elif safety.level is FilterAction.LATCH and request is stand:
+            elif safety.level is FilterAction.LATCH and request is OperatorRequest.STAND:
                 self.notice = "the fault is latched; request a reset once its cause is gone"
                 self._request = OperatorRequest.NONE
-        elif request is stand and mode is Mode.DAMP:
+        elif request is OperatorRequest.STAND and mode is Mode.DAMP:
             if t - self.since >= self.timing.damp_s:
-                self._path = stand_up(self.robot, position, t, self.timing, swing=not self._known)
-                self._swings[:] = np.nan
+                self._path = stand_up(
+                    self.robot, position, t, self.timing, swing=self._swing_check.needed
+                )
+                self._swing_check.begin()
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
-        elif request is OperatorRequest.WALK and mode is Mode.STAND and risen:
-            self.notice, self._request = objection, OperatorRequest.NONE
+        elif request is OperatorRequest.WALK and mode is Mode.STAND and self._has_risen(t):
+            self.notice = objection
+            self._request = OperatorRequest.NONE
             if not objection:
-                self._blending = None
+                self._blending_since = None
                 self.enter(Mode.POLICY, t)
-                self._first_entry = self.entry
-        if self.mode is not mode and request not in (OperatorRequest.QUIT, stand):
+                self._policy_entry = self.entry
+        # A granted request is over; that to quit lasts, and that to stand until the robot does.
+        if self.mode is not mode and request not in (OperatorRequest.QUIT, OperatorRequest.STAND):
             self._request = OperatorRequest.NONE
 
+    def desired(
+        self, t: float, position: Array, safety: SafetyFilter, action: Record | None
+    ) -> DesiredCommand:
+        """Return the desired command of the mode, but of a sweep; arguments as of `step`."""
+        if self.mode is Mode.HALT and t - self.since >= self.timing.halt_s:
+            self._sit(t, position)
+        path = self._path
+        if path is None:
+            return DesiredCommand()
+        if self.mode in POLICY_MODES:
+            return self._follow_policy(t, path.target(t), action, safety)
+        if self.mode is Mode.STAND:
+            if self._swing_check.needed and self._swing_check.finds_swapped(
+                t, path.began, position
+            ):
+                safety.fault(Reason.SWAPPED, t)
+                return DesiredCommand()
+            return self._pose(t, path.target(t), path.stiffness(t))
+        if self.mode is Mode.SIT:
+            if not path.done(t):
+                return self._pose(t, path.target(t), path.stiffness(t))
+            self.enter(Mode.DAMP, t)
+        return DesiredCommand()
+
+    def follow_sweep(self, t: float, command: Command | None) -> DesiredCommand:
+        """Return the desired command of a sweep; None as its command ends the run."""
+        if command is not None:
+            return DesiredCommand(command, stiffness=1.0)
+        self._request = OperatorRequest.QUIT
+        self.enter(Mode.DAMP, t)
+        return DesiredCommand()
+
+    def _has_risen(self, t: float) -> bool:
+        """Whether the robot has reached the default pose."""
+        return self._path is not None and self._path.done(t)
+
     def _sit(self, t: float, position: Array) -> None:
-        poses = position.copy(), folded_pose(self.robot)
-        self._path = Path(began=t, poses=poses, seconds=(self.timing.sit_s,))
+        """Begin to sit down from the measured pose."""
+        self._path = PosePath(
+            began=t,
+            poses=(position.copy(), folded_pose(self.robot)),
+            seconds=(self.timing.sit_s,),
+        )
         self.enter(Mode.SIT, t)
 
-    def _swapped(self, t: float, position: Array) -> bool:
-        """Note the position while legs swing; whether another joint than the swung one moved."""
-        assert self._path is not None
-        half = math.floor((t - self._path.began - self.timing.fold_s) / self.timing.check_s)
-        leg, back = divmod(half, 2)
-        if leg < 0:
-            return False
-        if leg < len(self._last):
-            seen = self._swings[:, leg]
-            seen[0] = np.where(np.isnan(seen[0]), position, seen[0])
-            seen[1 + back] = position
-            return False
-        before, out, after = self._swings
-        moved = np.abs(out - 0.5 * (before + after))
-        own = moved[np.arange(len(moved)), self._last]
-        wrong = (moved > np.maximum(STRAY, STRAY_SHARE * own[:, None])).any()
-        self._known = not wrong
-        return bool(wrong)
-
     def _pose(self, t: float, target: Array, share: float) -> DesiredCommand:
+        """Return the command of a pose with a share of the drives' stiffness."""
         command = Command(
-            position=target, stiffness=share * self._kp, damping=self._kd, made=t, valid_for=VALID_S
+            position=target,
+            stiffness=share * self._stiffness,
+            damping=self._damping,
+            made=t,
+            valid_for=VALID_S,
         )
         return DesiredCommand(command, stiffness=share)
 
-    def _follow(
+    def _follow_policy(
         self, t: float, pose: Array, action: Record | None, safety: SafetyFilter
     ) -> DesiredCommand:
-        """The policy's targets, blended in; the standing pose until the first of them."""
-        # Halted before its first action, the policy may act for either mode.
-        if self._blending is None and (action is None or action["entry"] < self._first_entry):
-            if t - self.since > FIRST_ACTION_S:
-                safety.fault(Reason.EXPIRED, t)
-                return DesiredCommand()
-            return self._pose(t, pose, 1.0)
+        """Return the policy's targets, blended in; the standing pose until the first of them."""
+        if self._blending_since is None:
+            # Halted before its first action, the policy may act for either mode.
+            if action is None or action["entry"] < self._policy_entry:
+                if t - self.since > FIRST_ACTION_S:
+                    safety.fault(Reason.EXPIRED, t)
+                    return DesiredCommand()
+                return self._pose(t, pose, 1.0)
+            self._blending_since = t
         assert action is not None
-        if self._blending is None:
-            self._blending = t
-        length = self.timing.blend_s
-        share = minimum_jerk((t - self._blending) / length) if length > 0.0 else 1.0
+        share = 1.0
+        if self.timing.blend_s > 0.0:
+            share = minimum_jerk((t - self._blending_since) / self.timing.blend_s)
         command = Command(
             position=pose + share * (action["position"] - pose),
-            stiffness=self._kp,
-            damping=self._kd,
+            stiffness=self._stiffness,
+            damping=self._damping,
             sequence=int(action["sequence"]),
             state_sequence=int(action["state_sequence"]),
             made=float(action["made"]),

@@ -1,9 +1,10 @@
 """Sweeps: excite each joint with its signals and log the response, under the safety filter.
 
 Commands change at the policy's rate on the machine's own clock; every measured state is logged with
-the command in force. `record` runs a sweep on a machine whose clock waits (the virtual robot in
-this process), the servo on a machine in real time. In both, every command passes the safety filter,
-and whatever happens, the joints are left damped and the log stays readable.
+the command in force. `record_sweep` (`pronk.deploy.runtime.sweep_recorder`) runs a sweep on a
+machine whose clock waits (the virtual robot in this process), the servo on a machine in real time.
+In both, every command passes the safety filter, and whatever happens, the joints are left damped
+and the log stays readable.
 """
 
 from __future__ import annotations
@@ -19,18 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.deploy.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dtype
-from pronk.deploy.runtime.safety import Limits, SafetyFilter
+from pronk.deploy.runtime.limits import AgeLimits, Limits
+from pronk.deploy.runtime.records import TEXT_SIZE, Record, SampleKind, sample_dtype
 from pronk.deploy.runtime.state_machine import VALID_S
 from pronk.errors import HardwareError
 from pronk.identify.excitation.plan import POSE_RAMP_S, PlannedExcitation, SweepPlan
-from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter, reason_of
-from pronk.identify.logs.segment import Segment
 from pronk.names import file_name
 from pronk.robots.machine import Command, Machine, State, TorqueKind
 
 _SAG = 0.05
-"""How much farther out than at first a joint may be on the way to its pose [rad]."""
+"""Distance beyond its first position that a joint may have on the way to its pose [rad]."""
 _SOFT_SPEED = 0.5
 """Fastest mean speed on the way to the pose [rad/s]."""
 _AT_POSE = 0.15
@@ -46,30 +45,34 @@ STALE_S = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class SweepTask:
-    """A plan and where its logs go: one MCAP file for each excited joint."""
+    """A plan and the place of its logs: one MCAP file for each excited joint."""
 
     plan: SweepPlan
+    """Excitations of the sweep."""
     out_dir: Path
+    """Folder of the logs."""
     joints: tuple[str, ...] | None = None
-    """Record only these joints of the plan, so that several processes can share one."""
+    """Joints of the plan to record, so that several processes can share one; None for all."""
     overwrite: bool = False
-    """Replace logs that exist."""
+    """Whether logs that exist are replaced."""
     metadata: Mapping[str, str] = field(default_factory=dict)
-    """Added to the logs' own, for instance the link."""
+    """Entries added to the logs' own, for instance the link."""
 
     @property
     def excited(self) -> list[str]:
-        """Joints, one log each."""
-        return [name for name in self.plan.joints if self.joints is None or name in self.joints]
+        """Excited joints, one log each."""
+        if self.joints is None:
+            return list(self.plan.joints)
+        return [name for name in self.plan.joints if name in self.joints]
 
     @property
     def paths(self) -> list[Path]:
-        """Of the logs."""
+        """Paths of the logs."""
         return [self.out_dir / f"{file_name(name)}.mcap" for name in self.excited]
 
     def excitations(self, joint: str) -> list[PlannedExcitation]:
-        """Excitations of one joint's log."""
-        return [each for each in self.plan.excitations if each.joint == joint]
+        """Return the excitations of one joint's log."""
+        return [excitation for excitation in self.plan.excitations if excitation.joint == joint]
 
     def check(self) -> None:
         """Refuse a task that cannot be carried out, before anything moves.
@@ -92,123 +95,60 @@ class SweepTask:
                 )
         self.plan.check()
 
-    def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
-        """Limits of the filter: ranges, no-load speeds and effort limits without tolerance.
+    def limits(self, torque_kind: TorqueKind) -> Limits:
+        """Return the limits of the filter: ranges, speeds and efforts without tolerance.
 
-        The plan's worst case keeps within them, so the filter changes no command of a valid plan;
-        margin and horizon are zero. The trunk is fixed, so its tilt is not limited. A torque that
-        is measured must keep within the effort limits too. `changed` gives other scalar values.
+        The plan's worst case keeps within the ranges, the no-load speeds and the effort limits, so
+        the filter changes no command of a valid plan; margin and horizon are zero. The trunk is
+        fixed, so its tilt is not limited. A torque that is measured must keep within the effort
+        limits too.
         """
-        robot = self.plan.robot
-        scalars = dict.fromkeys(("hold_s", "damp_s", "latch_s"), STALE_S) | {
-            "tilt": np.inf,
-            "margin": 1e-6,
-            "overrun": 1e-9,
-            "horizon_s": 1e-6,
-            "stiffness": max(100.0, float(self.plan.stiffness.max())),
-            "damping": max(5.0, float(self.plan.damping.max())),
-            "measured_torque": 1.0 if torque_kind == "measured" else np.inf,
-        }
-        limits = Limits.of(robot, **(scalars | changed))
-        return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
-
-
-class SweepLogs:
-    """Writes the logs of a task from its records (`sample_dtype`)."""
-
-    def __init__(self, task: SweepTask) -> None:
-        self.task = task
-        self._writer: McapLogWriter | None = None
-        self._joint = ""
-        self._columns: list[int] = []
-        self._torque = True
-
-    def drain(self, shared: Shared) -> None:
-        """Write everything that waits; events are not logged."""
-        for record in shared.samples.take():
-            self.write(record)
-        shared.events.take()
-
-    def write(self, record: Record) -> None:
-        """Write one record."""
-        kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
-        writer, columns = self._writer, self._columns
-        if kind == SampleKind.OPEN:
-            self._open(number, bool(record["virtual"]), bytes(record["text"]).decode("ascii"))
-        elif writer is None:
-            return
-        elif kind == SampleKind.SEGMENT:
-            writer.segment(self._segment(number, time))
-        elif kind == SampleKind.END:
-            self.end(bytes(record["text"]).decode("ascii"))
-        else:
-            command, position, velocity = (
-                record[name][columns] for name in ("command", "position", "velocity")
-            )
-            torque = record["torque"][columns] if self._torque else None
-            frequency = float(record["frequency"])
-            writer.sample(time, command, position, velocity, torque, frequency, number)
-
-    def _open(self, index: int, virtual: bool, torque_kind: str) -> None:
-        plan, self._joint = self.task.plan, self.task.excited[index]
-        self._torque = torque_kind != "absent"
-        # Joints that can move with the excited one or are clamped: its leg.
-        joint = plan.robot.joint(self._joint)
-        logged = {joint.name, *joint.chain, *joint.clamped}
-        names = tuple(name for name in plan.robot.joint_names if name in logged)
-        self._columns = columns = [plan.robot.joint_names.index(name) for name in names]
-        rate = f"{plan.rate_hz:g}"
-        header = LogHeader(
-            robot=plan.robot.name,
-            joints=names,
-            stiffness=plan.stiffness[columns].tolist(),
-            damping=plan.damping[columns].tolist(),
-            pose=plan.pose[columns].tolist(),
-            units=("rad",) * len(names),
-            virtual=virtual,
-            metadata={"command_rate_hz": rate, "excited": self._joint, "torque": torque_kind}
-            | dict(self.task.metadata),
+        limits = Limits.of(self.plan.robot)
+        measured_torque = np.full_like(limits.joints.torque, np.inf)
+        if torque_kind == "measured":
+            measured_torque = limits.joints.torque
+        operating = limits.operating
+        return replace(
+            limits,
+            joints=replace(
+                limits.joints, speed=limits.joints.no_load, measured_torque=measured_torque
+            ),
+            operating=replace(
+                operating,
+                tilt=math.inf,
+                margin=1e-6,
+                overrun=1e-9,
+                horizon_s=1e-6,
+                stiffness=max(operating.stiffness, float(self.plan.stiffness.max())),
+                damping=max(operating.damping, float(self.plan.damping.max())),
+            ),
+            ages=AgeLimits(hold_s=STALE_S, damp_s=STALE_S, latch_s=STALE_S),
         )
-        self._writer = McapLogWriter(self.task.paths[index], header)
-
-    def _segment(self, number: int, start: float) -> Segment:
-        """An excitation of the open log; `start` on the machine's clock [s]."""
-        plan, excitation = self.task.plan, self.task.excitations(self._joint)[number]
-        signal = excitation.signal
-        return Segment(
-            kind=signal.kind,
-            joints=(excitation.joint,),
-            start=start,
-            stop=start + plan.seconds(excitation) - 1.0 / plan.rate_hz / 2.0,
-            amplitude=signal.amplitude,
-            repeat=excitation.repeat,
-            band_hz=signal.band_hz,
-            period_s=signal.period_s,
-            clamped=excitation.clamped,
-        )
-
-    def end(self, reason: str) -> None:
-        """End the log, complete if there is no reason; ending twice has no effect."""
-        if self._writer is not None:
-            self._writer.end(complete=not reason, reason=reason)
-            self._writer = None
-
-    def flush(self) -> None:
-        """Hand what was written to the operating system."""
-        if self._writer is not None:
-            self._writer.flush()
 
 
 class SweepStep(NamedTuple):
     """The command of one tick."""
 
     target: Array
-    """[rad] (joints,)"""
+    """Joint targets [rad], (joints,)."""
     stiffness: float = 1.0
     """Share of the plan's stiffness."""
     frequency: float = math.nan
-    """Instantaneous, of the signal [Hz]."""
+    """Instantaneous frequency of the signal [Hz]."""
     segment: int = -1
+    """Number of the excitation in its log; -1 between."""
+
+
+class SentTarget(NamedTuple):
+    """A target that the filter let through."""
+
+    time: float
+    """Time on the machine's clock [s]."""
+    target: Array
+    """Joint targets [rad], (joints,)."""
+    frequency: float
+    """Instantaneous frequency of the signal [Hz]."""
+    segment: int
     """Number of the excitation in its log; -1 between."""
 
 
@@ -224,42 +164,54 @@ class SweepController:
         self,
         task: SweepTask,
         machine: Machine,
-        safety: SafetyFilter,
+        limits: Limits,
         sink: Callable[[Record], object],
         *,
         state: State,
         start: float,
         real_time: bool,
-        progress: Callable[[float], None] = lambda share: None,
-        written: Callable[[str], None] = lambda name: None,
     ) -> None:
-        """Begin on a connected machine at `start` on its clock [s], from a measured `state`.
+        """Begin on a connected machine.
 
-        Until the joints are at the pose, the limits of `safety` are widened to where they are at
-        first. In `real_time` the joints are stiffened first, and held while the operator clamps
-        others. `sink` takes records of `sample_dtype`, `progress` the share done, 0 to 1, and
-        `written` the name of each complete log.
+        Args:
+            task: What is excited, and where the logs are.
+            machine: The machine.
+            limits: Limits of the sweep.
+            sink: Takes the records of the logs (`sample_dtype`).
+            state: A measured state.
+            start: Time of the first tick on the machine's clock [s].
+            real_time: Whether the machine's clock does not wait: the joints are stiffened first,
+                and held while the operator clamps others.
         """
-        self.task, self.plan, self.machine, self.safety = task, task.plan, machine, safety
-        self._sink, self._progress, self._written = sink, progress, written
-        self._real_time, self._state, self._start = real_time, state, start
-        self._tick, self._ticks, self._pose = 1.0 / self.plan.rate_hz, 0, self.plan.pose
-        self._strict = safety.limits
-        q, low, high = state.position, self._strict.low, self._strict.high
-        safety.limits = replace(
-            self._strict,
-            low=np.where(q < low, q - _SAG, low),
-            high=np.where(q > high, q + _SAG, high),
-        )
-        self._dtype = sample_dtype(len(q))
-        self._step = SweepStep(q.copy(), stiffness=0.0 if real_time else 1.0)
+        self.task = task
+        self.plan = task.plan
+        self.machine = machine
+        self.limits = _widened(limits, state.position)
+        """Limits that apply at this tick: widened to where the joints are at first until they are
+        at the pose."""
+        self.progress = 0.0
+        """Share of the sweep that is done, 0 to 1."""
+        self.complete: list[Path] = []
+        """Logs that were written to their end."""
+        self._strict_limits = limits
+        self._sink = sink
+        self._real_time = real_time
+        self._state = state
+        self._start = start
+        self._tick = 1.0 / self.plan.rate_hz
+        self._ticks = 0
+        self._pose = self.plan.pose
+        self._dtype = sample_dtype(len(state.position))
+        self._step = SweepStep(state.position.copy(), stiffness=0.0 if real_time else 1.0)
         self._steps = self._sequence()
         self._logging = False
-        self._sent: deque[tuple[float, Array, float, int]] = deque(maxlen=16)
+        self._sent: deque[SentTarget] = deque(maxlen=16)
         self._waiting: list[State] = []
+        """States whose command is not known yet."""
         self._recent: list[State] = []
-        self._half = 0.0
-        """Half the spacing of the states [s]."""
+        """States since the last tick."""
+        self._half_spacing = 0.0
+        """Half the time between two states [s]."""
 
     @property
     def now(self) -> float:
@@ -267,9 +219,15 @@ class SweepController:
         return self._start + self._ticks * self._tick
 
     def command(self, t: float, states: Sequence[State], slack: float = 0.0) -> Command | None:
-        """The command at `t` [s], a new one once the next tick is due; None once all are over.
+        """Return the command at a time, a new one once the next tick is due.
 
-        `states` were measured since the last call, oldest first.
+        Args:
+            t: Time on the machine's clock [s].
+            states: States measured since the last call, oldest first.
+            slack: How long before it is due a tick may begin [s].
+
+        Returns:
+            The command; None once all excitations are over.
 
         Raises:
             HardwareError: A joint is far from its pose or could not be clamped.
@@ -280,8 +238,8 @@ class SweepController:
             self._state = states[-1]
         if t >= self.now - slack:
             if len(self._recent) > 1:
-                first, last = self._recent[0].time, self._recent[-1].time
-                self._half = 0.5 * (last - first) / (len(self._recent) - 1)
+                seconds = self._recent[-1].time - self._recent[0].time
+                self._half_spacing = 0.5 * seconds / (len(self._recent) - 1)
             self._recent.clear()
             self._log(t)
             step = next(self._steps, None)
@@ -298,11 +256,17 @@ class SweepController:
         )
 
     def sent(self, t: float, position: Array) -> None:
-        """Note what the filter let through at `t` [s]."""
-        entry = (t, position, self._step.frequency, self._step.segment)
-        last = self._sent[-1] if self._sent else None
-        if last is None or last[2:] != entry[2:] or not np.array_equal(last[1], position):
-            self._sent.append(entry)
+        """Note the target that the filter let through at a time [s]."""
+        step = self._step
+        if self._sent:
+            newest = self._sent[-1]
+            same_frequency = newest.frequency == step.frequency
+            if math.isnan(newest.frequency) and math.isnan(step.frequency):
+                same_frequency = True
+            same_segment = newest.segment == step.segment
+            if same_frequency and same_segment and np.array_equal(newest.target, position):
+                return
+        self._sent.append(SentTarget(t, position, step.frequency, step.segment))
 
     def end(self, reason: str) -> None:
         """Log what is waiting and end an open log; `reason` is empty if the log is complete."""
@@ -312,10 +276,13 @@ class SweepController:
         self._logging = False
 
     def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
+        """Put a record that is not a sample."""
         record = np.zeros(1, dtype=self._dtype)
         record["virtual"] = self.machine.virtual
-        record["kind"], record["number"], record["time"] = kind, number, time
-        record["text"] = text.encode("ascii", "replace")[:TEXT]
+        record["kind"] = kind
+        record["number"] = number
+        record["time"] = time
+        record["text"] = text.encode("ascii", "replace")[:TEXT_SIZE]
         self._sink(record[0])
 
     def _log(self, until: float) -> None:
@@ -325,34 +292,49 @@ class SweepController:
         jitters about the tick, so states less than half their own spacing before it count as at it:
         the command is logged at the nearest state, not at the next.
         """
-        edge, waiting = until - self._half, self._waiting if self._logging else []
+        edge = until - self._half_spacing
+        waiting = self._waiting if self._logging else []
         states = [state for state in waiting if state.time < edge]
         self._waiting = [state for state in waiting if state.time >= edge]
         if not states:
             return
         records = np.zeros(len(states), dtype=self._dtype)
-        for name in ("time", "position", "velocity", "torque"):
-            records[name] = [getattr(state, name) for state in states]
+        records["time"] = [state.time for state in states]
+        records["position"] = [state.position for state in states]
+        records["velocity"] = [state.velocity for state in states]
+        records["torque"] = [state.torque for state in states]
         # A number that is not finite ends the sweep, and would make the log unreadable.
-        fine = np.isfinite(records["position"]) & np.isfinite(records["velocity"])
-        for record, loggable in zip(records, fine.all(axis=1), strict=True):
-            _, record["command"], record["frequency"], record["number"] = next(
-                (s for s in reversed(self._sent) if s[0] - self._half <= record["time"]),
-                self._sent[0],
-            )
+        is_finite = np.isfinite(records["position"]) & np.isfinite(records["velocity"])
+        for record, loggable in zip(records, is_finite.all(axis=1), strict=True):
+            command = self._command_at(float(record["time"]))
+            record["command"] = command.target
+            record["frequency"] = command.frequency
+            record["number"] = command.segment
             if loggable:
                 self._sink(record)
+
+    def _command_at(self, t: float) -> SentTarget:
+        """Return the newest command that was sent before a time [s], else the oldest."""
+        for command in reversed(self._sent):
+            if command.time - self._half_spacing <= t:
+                return command
+        return self._sent[0]
 
     # --- the sequence -----------------------------------------------------------------------------
 
     def _sequence(self) -> Iterator[SweepStep]:
+        """Yield the steps of the whole sweep."""
         ticks = round(_STIFFEN_S / self._tick) if self._real_time else 0
         for k in range(1, ticks + 1):
             yield SweepStep(self._step.target, stiffness=k / ticks)
-        task, plan = self.task, self.plan
-        all_excitations = [each for name in task.excited for each in task.excitations(name)]
-        whole, done = sum(plan.seconds(each) for each in all_excitations), 0.0
-        for index, (joint, path) in enumerate(zip(task.excited, task.paths, strict=True)):
+        task = self.task
+        plan = self.plan
+        all_seconds = 0.0
+        for joint in task.excited:
+            for excitation in task.excitations(joint):
+                all_seconds += plan.seconds(excitation)
+        done_s = 0.0
+        for index, joint in enumerate(task.excited):
             excitations = task.excitations(joint)
             self._waiting.clear()
             self._put(SampleKind.OPEN, number=index, text=self.machine.torque_kind)
@@ -366,20 +348,21 @@ class SweepController:
             for number, excitation in enumerate(excitations):
                 for k, step in enumerate(self._excite(number, excitation)):
                     if k % _PROGRESS_TICKS == 0:
-                        self._progress(min((done + k * self._tick) / whole, 1.0))
+                        self.progress = min((done_s + k * self._tick) / all_seconds, 1.0)
                     yield step
-                done += plan.seconds(excitation)
+                done_s += plan.seconds(excitation)
             yield from self._clamp(())
             self.end("")
-            self._progress(done / whole)
-            self._written(path.name)
+            self.progress = done_s / all_seconds
+            self.complete.append(task.paths[index])
 
     def _rest(self, segment: int = -1) -> Iterator[SweepStep]:
+        """Yield the steps of a rest at the pose."""
         for _ in range(round(self.plan.settle_s / self._tick)):
             yield SweepStep(self._pose, segment=segment)
 
     def _move(self, goal: Array) -> Iterator[SweepStep]:
-        """Half a cosine from the present target to the goal."""
+        """Yield half a cosine from the present target to the goal."""
         start = self._step.target
         seconds = max(POSE_RAMP_S, float(np.abs(goal - start).max()) / _SOFT_SPEED)
         ticks = round(seconds / self._tick)
@@ -387,38 +370,39 @@ class SweepController:
             yield SweepStep(start + (goal - start) * (0.5 * (1.0 - np.cos(np.pi * k / ticks))))
 
     def _clamp(self, joints: tuple[str, ...]) -> Iterator[SweepStep]:
-        """Clamp joints; in real time they are held meanwhile."""
+        """Clamp joints; in real time yield steps that hold them meanwhile."""
         if not self._real_time:
             self.machine.clamp(joints)
             return
-        failed: list[BaseException] = []
+        failures: list[BaseException] = []
 
         def clamp() -> None:
             try:
                 self.machine.clamp(joints)
             except BaseException as error:
-                failed.append(error)
+                failures.append(error)
 
         thread = threading.Thread(target=clamp, name="pronk sweep clamps", daemon=True)
         thread.start()
         while thread.is_alive():
             yield SweepStep(self._step.target)
-        if failed:
-            raise failed[0]
+        if failures:
+            raise failures[0]
 
     def _check_at_pose(self) -> None:
         """Refuse to go on from another pose; from here on the strict limits hold."""
-        away = np.abs(self._state.position - self._pose)
-        i = int(np.argmax(away))
-        if not away[i] <= _AT_POSE:
+        distance = np.abs(self._state.position - self._pose)
+        i = int(np.argmax(distance))
+        if not distance[i] <= _AT_POSE:
             raise HardwareError(
-                f"{self._strict.joints[i]} rests {away[i]:.3f} rad from its pose, expected at most "
-                f"{_AT_POSE:g} rad; free the joint, check its drive, or raise the gains."
+                f"{self._strict_limits.joints.names[i]} rests {distance[i]:.3f} rad from its pose, "
+                f"expected at most {_AT_POSE:g} rad; free the joint, check its drive, or raise the "
+                "gains."
             )
-        self.safety.limits = self._strict
+        self.limits = self._strict_limits
 
     def _excite(self, number: int, excitation: PlannedExcitation) -> Iterator[SweepStep]:
-        """One excitation and the rest after it."""
+        """Yield the steps of one excitation and of the rest after it."""
         rate = self.plan.rate_hz
         column = self.plan.robot.joint_names.index(excitation.joint)
         frequency = excitation.signal.frequency(rate)
@@ -432,63 +416,13 @@ class SweepController:
         yield from self._rest(segment=number)
 
 
-def record(
-    machine: Machine, task: SweepTask, progress: Callable[[float], None] = lambda share: None
-) -> list[Path]:
-    """Carry out a sweep on a machine whose clock waits; the link is opened here and closed again.
-
-    `progress` is called about twice a second of machine time. Returns the logs, in order.
-
-    Raises:
-        PronkError: As of `SweepTask.check`; or no states come, or the filter stopped the sweep. The
-            joints are then damped, and the log up to then is readable and has the reason.
-    """
-    if machine.robot != task.plan.robot.name:
-        raise HardwareError(
-            f"the machine is {machine.robot!r} and the plan is for {task.plan.robot.name!r}; both "
-            "must be the same."
-        )
-    task.check()
-    machine.connect()
-    try:
-        states = [machine.latest()]
-        safety = SafetyFilter(
-            limits=task.limits(machine.torque_kind), state_rate_hz=machine.state_rate_hz
-        )
-        controller = SweepController(
-            task,
-            machine,
-            safety,
-            SweepLogs(task).write,
-            state=states[0],
-            start=states[0].time,
-            real_time=False,
-            progress=progress,
-        )
-        try:
-            while True:
-                t = machine.now()
-                command = controller.command(t, states, slack=np.inf)
-                if command is None:
-                    break
-                sent, decision = safety.judge(states, command, t)
-                if sent is None:
-                    raise HardwareError(f"{decision.text}; the joints were damped.")
-                machine.send(sent)
-                controller.sent(t, sent.position)
-                states = machine.wait(controller.now)
-                if not states:
-                    raise HardwareError(
-                        f"{machine.robot} sent no state between {t:.3f} and {controller.now:.3f} "
-                        "s; check the link and that the machine's program runs."
-                    )
-        except BaseException as error:
-            # Damp before the file is finished: the joints come first.
-            machine.damp()
-            controller.end(reason_of(error))
-            raise
-    finally:
-        # In every case, the interrupt key included, the joints are damped.
-        machine.damp()
-        machine.close()
-    return task.paths
+def _widened(limits: Limits, position: Array) -> Limits:
+    """Return limits whose ranges hold measured joint positions [rad], and a little more."""
+    low = limits.joints.low
+    high = limits.joints.high
+    joints = replace(
+        limits.joints,
+        low=np.where(position < low, position - _SAG, low),
+        high=np.where(position > high, position + _SAG, high),
+    )
+    return replace(limits, joints=joints)

@@ -28,10 +28,11 @@ class OperatorCommand:
     """The operator's input at a moment."""
 
     command: Velocity = STILL
-    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+    """Velocity command: forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
     jump: bool = False
+    """Jump input."""
     held: bool = False
-    """Dead-man button; without it the robot is damped while the policy runs."""
+    """Whether the dead-man button is held; without it the robot is damped while the policy runs."""
     request: OperatorRequest = OperatorRequest.NONE
     """A new request."""
 
@@ -40,7 +41,7 @@ class Operator:
     """Gives the operator's input, 50 times a second."""
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The input now (CLOCK_MONOTONIC [s]), in a mode of the servo."""
+        """Return the input now (CLOCK_MONOTONIC [s]), in a mode of the servo."""
         raise NotImplementedError
 
     def notified(self, kind: str, text: str) -> None:
@@ -54,7 +55,7 @@ class Operator:
 
 
 _PAUSE_S = 1.0
-"""With a zero command after each script [s]."""
+"""Time with a zero command after each script [s]."""
 
 
 class ScriptedOperator(Operator):
@@ -64,9 +65,10 @@ class ScriptedOperator(Operator):
     """
 
     def __init__(self, scripts: Sequence[Script]) -> None:
+        """Run scripts in this order."""
         self.scripts = tuple(scripts)
         self.seconds = sum(script.seconds + _PAUSE_S for script in scripts)
-        """While the policy runs [s]."""
+        """Time for which the policy runs [s]."""
         self._began: float | None = None
         self._requested_in = Mode.ENDED
         self._over = False
@@ -81,7 +83,7 @@ class ScriptedOperator(Operator):
         self._over = True
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The scripts' input."""
+        """Return the scripts' input."""
         if self._over:
             return OperatorCommand(request=OperatorRequest.QUIT)
         if mode is Mode.DAMP:
@@ -89,7 +91,8 @@ class ScriptedOperator(Operator):
         if mode is Mode.STAND:
             return OperatorCommand(held=True, request=self._once(OperatorRequest.WALK, mode))
         if mode is Mode.POLICY:
-            self._began = now if self._began is None else self._began
+            if self._began is None:
+                self._began = now
             t = now - self._began
             for script in self.scripts:
                 if 0.0 <= t < script.seconds:
@@ -99,7 +102,7 @@ class ScriptedOperator(Operator):
         return OperatorCommand(held=True)
 
     def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
-        """A request, once in each mode."""
+        """Return a request, once in each mode."""
         if self._requested_in is mode:
             return OperatorRequest.NONE
         self._requested_in = mode
@@ -111,30 +114,33 @@ class BenchOperator(Operator):
 
     def __init__(self, clamp_operator: ClampOperator) -> None:
         """`clamp_operator` clamps joints; it is called in a thread of its own."""
-        self._clamp = clamp_operator
-        self._next = OperatorRequest.NONE
+        self._clamp_operator = clamp_operator
+        self._request = OperatorRequest.NONE
+        """Request to send next."""
         self.error: PronkError | None = None
-        """Why joints could not be clamped."""
+        """Error for which joints could not be clamped; None if there was none."""
 
     def notified(self, kind: str, text: str) -> None:
         """Have joints clamped."""
         if kind == "clamp":
             joints = tuple(name for name in text.split(", ") if name)
-            threading.Thread(target=self._fix, args=(joints,), daemon=True).start()
+            threading.Thread(target=self._clamp, args=(joints,), daemon=True).start()
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The dead-man button is held; a request once joints are clamped, or cannot be."""
-        request, self._next = self._next, OperatorRequest.NONE
+        """Return a held dead-man button; a request once joints are clamped, or cannot be."""
+        request = self._request
+        self._request = OperatorRequest.NONE
         return OperatorCommand(held=True, request=request)
 
-    def _fix(self, joints: tuple[str, ...]) -> None:
+    def _clamp(self, joints: tuple[str, ...]) -> None:
+        """Have joints clamped, and request that the sweep goes on or ends; runs in a thread."""
         try:
-            self._clamp(joints)
+            self._clamp_operator(joints)
         except PronkError as error:
             self.error = error
         except Exception as error:
             self.error = HardwareError(f"{type(error).__name__}: {error}")
-        self._next = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
+        self._request = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
 
 
 class TimeLimit(Operator):
@@ -146,24 +152,33 @@ class TimeLimit(Operator):
         self._seconds = seconds
         self._began: float | None = None
         self._sat = False
-        self.notified = operator.notified  # type: ignore[method-assign]
-        self.leave = operator.leave  # type: ignore[method-assign]
-        self.close = operator.close  # type: ignore[method-assign]
+
+    def notified(self, kind: str, text: str) -> None:
+        """Pass an event of the servo on."""
+        self._operator.notified(kind, text)
+
+    def leave(self) -> None:
+        """End, because the program was interrupted."""
+        self._operator.leave()
+
+    def close(self) -> None:
+        """Release the other operator's device."""
+        self._operator.close()
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The other's input, until the time is over; then its requests to damp and to end."""
-        given = self._operator.command(now, mode)
+        """Return the other's input, until the time is over; then its requests to damp or end."""
+        command = self._operator.command(now, mode)
         if mode is Mode.POLICY and self._began is None:
             self._began = now
         over = self._began is not None and now - self._began >= self._seconds
-        if not over or given.request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
-            return given
+        if not over or command.request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
+            return command
         if mode is Mode.DAMP:
             return OperatorCommand(request=OperatorRequest.QUIT)
         if mode is not Mode.POLICY or self._sat:
-            return OperatorCommand(held=given.held)
+            return OperatorCommand(held=command.held)
         self._sat = True
-        return OperatorCommand(held=given.held, request=OperatorRequest.SIT)
+        return OperatorCommand(held=command.held, request=OperatorRequest.SIT)
 
 
 HELP = """\
@@ -172,8 +187,15 @@ HELP = """\
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
 
-_STEPS = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1)}
-_STEPS |= {"j": (2, 0.2), "l": (2, -0.2)}
+_STEPS = {
+    "w": (0, 0.25),
+    "s": (0, -0.25),
+    "a": (1, 0.1),
+    "d": (1, -0.1),
+    "j": (2, 0.2),
+    "l": (2, -0.2),
+}
+"""Axis of the velocity command and change of it, for each key."""
 _REQUESTS = {
     "1": OperatorRequest.STAND,
     "2": OperatorRequest.WALK,
@@ -186,31 +208,11 @@ _REPEAT_S = 0.8
 """A key counts as held for this long; keyboards repeat a key after 0.66 s at most [s]."""
 
 
-class Device(Operator):
-    """A device that is read by its file descriptor."""
-
-    def __init__(self, fd: int, ranges: Ranges) -> None:
-        self._fd, self._ranges = fd, tuple(ranges.values())
-        self._jump = -1e9
-        """When the jump was pressed last [s]."""
-        self._connected = True
-
-    def _read(self) -> bytes:
-        """What has come since the last call; notes the end of the device."""
-        data = b""
-        while select.select([self._fd], [], [], 0.0)[0]:
-            try:
-                part = os.read(self._fd, 4096)
-            except OSError:
-                part = b""
-            if not part:
-                self._connected = False
-                break
-            data += part
-        return data
+_NEVER = -1e9
+"""Time of a key that was not pressed yet [s]."""
 
 
-class Keyboard(Device):
+class Keyboard(Operator):
     """Keys of a terminal.
 
     A terminal does not report the release of a key, only its repetition, so the dead-man button is
@@ -219,21 +221,27 @@ class Keyboard(Device):
 
     def __init__(self, ranges: Ranges, stream: int | None = None) -> None:
         """Read standard input key by key, or another file; HardwareError if it is no terminal."""
-        super().__init__(sys.stdin.fileno() if stream is None else stream, ranges)
+        self._fd = sys.stdin.fileno() if stream is None else stream
+        self._ranges = tuple(ranges.values())
+        self._jump_pressed = _NEVER
+        """Time at which the jump key came last [s]."""
+        self._connected = True
         if not os.isatty(self._fd):
             raise HardwareError(
                 "there is no keyboard (standard input is no terminal); run it in a terminal, use "
                 "--gamepad, or --script for a run without an operator."
             )
-        self._before = termios.tcgetattr(self._fd)
+        self._attributes = termios.tcgetattr(self._fd)
+        """Attributes of the terminal before this program."""
         tty.setcbreak(self._fd)
         self._command = [0.0, 0.0, 0.0]
-        self._held = -1e9
+        self._dead_man_pressed = _NEVER
+        """Time at which the dead-man key came last [s]."""
 
     def close(self) -> None:
         """Restore the terminal."""
         with suppress(termios.error):
-            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._attributes)
 
     def notified(self, kind: str, text: str) -> None:
         """Reset the velocity command when the mode changes."""
@@ -241,13 +249,14 @@ class Keyboard(Device):
             self._command = [0.0, 0.0, 0.0]
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """The keys' input."""
-        request, keys = OperatorRequest.NONE, self._read().decode("ascii", "ignore")
+        """Return the keys' input."""
+        request = OperatorRequest.NONE
+        keys = self._read().decode("ascii", "ignore")
         if not self._connected:
             return OperatorCommand(request=OperatorRequest.QUIT)
         for key in keys:
             if key == " ":
-                self._held = now
+                self._dead_man_pressed = now
             elif key in _STEPS:
                 axis, step = _STEPS[key]
                 low, high = self._ranges[axis]
@@ -255,16 +264,30 @@ class Keyboard(Device):
             elif key == "x":
                 self._command = [0.0, 0.0, 0.0]
             elif key in "\r\n":
-                self._jump = now
+                self._jump_pressed = now
             elif key in _REQUESTS:
                 request = _REQUESTS[key]
         forward, left, yaw = self._command
         return OperatorCommand(
             command=(forward, left, yaw),
-            jump=now - self._jump < JUMP_S,
-            held=now - self._held < _REPEAT_S,
+            jump=now - self._jump_pressed < JUMP_S,
+            held=now - self._dead_man_pressed < _REPEAT_S,
             request=request,
         )
+
+    def _read(self) -> bytes:
+        """Return what has come since the last call; note the end of the device."""
+        data = b""
+        while select.select([self._fd], [], [], 0.0)[0]:
+            try:
+                received = os.read(self._fd, 4096)
+            except OSError:
+                received = b""
+            if not received:
+                self._connected = False
+                break
+            data += received
+        return data
 
 
 _PAD_REQUESTS: dict[int, OperatorRequest] = {

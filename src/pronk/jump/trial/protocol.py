@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from pronk.errors import PronkError
-from pronk.policy.script import STILL, Velocity
+from pronk.policy.script import PAPER_VELOCITIES, STILL, Velocity, parse_velocity
 
 MeanStd = tuple[float, float]
 """Mean and standard deviation."""
@@ -49,7 +47,7 @@ def named(*names: str) -> tuple[Case, ...]:
     return tuple(Case(name=name, command=_COMMANDS[name]) for name in names)
 
 
-PAPER_COMMANDS = named("forward 1", "forward 2", "side -1", "side +1", "back 2")
+PAPER_COMMANDS = tuple(Case(name=name, command=PAPER_VELOCITIES[name]) for name in PAPER_VELOCITIES)
 """The jumps of Table III of the paper."""
 # Paper R7.
 RATES = Case(name="forward 2.25", command=_COMMANDS["forward 2.25"])
@@ -69,17 +67,7 @@ def parse_cases(texts: Iterable[str]) -> tuple[Case, ...]:
 
 def parse_case(text: str) -> Case:
     """Return the case of a command as `1,0` or `1,0,0`; one of the paper's keeps its name."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
-        raise PronkError(
-            f"command {text!r}; expected two or three numbers between commas, forward and left "
-            'velocity [m/s] and yaw rate [rad/s], as in "1,0,0".'
-        )
-    yaw_rate = values[2] if len(values) == 3 else 0.0
-    command = (values[0], values[1], yaw_rate)
+    command = parse_velocity(text)
     for case in (*PAPER_COMMANDS, RATES):
         if case.command == command:
             return case

@@ -1,0 +1,286 @@
+"""Limits of the safety filter: those of a robot, and those that hold for any robot.
+
+`Limits.of` takes the ranges, drives and operating limits of a robot's file. The other groups have
+the values that were measured with the virtual Mini Cheetah: 10.02 h of walking, running and 8,665
+jumps without a false alarm (`python -m benchmarks supervision`, docs/hardware.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from pronk.arrays import Array
+from pronk.errors import RobotError
+from pronk.robots.limits import OperatingLimits
+from pronk.robots.motor import winding_loss
+from pronk.robots.robot import RobotSpec
+
+
+def _require_positive(group: str, numbers: Mapping[str, float]) -> None:
+    """Raise a RobotError for a limit that is not positive and finite."""
+    for name, number in numbers.items():
+        if not 0.0 < number < math.inf:
+            raise RobotError(f"{group}.{name} is {number}; it must be positive and finite.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointLimits:
+    """Limits and constants of the joints. Arrays have the shape (joints,), in file order."""
+
+    names: tuple[str, ...]
+    """Names of the joints."""
+    low: Array
+    """Lower mechanical limit [rad]."""
+    high: Array
+    """Upper mechanical limit [rad]."""
+    speed: Array
+    """Largest measured speed [rad/s]."""
+    torque: Array
+    """Largest commanded torque [N m]."""
+    measured_torque: Array
+    """Largest measured torque [N m]; infinite where it is not checked: a policy's landings exceed
+    the commanded one for some milliseconds."""
+    stall: Array
+    """Torque at standstill with the nominal bus voltage across the winding [N m]."""
+    no_load: Array
+    """Speed at which that torque is zero [rad/s]."""
+    loss: Array
+    """Winding loss per square of the joint's torque [W / (N m)^2]."""
+    felt: Array
+    """Change of the commanded torque that a joint shows by a bit at least [N m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse arrays of another shape, and numbers that are not finite."""
+        arrays = {
+            "low": self.low,
+            "high": self.high,
+            "speed": self.speed,
+            "torque": self.torque,
+            "stall": self.stall,
+            "no_load": self.no_load,
+            "loss": self.loss,
+            "felt": self.felt,
+        }
+        count = len(self.names)
+        for name, values in arrays.items():
+            if np.shape(values) != (count,) or not np.isfinite(values).all():
+                raise RobotError(f"JointLimits.{name} is {values}; expected {count} numbers.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgeLimits:
+    """How old states and commands may be."""
+
+    hold_s: float = 0.02
+    """Age of the state from which the last target is held [s]."""
+    damp_s: float = 0.05
+    """Age of the state from which the joints are damped [s]."""
+    latch_s: float = 0.1
+    """Age of the state from which the fault is latched [s]."""
+    future_s: float = 0.005
+    """A state or command stamped farther ahead than this is of another clock [s]."""
+    held_s: float = 0.1
+    """Longest time that targets are held in any second [s]."""
+    expiry_s: float = 0.05
+    """Longest time that any command is repeated, whatever its own validity [s]."""
+    lag: float = 30.0
+    """Largest number of states, at `LAG_RATE_HZ`, between the newest one and the one that a command
+    was computed from: three policy steps."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing, and ages that fall from hold to latch."""
+        _require_positive(
+            "AgeLimits",
+            {
+                "hold_s": self.hold_s,
+                "damp_s": self.damp_s,
+                "latch_s": self.latch_s,
+                "future_s": self.future_s,
+                "held_s": self.held_s,
+                "expiry_s": self.expiry_s,
+                "lag": self.lag,
+            },
+        )
+        if not self.hold_s <= self.damp_s <= self.latch_s:
+            raise RobotError(
+                f"ages {self.hold_s}, {self.damp_s}, {self.latch_s} s to hold, damp and latch; "
+                "they must not fall."
+            )
+
+
+LAG_RATE_HZ = 500.0
+"""States per second of which `AgeLimits.lag` counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockedLimits:
+    """How long targets may be limited by torque."""
+
+    clipped_s: float = 0.3
+    """Longest time that targets are limited by torque without a break [s]: twice the longest of a
+    jumping policy (0.164 s in 8,665 jumps)."""
+    blocked_s: float = 0.2
+    """Longest time that the target of one joint is limited, in one direction, without its moving by
+    `motion` [s]. One take-off of 8,677 jumps took 0.146 s, all others 0.086 s at most; in 8,665
+    other jumps it was 0.100 s at most."""
+    motion: float = 0.05
+    """Motion that counts [rad]; most jumps limit a joint for 0.12 s, in which it moves by 0.7."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        _require_positive(
+            "BlockedLimits",
+            {"clipped_s": self.clipped_s, "blocked_s": self.blocked_s, "motion": self.motion},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorLimits:
+    """How far the sensors may contradict each other; `pronk.deploy.runtime.supervision`."""
+
+    repeat_s: float = 0.04
+    """Longest time that attitude, gyro or accelerometer may repeat: an attitude of LCM may be 20 ms
+    old. Also the time from which a constant position or velocity counts [s]."""
+    attitude: float = 0.06
+    """Largest difference of attitude and integral of the gyro [rad]; 1.7 times the largest of an
+    hour."""
+    turned: float = 0.03
+    """Integral of the gyro from which the attitude must have moved too [rad]."""
+    stuck_share: float = 0.25
+    """Least path of the attitude, as a share of the integral of the gyro; the least measured is
+    0.86."""
+    upright: float = 0.5
+    """Largest angle between the mean specific force and the attitude's vertical [rad]; twice the
+    largest of an hour."""
+    encoder: float = 0.18
+    """Largest difference of position and integral of velocity [rad]; the largest measured is 0.13
+    with a third of the states lost, 0.01 with all of them."""
+    moved: float = 0.005
+    """Largest range of the integral of velocity at a constant position, or the reverse [rad]: three
+    steps of an encoder of 12 bits."""
+    others: float = 0.05
+    """Largest sum of the displacements of other joints while one is constant for `repeat_s` [rad];
+    the largest measured is 0.003, with encoders of 12 bits without noise."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        _require_positive(
+            "SensorLimits",
+            {
+                "repeat_s": self.repeat_s,
+                "attitude": self.attitude,
+                "turned": self.turned,
+                "stuck_share": self.stuck_share,
+                "upright": self.upright,
+                "encoder": self.encoder,
+                "moved": self.moved,
+                "others": self.others,
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """All limits of the safety filter for one robot."""
+
+    joints: JointLimits
+    """Limits and constants of the joints."""
+    operating: OperatingLimits = field(default_factory=OperatingLimits)
+    """Limits of commands and measurements from the robot's file."""
+    ages: AgeLimits = field(default_factory=AgeLimits)
+    """Ages of states and commands."""
+    blocked: BlockedLimits = field(default_factory=BlockedLimits)
+    """Times for which targets may be limited by torque."""
+    sensors: SensorLimits = field(default_factory=SensorLimits)
+    """Contradictions of the sensors."""
+
+    def __post_init__(self) -> None:
+        """Refuse a margin that leaves no target."""
+        span = self.joints.high - self.joints.low
+        if not (span > 2.0 * self.operating.margin).all():
+            raise RobotError(
+                f"OperatingLimits.margin is {self.operating.margin}, which leaves nothing between "
+                "the mechanical limits of a joint; make it smaller."
+            )
+
+    @property
+    def trunk_is_free(self) -> bool:
+        """Whether the trunk can move; a hung robot has no limit of its tilt."""
+        return math.isfinite(self.operating.tilt)
+
+    @cached_property
+    def measured(self) -> tuple[Array, Array]:
+        """Least and largest position, velocity, torque and temperature, (4 joints,) each."""
+        joints = self.joints
+        hottest = np.full_like(joints.low, self.operating.temperature)
+        coldest = np.full_like(joints.low, -np.inf)
+        least = (
+            joints.low - self.operating.overrun,
+            -joints.speed,
+            -joints.measured_torque,
+            coldest,
+        )
+        largest = (
+            joints.high + self.operating.overrun,
+            joints.speed,
+            joints.measured_torque,
+            hottest,
+        )
+        return np.concatenate(least), np.concatenate(largest)
+
+    @cached_property
+    def gains(self) -> Array:
+        """Largest stiffness and damping of a command, (2 joints,)."""
+        return np.repeat([self.operating.stiffness, self.operating.damping], len(self.joints.names))
+
+    @classmethod
+    def of(cls, robot: RobotSpec) -> Limits:
+        """Return the limits of a robot: its ranges, effort limits and operating limits.
+
+        Speeds are 1.2 times the no-load speed, because impacts exceed it. Measured torques are not
+        checked.
+        """
+        low = []
+        high = []
+        no_load = []
+        torque = []
+        stall = []
+        loss = []
+        felt = []
+        for joint in robot.joints:
+            drive = joint.drive
+            low.append(joint.range[0])
+            high.append(joint.range[1])
+            no_load.append(drive.no_load_speed)
+            torque.append(drive.effort_limit)
+            stall.append(drive.stall_torque)
+            loss.append(
+                winding_loss(
+                    1.0,
+                    gear_ratio=drive.gear_ratio,
+                    torque_constant=drive.torque_constant,
+                    stall_torque=drive.stall_torque,
+                    bus_voltage=drive.bus_voltage,
+                )
+            )
+            # From one direction of slip to the other dry friction takes up twice its size; that
+            # again for a drive whose friction is twice the nominal.
+            felt.append(0.05 * drive.effort_limit + 4.0 * drive.frictionloss)
+        joints = JointLimits(
+            names=robot.joint_names,
+            low=np.array(low, dtype=float),
+            high=np.array(high, dtype=float),
+            speed=1.2 * np.array(no_load),
+            torque=np.array(torque),
+            measured_torque=np.full(len(torque), np.inf),
+            stall=np.array(stall),
+            no_load=np.array(no_load),
+            loss=np.array(loss, dtype=float),
+            felt=np.array(felt),
+        )
+        return cls(joints=joints, operating=robot.limits)

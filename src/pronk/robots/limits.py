@@ -1,0 +1,57 @@
+"""Operating limits of a robot: the section `limits` of its `robot.yaml`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pronk.errors import RobotError
+
+
+@dataclass(frozen=True, kw_only=True)
+class OperatingLimits:
+    """Limits of the commands to a robot and of its measurements, for the safety filter.
+
+    The defaults hold for a legged robot of the size of a Mini Cheetah; ranges, speeds and torques
+    are those of the joints and drives.
+    """
+
+    stiffness: float = 100.0
+    """Largest stiffness of a command [N m/rad]."""
+    damping: float = 5.0
+    """Largest damping of a command [N m s/rad]."""
+    margin: float = 0.05
+    """Distance between targets and the mechanical limits [rad]."""
+    horizon_s: float = 0.02
+    """Time ahead [s]: a joint that would leave its limits in it is not driven further out."""
+    change: float = 1.0
+    """Largest change of a target from one tick of the servo to the next [rad]."""
+    power_w: float = 5000.0
+    """Largest bus power of a command [W], computed from the torques that the drives can give at
+    their speeds, with winding losses and without recovery."""
+    overrun: float = 0.15
+    """Distance beyond a mechanical limit from which a measured position is a fault [rad]."""
+    tilt: float = 0.8
+    """Largest angle of the trunk's z axis from the vertical [rad]; infinite for a hung robot."""
+    temperature: float = 80.0
+    """Largest temperature of a motor, where it is measured [deg C]."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        numbers = {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "margin": self.margin,
+            "horizon_s": self.horizon_s,
+            "change": self.change,
+            "power_w": self.power_w,
+            "overrun": self.overrun,
+            "temperature": self.temperature,
+        }
+        for name, number in numbers.items():
+            if not 0.0 < number < math.inf:
+                raise RobotError(
+                    f"OperatingLimits.{name} is {number}; it must be positive and finite."
+                )
+        if not self.tilt > 0.0:
+            raise RobotError(f"OperatingLimits.tilt is {self.tilt}; it must be positive.")
