@@ -37,7 +37,7 @@ from mcap.writer import Writer
 
 import pronk.identify.match.gains as gains_file
 from pronk.cli import console
-from pronk.cli.export import Target
+from pronk.cli.export import TargetName
 from pronk.cli.main import run
 from pronk.deploy.runtime.deploy_log import read_deploy_log
 from pronk.deploy.runtime.log import DeployLogWriter
@@ -49,7 +49,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import records
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match import result as match_file
-from pronk.identify.match.export import export_text
+from pronk.identify.match.export.targets import export
 from pronk.identify.match.predict import load_prediction
 from pronk.identify.response import response as response_file
 from pronk.jump.trial import results
@@ -185,9 +185,9 @@ def _kinds() -> dict[str, _Kind]:
 
     def gains(path: Path) -> None:
         found = gains_file.load_gains(path)
-        for target in get_args(Target):
+        for target in get_args(TargetName):
             with contextlib.suppress(PronkError):
-                write_text(path.parent / "out" / "a.py", export_text(found, target, None))
+                write_text(path.parent / "out" / "a.py", export(found, target))
 
     def match(path: Path) -> Any:
         return match_file.load(path, gains_file.load_gains(path.with_name("gains.yaml")))

@@ -18,6 +18,7 @@ from pronk.version import VERSION
 
 if TYPE_CHECKING:
     from pronk.identify.logs.readers import read_log, read_logs
+    from pronk.identify.match.export.targets import export
     from pronk.identify.match.pipeline import match_logs as match
     from pronk.identify.match.predict import predict
     from pronk.identify.response.estimate import estimate as response
@@ -25,9 +26,19 @@ if TYPE_CHECKING:
     from pronk.robots import load_robot
 
 __version__ = VERSION
-__all__ = ["load_policy", "load_robot", "match", "predict", "read_log", "read_logs", "response"]
+__all__ = [
+    "export",
+    "load_policy",
+    "load_robot",
+    "match",
+    "predict",
+    "read_log",
+    "read_logs",
+    "response",
+]
 
 _HOMES = {
+    "export": ("pronk.identify.match.export.targets", "export"),
     "load_policy": ("pronk.policy.runtime", "load_policy"),
     "load_robot": ("pronk.robots", "load_robot"),
     "match": ("pronk.identify.match.pipeline", "match_logs"),

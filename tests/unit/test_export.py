@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from pronk.arrays import Array
-from pronk.cli.export import Target
+from pronk.cli.export import TargetName
 from pronk.errors import PronkError
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.export import TARGETS, Actuator, actuators, export_text
+from pronk.identify.match.export.actuators import Actuator, exported_actuators
+from pronk.identify.match.export.targets import TARGETS, export
 from pronk.identify.match.gains import FittedValue, JointGains, MatchedGains
 from pronk.identify.match.parameters import GAINS
 from pronk.identify.match.predict import drives_of
@@ -95,13 +96,13 @@ def driven_joints(model: mujoco.MjModel) -> list[str]:
 @pytest.mark.parametrize("target", ["mjlab", "mjlab-idealpd", "mjlab-builtin"])
 def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
     gains = for_target(target, frictionloss=0.15, delay_s=0.011)
-    text = export_text(gains, target)
+    text = export(gains, target)
     assert {*driven_joints(entity_model(ROBOT, text))} == {*ROBOT.joint_names}
     space = evaluated(text)
     rows = zip(space["ACTUATORS"], space["EVENTS"].values(), gains.groups.items(), strict=True)
     for i, (cfg, event, (name, group)) in enumerate(rows):
         drive = ROBOT.group(name)[0].drive
-        assert type(cfg).__name__ == TARGETS[target].call
+        assert type(cfg).__name__ == TARGETS[target].config_class
         assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
         assert (cfg.stiffness, cfg.damping) == (group.stiffness, group.damping)
         assert cfg.armature == pytest.approx(drive.armature)
@@ -120,7 +121,7 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
 @pytest.mark.parametrize("target", [name for name in TARGETS if name.startswith("isaaclab")])
 def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
     gains = for_target(target, frictionloss=0.15, delay_s=0.011)
-    text = export_text(gains, target)
+    text = export(gains, target)
     nodes = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
     calls = [node for node in nodes if isinstance(node.func, ast.Name)]
     assert len(calls) == len(gains.groups)
@@ -139,7 +140,7 @@ def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
 
 def test_genesis_text_sets_every_parameter_of_every_joint() -> None:
     gains = for_target("genesis", robot_name="go2")
-    space = evaluated(export_text(gains, "genesis", per="joint"))
+    space = evaluated(export(gains, "genesis", per="joint"))
     called = {}
 
     class Robot:
@@ -170,7 +171,7 @@ def test_playground_text_gives_a_model_the_explicit_law() -> None:
         1e-3"/><joint name="FR_knee" axis="0 1 0" damping="3"/></body></worldbody>
         <actuator><position joint="FR_knee" kp="1" kv="2"/></actuator></mujoco>"""
     )
-    space = evaluated(export_text(gains, "playground", per="joint"))
+    space = evaluated(export(gains, "playground", per="joint"))
     space["JOINTS"] = {"FR_knee": space["JOINTS"]["FR_knee"] | {"frictionloss": 0.0}}
     space["apply"](model)
     own, drive = gains.joints["FR_knee"], ROBOT.joint("FR_knee").drive
@@ -190,7 +191,7 @@ def test_playground_text_gives_a_model_the_explicit_law() -> None:
 
 def test_newton_text_is_a_usd_layer_in_radians_and_degrees(tmp_path: Any) -> None:
     gains = matched("go2", "isaaclab-explicit", delay_s=0.01)
-    text = export_text(gains, "newton-usd")
+    text = export(gains, "newton-usd")
     assert text.startswith("#usda 1.0\n")
     assert text.count("def NewtonActuator") == 12
     assert "rel newton:targets = </Robot/joints/FR_calf_joint>" in text
@@ -259,8 +260,8 @@ def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     # A history of parts of a step is interpolated between the parts.
     delay = 2.0 * holds.timestep_s if holds.iterations > 1 else 0.0123
     gains = matched("so101", name, delay_s=delay)
-    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
-    snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
+    model = mujoco.MjModel.from_xml_string(export(gains, "mjcf", arm, per="joint"))
+    snippet = export(gains, "mjcf-snippet", arm, per="joint")
     assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
     known = holds.robot(arm)
     assert_moves(model, *motion(known, drives_of(known, gains)), steps=holds.iterations)
@@ -270,7 +271,7 @@ def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
 def test_joints_of_mjlab_move_as_its_profile_does() -> None:
     arm, name = smooth_arm(), "mjlab-builtin"
     gains, known = matched("so101", name), profile(name).robot(arm)
-    model = entity_model(arm, export_text(gains, name, arm, per="joint"))
+    model = entity_model(arm, export(gains, name, arm, per="joint"))
     # As mjlab's SimulationCfg sets them.
     model.opt.timestep = known.timestep_s
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -280,20 +281,20 @@ def test_joints_of_mjlab_move_as_its_profile_does() -> None:
 
 def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
     arm, gains = load_robot("so101"), matched("so101", frictionloss=0.2, stribeck=0.6)
-    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
+    model = mujoco.MjModel.from_xml_string(export(gains, "mjcf"))
     drives = drives_of(arm, gains)
     for name, group in gains.groups.items():
         drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
     assert_moves(model, *motion(arm, drives, 400), within=1e-5)
-    assert "elbow_flex 0.6" in export_text(gains, "mjlab").replace("\n# ", " ")
-    assert "elbow_flex" not in export_text(matched("so101"), "mjlab").partition("import")[0]
-    static = export_text(gains, "isaaclab-dcmotor")
+    assert "elbow_flex 0.6" in export(gains, "mjlab").replace("\n# ", " ")
+    assert "elbow_flex" not in export(matched("so101"), "mjlab").partition("import")[0]
+    static = export(gains, "isaaclab-dcmotor")
     assert "friction=0.2,\n        dynamic_friction=0.08," in static
 
 
 @pytest.mark.parametrize("target", list(TARGETS))
 def test_every_export_says_what_it_holds_for(target: str) -> None:
-    text = export_text(for_target(target, only="_knee"), target)
+    text = export(for_target(target, only="_knee"), target)
     text = text.replace("\n# ", " ").replace("\n", " ")
     holds = profile(TARGETS[target].profile or "isaaclab-implicit")
     law = f"drive law {holds.drive_law.label}, timestep {holds.timestep_s:g}"
@@ -304,9 +305,9 @@ def test_every_export_says_what_it_holds_for(target: str) -> None:
 
 def test_unmatched_joints_have_the_gains_of_their_group() -> None:
     gains = matched(only="FR_knee")
-    (knee,) = actuators(gains, ROBOT)
+    (knee,) = exported_actuators(gains, ROBOT)
     assert knee.unmatched == ("FL_knee", "HR_knee", "HL_knee")
-    for one in actuators(gains, ROBOT, "joint"):
+    for one in exported_actuators(gains, ROBOT, "joint"):
         group = gains.groups["knee"]
         expected = (group.stiffness, group.damping)
         if one.name == "FR_knee":
@@ -318,8 +319,8 @@ def test_unmatched_joints_have_the_gains_of_their_group() -> None:
 def test_gains_of_another_drive_law_are_refused() -> None:
     for name, target in (("mjlab", "mjlab-builtin"), ("isaaclab-implicit", "isaaclab-dcmotor")):
         with pytest.raises(PronkError, match=r"pronk translate GAINS --to"):
-            export_text(matched(simulator=name), target)
-    assert "DCMotorCfg" in export_text(matched(simulator="mjlab"), "isaaclab-dcmotor")
+            export(matched(simulator=name), target)
+    assert "DCMotorCfg" in export(matched(simulator="mjlab"), "isaaclab-dcmotor")
 
 
 @pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin", "newton-featherstone"])
@@ -329,7 +330,7 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     free = [replace(joint.drive, **loss, no_load_speed=1e6) for joint in arm.joints]
     joints = [replace(a, drive=b) for a, b in zip(arm.joints, free, strict=True)]
     robot = replace(profile(name).robot(arm), joints=tuple(joints))
-    drives = actuators(matched("so101", name), robot, "joint")
+    drives = exported_actuators(matched("so101", name), robot, "joint")
     # Only a large stiffness makes the law with implicit damping diverge.
     field = "stiffness" if name == "mjlab-builtin" else "damping"
 
@@ -364,17 +365,17 @@ def test_unstable_gains_are_refused() -> None:
     }
     groups = group_gains(load_robot("go2"), joints)
     with pytest.raises(PronkError, match="times the limit of drive law E"):
-        export_text(replace(gains, joints=joints, groups=groups), "mjlab")
+        export(replace(gains, joints=joints, groups=groups), "mjlab")
 
 
 def test_unknown_target_and_foreign_robot_are_refused() -> None:
-    assert get_args(Target) == tuple(TARGETS)
+    assert get_args(TargetName) == tuple(TARGETS)
     with pytest.raises(PronkError, match="mjcf-snippet"):
-        export_text(matched(), "gazebo")
+        export(matched(), "gazebo")
     with pytest.raises(PronkError, match="so101"):
-        actuators(matched(), load_robot("so101"))
+        exported_actuators(matched(), load_robot("so101"))
     own = replace(matched().simulator, profile="", engine="bullet")
     with pytest.raises(PronkError, match="simulator bullet, whose drive law"):
-        export_text(replace(matched(), simulator=own), "mjlab")
+        export(replace(matched(), simulator=own), "mjlab")
     with pytest.raises(PronkError, match="--robot PATH"):
-        export_text(replace(matched(), robot="mine"), "mjlab")
+        export(replace(matched(), robot="mine"), "mjlab")

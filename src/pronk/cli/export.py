@@ -9,7 +9,7 @@ import tyro
 
 from pronk.cli import console
 
-Target = Literal[
+TargetName = Literal[
     "mjlab",
     "mjlab-idealpd",
     "mjlab-builtin",
@@ -26,11 +26,12 @@ Target = Literal[
     "mjcf",
     "mjcf-snippet",
 ]
+"""Names in `TARGETS`, which takes too long to import for `--help`; a test holds them together."""
 
 
-def export(
+def export_gains(
     gains: tyro.conf.Positional[Path],
-    to: Target,
+    to: TargetName,
     out: Path,
     robot: str | None = None,
     per: Literal["group", "joint"] = "group",
@@ -45,10 +46,10 @@ def export(
         per: One actuator per joint group, with the group's gains, or per joint, with its own.
     """
     from pronk.files import write_text
-    from pronk.identify.match import gains as gains_file
-    from pronk.identify.match.export import export_text
+    from pronk.identify.match.export.targets import export
+    from pronk.identify.match.gains import load_gains
     from pronk.robots import load_robot
 
-    known = load_robot(robot) if robot else None
-    write_text(out, export_text(gains_file.load_gains(gains), to, known, per=per))
+    robot_spec = load_robot(robot) if robot else None
+    write_text(out, export(load_gains(gains), to, robot_spec, per=per))
     return console.Outcome(figures={"written": out, "to": to}, wrote=[out])

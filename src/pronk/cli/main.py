@@ -32,7 +32,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.predict:predict", "Replay logs that the fit has not used."),
-    "export": ("pronk.cli.export:export", "Write gains as configuration of a simulator."),
+    "export": ("pronk.cli.export:export_gains", "Write gains as configuration of a simulator."),
     "translate": (
         "pronk.cli.translate:translate",
         "Translate gains for a framework of another drive law.",

@@ -35,7 +35,7 @@ def translate(
     """
     from pronk.identify.match import gains as gains_file
     from pronk.identify.match import translate as translation
-    from pronk.identify.match.export import profile_held, robot_of
+    from pronk.identify.match.export.actuators import profile_held, robot_of
     from pronk.identify.match.measured_joint import gains_by_joint
     from pronk.identify.simulators.profiles import load_profiles, profile
     from pronk.robots import load_robot

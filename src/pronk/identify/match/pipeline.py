@@ -16,7 +16,7 @@ from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.arm import fit_together
 from pronk.identify.match.checks import check_recordings, check_response
-from pronk.identify.match.export import actuators
+from pronk.identify.match.export.actuators import exported_actuators
 from pronk.identify.match.grid import (
     GridSearch,
     alike,
@@ -195,7 +195,7 @@ def match_frameworks(
         kind = _kind(robots[name])
         info = replace(framework.info, decimation=robots[name].decimation)
         theirs = replace(done[kind].gains, simulator=info)
-        require_stable(framework, robots[name], actuators(theirs, robots[name], "joint"))
+        require_stable(framework, robots[name], exported_actuators(theirs, robots[name], "joint"))
         timed = kind in others and others[kind].clock.name == name
         seconds = done[kind].seconds if timed else {}
         out[name] = replace(done[kind], gains=theirs, seconds=seconds)

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from pronk.arrays import Array
 from pronk.errors import PronkError
-from pronk.identify.match.export import actuators, profile_held
+from pronk.identify.match.export.actuators import exported_actuators, profile_held
 from pronk.identify.match.gains import (
     ZERO,
     FittedValue,
@@ -115,7 +115,8 @@ def translate(
 
     simulator = replace(to.info, decimation=target.decimation)
     translated_gains = replace(gains, simulator=simulator, joints=joints, groups=groups)
-    require_stable(to, target, actuators(translated_gains, target, "joint"))
+    actuators = exported_actuators(translated_gains, target, "joint")
+    require_stable(to, target, actuators)
     return translated_gains, translations
 
 

@@ -1,0 +1,205 @@
+"""The actuators that an export writes: joint groups, or single joints, with their parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pronk.errors import PronkError, RobotError
+from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.simulators.profiles import Profile, load_profiles, profile_of
+from pronk.robots import load_robot
+from pronk.robots.robot import Drive, Joint, RobotSpec
+
+Per = Literal["group", "joint"]
+"""Whether an actuator is a joint group or one joint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuator:
+    """Joints with the same parameters: a joint group, or one joint."""
+
+    name: str
+    """Name of the group or of the joint."""
+    joints: tuple[str, ...]
+    """Names of the joints in pronk."""
+    maker_joints: tuple[str, ...]
+    """Names of the same joints in the models of the robot's maker."""
+    unmatched: tuple[str, ...]
+    """Joints without a match of their own, which have the gains of their group."""
+    stiffness: float
+    """Stiffness [N m/rad]."""
+    damping: float
+    """Damping [N m s/rad]."""
+    stiffness_range: tuple[float, float]
+    """Lowest and highest stiffness of the uniform randomization [N m/rad]."""
+    damping_range: tuple[float, float]
+    """Lowest and highest damping of the uniform randomization, 0 or more [N m s/rad]."""
+    armature: float
+    """Rotor inertia at the joint [kg m^2]."""
+    frictionloss: float
+    """Dry friction at rest [N m]."""
+    stribeck: float
+    """Share of the dry friction that motion takes away, 0 to 1."""
+    delay_s: float
+    """Delay of the command [s]."""
+    drive: Drive
+    """Limits and viscous friction of the drive."""
+
+    def quantities(self) -> dict[str, float]:
+        """Return what a simulator can be given of the actuator, by name, in SI units."""
+        viscous_damping = self.drive.viscous_damping
+        return {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "armature": self.armature,
+            "frictionloss": self.frictionloss,
+            "viscous_damping": viscous_damping,
+            "effort_limit": self.drive.effort_limit,
+            "stall_torque": self.drive.stall_torque,
+            "no_load_speed": self.drive.no_load_speed,
+            # Dry friction in motion [N m].
+            "sliding_friction": self.frictionloss * (1.0 - self.stribeck),
+            # For an engine with one parameter for damping and viscous friction [N m s/rad].
+            "all_damping": self.damping + viscous_damping,
+            # Viscous friction per degree [N m s/degree].
+            "viscous_per_degree": math.radians(viscous_damping),
+        }
+
+
+def exported_actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list[Actuator]:
+    """List the matched groups, or the joints of these groups, in the robot's order.
+
+    Args:
+        gains: Matched gains.
+        robot: The robot that they were matched for.
+        per: `group` for an actuator with the gains of each group; `joint` for one with the gains
+            of each joint, or with those of its group where the joint was not matched.
+
+    Returns:
+        Actuators. A group has the means of its joints for armature, friction and delay.
+
+    Raises:
+        PronkError: The gains are of another robot, or hold no group.
+    """
+    if gains.robot != robot.name:
+        raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    if not gains.groups:
+        raise PronkError(
+            f"the gains of {gains.robot} hold no joint group; match some joints first."
+        )
+    actuators = []
+    for group in robot.groups:
+        if group not in gains.groups:
+            continue
+        members = robot.group(group)
+        if per == "group":
+            actuators.append(_group_actuator(gains, group, members))
+        else:
+            for joint in members:
+                actuators.append(_joint_actuator(gains, joint, members))
+    return actuators
+
+
+def _group_actuator(gains: MatchedGains, group: str, members: Sequence[Joint]) -> Actuator:
+    """Return the actuator of a whole group."""
+    group_gains = gains.groups[group]
+    return _actuator(
+        gains,
+        name=group,
+        joints=members,
+        gain_pair=(group_gains.stiffness, group_gains.damping),
+        sources=_matched_gains(gains, members),
+    )
+
+
+def _joint_actuator(gains: MatchedGains, joint: Joint, members: Sequence[Joint]) -> Actuator:
+    """Return the actuator of one joint of a group; of its group if it was not matched."""
+    group_gains = gains.groups[joint.group]
+    gain_pair = (group_gains.stiffness, group_gains.damping)
+    sources = _matched_gains(gains, members)
+    if joint.name in gains.joints:
+        joint_gains = gains.joints[joint.name]
+        gain_pair = (joint_gains.stiffness.value, joint_gains.damping.value)
+        sources = [joint_gains]
+    return _actuator(gains, name=joint.name, joints=[joint], gain_pair=gain_pair, sources=sources)
+
+
+def _matched_gains(gains: MatchedGains, joints: Sequence[Joint]) -> list[JointGains]:
+    """Return the gains of those joints that were matched."""
+    return [gains.joints[joint.name] for joint in joints if joint.name in gains.joints]
+
+
+def _actuator(
+    gains: MatchedGains,
+    *,
+    name: str,
+    joints: Sequence[Joint],
+    gain_pair: tuple[float, float],
+    sources: Sequence[JointGains],
+) -> Actuator:
+    """Return an actuator with a pair of gains, and the mean of what else the sources have."""
+    stiffness, damping = gain_pair
+    drive = joints[0].drive
+    group_gains = gains.groups[joints[0].group]
+    frictions = [source.frictionloss.value for source in sources]
+    stated_frictions = [friction for friction in frictions if not math.isnan(friction)]
+    return Actuator(
+        name=name,
+        joints=tuple(joint.name for joint in joints),
+        maker_joints=tuple(joint.own_name or joint.name for joint in joints),
+        unmatched=tuple(joint.name for joint in joints if joint.name not in gains.joints),
+        stiffness=stiffness,
+        damping=damping,
+        stiffness_range=_range_about(stiffness, group_gains.stiffness_range),
+        damping_range=_range_about(damping, group_gains.damping_range),
+        armature=_mean([source.armature.value for source in sources], drive.armature),
+        frictionloss=_mean(stated_frictions, drive.frictionloss),
+        stribeck=_mean([source.stribeck.value for source in sources], 0.0),
+        delay_s=_mean([source.delay_s.value for source in sources], 0.0),
+        drive=drive,
+    )
+
+
+def _mean(values: Sequence[float], default: float) -> float:
+    """Return the mean of some values, or a default without any."""
+    return float(np.mean(values)) if values else default
+
+
+def _range_about(middle: float, half_width: float) -> tuple[float, float]:
+    """Return the ends of a range, 0 or more, free of the last binary digits."""
+    return round(max(middle - half_width, 0.0), 9), round(middle + half_width, 9)
+
+
+def profile_held(gains: MatchedGains) -> Profile:
+    """Return the profile of the framework that gains hold for.
+
+    Raises:
+        PronkError: Their simulator has none; the message names the profiles.
+    """
+    try:
+        return profile_of(gains.simulator)
+    except PronkError:
+        raise PronkError(
+            f"the gains hold for simulator {gains.simulator.engine}, whose drive law pronk does "
+            f"not know; match with --for NAME, one of {', '.join(load_profiles())}."
+        ) from None
+
+
+def robot_of(gains: MatchedGains) -> RobotSpec:
+    """Load the robot of some gains by its name.
+
+    Raises:
+        PronkError: There is no robot of that name.
+    """
+    try:
+        return load_robot(gains.robot)
+    except RobotError:
+        raise PronkError(
+            f"the robot {gains.robot!r} of the gains is none that pronk knows by name; give "
+            "--robot PATH, the robot.yaml or model that they were matched with."
+        ) from None
