@@ -20,7 +20,7 @@ STRAIGHT = np.tile([0.0, 0.65, -1.3], 4)
 
 
 def contract(**changes: Any) -> Contract:
-    kept: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "robot": ROBOT.name,
         "joint_names": ROBOT.joint_names,
         "default_position": tuple(DEFAULT.tolist()),
@@ -40,14 +40,15 @@ def contract(**changes: Any) -> Contract:
         "lift_off_velocity": 2.5,
     }
     if not changes.get("jump", True):
-        kept["lift_off_velocity"] = None
-    return Contract(**(kept | changes))
+        fields["lift_off_velocity"] = None
+    fields.update(changes)
+    return Contract(**fields)
 
 
 def write_hopper(path: Path, strength: float = 1.0, **changes: Any) -> Path:
     """Write it as ONNX: action = jump * strength * straight / scale; contacts 1, velocity 0."""
     pytest.importorskip("onnx")
-    made = contract(**changes)
-    straight = strength * STRAIGHT / np.array(made.action_scale)
+    trained = contract(**changes)
+    straight = strength * STRAIGHT / np.array(trained.action_scale)
     still = np.zeros((MEASURED_SIZE, JOINTS))
-    return write_linear(path, made, still, straight if made.jump else None)
+    return write_linear(path, trained, still, straight if trained.jump else None)

@@ -30,7 +30,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Policy:
     return load_policy(write_hopper(tmp_path_factory.mktemp("hopper") / "policy.onnx"))
 
 
-class Tapped(VirtualRobot):
+class RecordedRobot(VirtualRobot):
     """A virtual robot that remembers what it was sent, and when."""
 
     def connect(self) -> None:
@@ -42,8 +42,8 @@ class Tapped(VirtualRobot):
         super().send(command)
 
 
-def standing() -> Tapped:
-    machine = Tapped(ROBOT, load_sim_params(), base="ground", start=Start(yaw=0.5))
+def standing() -> RecordedRobot:
+    machine = RecordedRobot(ROBOT, load_sim_params(), base="ground", start=Start(yaw=0.5))
     machine.connect()
     return machine
 
@@ -105,15 +105,15 @@ def test_a_policy_of_another_robot_sends_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "found"),
+    ("changes", "message"),
     [
         ({"position": DEFAULT + 0.6 * np.eye(12)[2]}, "FR_knee"),
         ({"position": np.full(12, np.nan)}, "nan"),
         ({"orientation": np.sqrt([0.5, 0.5, 0.0, 0.0])}, "90 degrees"),
     ],
 )
-def test_a_robot_that_does_not_stand_is_refused(changes: dict[str, Any], found: str) -> None:
+def test_a_robot_that_does_not_stand_is_refused(changes: dict[str, Any], message: str) -> None:
     state = standing().latest()
     check_standing(ROBOT, state)
-    with pytest.raises(HardwareError, match=found):
+    with pytest.raises(HardwareError, match=message):
         check_standing(ROBOT, replace(state, **changes))

@@ -26,13 +26,14 @@ WALK: dict[str, Any] = {"jump": False}
 
 
 def measurement(**changes: Any) -> Measurement:
-    kept: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "angular_velocity": np.zeros(3),
         "projected_gravity": [0.0, 0.0, -1.0],
         "position": DEFAULT,
         "velocity": np.zeros(12),
     }
-    return Measurement(**(kept | changes))
+    fields.update(changes)
+    return Measurement(**fields)
 
 
 # --- Contract -----------------------------------------------------------------------------------
@@ -75,7 +76,7 @@ BEYOND = {"vx": (-300.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
         ({"default_position": (1e3,) * 12}, "default_position"),
         ({"lift_off_velocity": 1e3}, "lift_off_velocity"),
         ({"command_ranges": BEYOND}, "command_ranges"),
-        ({"joint_names": ("..", *(f"j{i}" for i in range(11)))}, "name"),
+        ({"joint_names": ("..", *"abcdefghijk")}, "name"),
         # Other types, fields and schemas.
         ({"schema": "pronk/policy/9"}, "pronk/policy/9"),
         ({"mass": 1.0}, "mass"),
@@ -134,7 +135,8 @@ def test_a_contract_for_another_robot_or_gains_is_refused(
 
 
 def test_layout_by_hand() -> None:
-    three, two = (-0.04, -0.02, 0.0), (-0.04, -0.02)
+    three = (-0.04, -0.02, 0.0)
+    two = (-0.04, -0.02)
     assert [(part.name, part.size, part.times_s) for part in measured_layout(50.0)] == [
         ("angular_velocity", 3, (0.0,)),
         ("projected_gravity", 3, (0.0,)),
@@ -146,7 +148,8 @@ def test_layout_by_hand() -> None:
 
 
 def test_history_by_hand() -> None:
-    history, command = History(DEFAULT), (1.0, -0.5, 0.25)
+    history = History(DEFAULT)
+    command = (1.0, -0.5, 0.25)
     # The first sample fills the history; no action came before it.
     samples = [(1, 1, 1), (1, 1, 2), (1, 2, 3), (2, 3, 4)]
     actions = [(0, 0), (0, 100), (100, 101), (101, 102)]
@@ -184,8 +187,8 @@ def test_a_measurement_that_is_not_finite_is_refused(changes: dict[str, Any], ma
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
 def test_finite_numbers_of_any_size_and_type_are_read(kind: type) -> None:
-    most = 2**62 if kind is np.int64 else kind(3.4e38)  # its square overflows a float32
-    value = np.array([most, 1, -most], kind)
+    largest = 2**62 if kind is np.int64 else kind(3.4e38)  # its square overflows a float32
+    value = np.array([largest, 1, -largest], kind)
     np.testing.assert_array_equal(finite("it", value, (3,)), value.astype(np.float32))
     for bad in (math.nan, -math.inf, 1e39):
         with pytest.raises(ArtefactError, match=r"it is (nan|-?inf) at \[1\]"):
@@ -201,13 +204,19 @@ def write_network(path: Path, metadata: dict[str, str], *, jump: bool, width: in
     """A linear network: action, contact and velocity are columns of (measured, jump) WEIGHTS."""
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
-    helper, tensor = onnx.helper, onnx.numpy_helper.from_array
-    inputs = {"measured": width} | ({"jump": 1} if jump else {})
+    helper = onnx.helper
+    tensor = onnx.numpy_helper.from_array
+    inputs = {"measured": width}
+    if jump:
+        inputs["jump"] = 1
     outputs = {"action": 12, "contact": 4, "linear_velocity": 3}
 
-    def values(sizes: dict[str, int]) -> list[Any]:
-        kind = onnx.TensorProto.FLOAT
-        return [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in sizes.items()]
+    def described(sizes: dict[str, int]) -> list[Any]:
+        values = []
+        for name, size in sizes.items():
+            shape = ["batch", size]
+            values.append(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape))
+        return values
 
     weights = np.concatenate([WEIGHTS[:width], WEIGHTS[MEASURED_SIZE:]])[: width + jump]
     nodes = [
@@ -215,8 +224,8 @@ def write_network(path: Path, metadata: dict[str, str], *, jump: bool, width: in
         helper.make_node("MatMul", ["x", "weights"], ["y"]),
         helper.make_node("Split", ["y", "sizes"], list(outputs), axis=1),
     ]
-    given = [tensor(weights, "weights"), tensor(np.array([12, 4, 3]), "sizes")]
-    graph = helper.make_graph(nodes, "linear", values(inputs), values(outputs), given)
+    constants = [tensor(weights, "weights"), tensor(np.array([12, 4, 3]), "sizes")]
+    graph = helper.make_graph(nodes, "linear", described(inputs), described(outputs), constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     helper.set_model_props(model, metadata)
     path.write_bytes(model.SerializeToString())
@@ -224,9 +233,9 @@ def write_network(path: Path, metadata: dict[str, str], *, jump: bool, width: in
 
 
 def write_policy(folder: Path, **changes: Any) -> Path:
-    made = contract(**changes)
-    metadata = {METADATA_KEY: to_json(made)}
-    return write_network(folder / "policy.onnx", metadata, jump=made.jump)
+    trained = contract(**changes)
+    metadata = {METADATA_KEY: to_json(trained)}
+    return write_network(folder / "policy.onnx", metadata, jump=trained.jump)
 
 
 @pytest.fixture
@@ -322,30 +331,61 @@ def test_without_onnx_runtime_its_extra_is_named(
         load_policy(path)
 
 
-KINDS = ("Loop", "ConstantOfShape", "Expand", "If", "domain", "function")
-
-
-@pytest.mark.parametrize("kind", [*KINDS, "nodes", "weights of another file"])
-def test_a_network_beyond_a_plain_one_is_refused_unseen(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("place", ["initializer", "Constant"])
+@pytest.mark.parametrize("location", ["beside.bin", "../beside.bin", "/dev/zero"])
+def test_a_network_that_reads_another_file_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, location: str
+) -> None:
     onnx = pytest.importorskip("onnx")
     path = write_hopper(tmp_path / "policy.onnx")
     load_policy(path)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    for file in (tmp_path / "beside.bin", folder / "beside.bin"):
+        file.write_bytes(np.full(12, 7.0, np.float32).tobytes())
+    weights = onnx.numpy_helper.from_array(np.zeros(12, np.float32), "offset")
+    onnx.external_data_helper.set_external_data(weights, location, offset=0, length=48)
+    weights.ClearField("raw_data")
     model = onnx.load(path)
-    graph, node = model.graph, onnx.helper.make_node
-    if kind == "function":
-        made = [node("Add", ["x", "x"], ["y"])]
-        opset = [onnx.helper.make_opsetid("", 17)]
-        model.functions.append(onnx.helper.make_function("", "Add", ["x"], ["y"], made, opset))
-    elif kind == "domain":
-        graph.node[0].domain = "evil"
-    elif kind == "nodes":
-        graph.node.extend(node("Identity", ["one"], [f"x{i}"]) for i in range(3000))
-    elif kind == "weights of another file":
-        onnx.external_data_helper.set_external_data(graph.initializer[0], "/dev/zero")
+    if place == "initializer":
+        model.graph.initializer.append(weights)
     else:
-        graph.node.append(node(kind, ["one"], ["large"]))
+        model.graph.node.append(onnx.helper.make_node("Constant", [], ["offset"], value=weights))
+    model.graph.node.append(onnx.helper.make_node("Add", ["acted", "offset"], ["action"]))
+    for node in model.graph.node[:-1]:
+        for index, name in enumerate(node.output):
+            if name == "action":
+                node.output[index] = "acted"
     path.write_bytes(model.SerializeToString())
-    with pytest.raises(ArtefactError, match="may use" if kind in KINDS else kind):
+    with pytest.raises(ArtefactError, match="policy.onnx"):
+        load_policy(path)
+
+
+def test_a_file_larger_than_a_policy_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    with path.open("wb") as file:
+        file.truncate(2**26)
+    with pytest.raises(ArtefactError, match="64 MiB"):
+        load_policy(path)
+
+
+def test_a_network_without_end_is_stopped(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    path = write_hopper(tmp_path / "policy.onnx")
+    load_policy(path)
+    helper = onnx.helper
+    boolean = helper.make_tensor_value_info("go_on", onnx.TensorProto.BOOL, [])
+    condition = helper.make_tensor_value_info("condition", onnx.TensorProto.BOOL, [])
+    count = helper.make_tensor_value_info("count", onnx.TensorProto.INT64, [])
+    again = helper.make_node("Identity", ["condition"], ["go_on"])
+    body = helper.make_graph([again], "body", [count, condition], [boolean])
+    model = onnx.load(path)
+    yes = onnx.numpy_helper.from_array(np.array(True), "yes")
+    model.graph.initializer.append(yes)
+    model.graph.node.append(helper.make_node("Loop", ["", "yes"], [], body=body))
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(ArtefactError):
         load_policy(path)
 
 
@@ -357,9 +397,12 @@ def test_a_network_that_doubles_a_tensor_is_refused_before_the_memory_is_taken(
     path = write_hopper(tmp_path / "policy.onnx")
     load_policy(path)
     model = onnx.load(path)
-    graph, node = model.graph, onnx.helper.make_node
+    graph = model.graph
+    node = onnx.helper.make_node
     graph.node[-1].output[0] = "acted"
-    names = [begin, *(f"x{i}" for i in range(26))]
+    names = [begin]
+    for index in range(26):
+        names.append(f"x{index}")
     for before, after in pairwise(names):
         graph.node.append(node("Concat", [before, before], [after], axis=1))
     for name, value in {"zero": 0, "twelve": 12, "axis": 1}.items():
@@ -367,7 +410,7 @@ def test_a_network_that_doubles_a_tensor_is_refused_before_the_memory_is_taken(
     graph.node.append(node("Slice", [names[-1], "zero", "twelve", "axis"], ["part"]))
     graph.node.append(node("Add", ["acted", "part"], ["action"]))
     onnx.save(model, path)
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ArtefactError):
         load_policy(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - most < 300 << 10
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak_before < 300 << 10

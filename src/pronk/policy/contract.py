@@ -25,10 +25,17 @@ GAINS = ("matched", "naive")
 COMMANDS = ("vx", "vy", "yaw_rate")
 """The command in order: forward and left [m/s], about the trunk's z [rad/s]."""
 
-_LARGEST = {
-    **{"default_position": 10.0, "action_scale": 10.0, "stiffness": 1e4, "damping": 1e3},
-    **{"policy_rate_hz": 1e3, "timestep_s": 0.1, "decimation": 1e3, "delay_range_s": 0.5},
-    **{"command_ranges": 20.0, "lift_off_velocity": 10.0},
+_MAX_MAGNITUDES = {
+    "default_position": 10.0,
+    "action_scale": 10.0,
+    "stiffness": 1e4,
+    "damping": 1e3,
+    "policy_rate_hz": 1e3,
+    "timestep_s": 0.1,
+    "decimation": 1e3,
+    "delay_range_s": 0.5,
+    "command_ranges": 20.0,
+    "lift_off_velocity": 10.0,
 }
 """Largest magnitude of each field, in its unit; all beyond what legged robots do."""
 
@@ -55,20 +62,25 @@ class ObservationPart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measured_layout(policy_rate_hz: float) -> tuple[ObservationPart, ...]:
-    """The layout that this pronk trains and runs with (see `pronk.policy.observation`).
+    """Return the layout that this pronk trains and runs with (see `pronk.policy.observation`).
 
     Joint positions are relative to the default position, actions are outputs of the network, and
     vectors are in the trunk's frame (x forward, y left, z up).
     """
-    past = [-i / policy_rate_hz for i in range(max(HISTORY, ACTIONS), 0, -1)]
-    samples = (*past[1 - HISTORY :], 0.0)
-    times = {"joint_position": samples, "joint_velocity": samples, "action": tuple(past[-ACTIONS:])}
-    return tuple(
-        ObservationPart(
-            name=name, size=len(part), times_s=times.get(name, (0.0,)), unit=_UNITS[name]
+    sample_times_s = tuple((step - HISTORY + 1) / policy_rate_hz for step in range(HISTORY))
+    action_times_s = tuple((step - ACTIONS) / policy_rate_hz for step in range(ACTIONS))
+    times_s = {
+        "joint_position": sample_times_s,
+        "joint_velocity": sample_times_s,
+        "action": action_times_s,
+    }
+    parts = []
+    for name, indices in MEASURED.items():
+        part = ObservationPart(
+            name=name, size=len(indices), times_s=times_s.get(name, (0.0,)), unit=_UNITS[name]
         )
-        for name, part in MEASURED.items()
-    )
+        parts.append(part)
+    return tuple(parts)
 
 
 class Contract(
@@ -119,43 +131,30 @@ class Contract(
 
     def __post_init__(self) -> None:
         """Refuse contradictions; the ArtefactError names the field."""
-        n = len(self.joint_names)
         check_names((self.robot, *self.joint_names), "the contract", ArtefactError)
-        for name, most in _LARGEST.items():
-            value = getattr(self, name)
-            value = tuple(value.values()) if isinstance(value, dict) else value
-            numbers = np.ravel(0.0 if value is None else value)
-            met = bool((np.abs(numbers) <= most).all())
-            _demand(met, name, value, f"finite and within {most:g} of 0")
-        for name in ("default_position", "action_scale", "stiffness", "damping"):
-            values = getattr(self, name)
-            _demand(len(values) == n, name, values, f"one number for each of the {n} joints")
-        for name in ("action_scale", "stiffness"):
-            values = getattr(self, name)
-            _demand(all(value > 0.0 for value in values), name, values, "positive")
-        for name in ("delay_range_s", "damping"):
-            values = getattr(self, name)
-            _demand(min(values, default=0.0) >= 0.0, name, values, "not negative")
+        self._check_magnitudes()
+        self._check_joints()
         _demand(self.gains in GAINS, "gains", self.gains, " or ".join(GAINS))
+        is_hash = re.fullmatch("[0-9a-f]{64}", self.gains_sha256) is not None
+        may_be_empty = self.gains == "naive" and not self.gains_sha256
         _demand(
-            re.fullmatch("[0-9a-f]{64}", self.gains_sha256) is not None
-            or (self.gains == "naive" and not self.gains_sha256),
+            is_hash or may_be_empty,
             "gains_sha256",
             self.gains_sha256,
             "64 hex digits, or empty for naive gains that rest on no file",
         )
-        step = self.timestep_s * self.decimation
+        period_s = self.timestep_s * self.decimation
         _demand(
-            step > 0.0 and math.isclose(step * self.policy_rate_hz, 1.0, rel_tol=1e-9),
+            period_s > 0.0 and math.isclose(period_s * self.policy_rate_hz, 1.0, rel_tol=1e-9),
             "policy_rate_hz",
             self.policy_rate_hz,
             f"that of {self.decimation} physics steps of {self.timestep_s} s",
         )
         commands = tuple(self.command_ranges)
         _demand(commands == COMMANDS, "command_ranges", commands, f"of {', '.join(COMMANDS)}")
-        ranges = {f"command_ranges of {k}": v for k, v in self.command_ranges.items()}
-        for name, (low, high) in {**ranges, "delay_range_s": self.delay_range_s}.items():
-            _demand(low <= high, name, (low, high), "finite, the smaller number first")
+        for name, (lower, upper) in self.command_ranges.items():
+            _demand_order(f"command_ranges of {name}", lower, upper)
+        _demand_order("delay_range_s", *self.delay_range_s)
         _demand(
             self.jump == (self.lift_off_velocity is not None),
             "lift_off_velocity",
@@ -163,9 +162,33 @@ class Contract(
             "a number for a policy that jumps and null for one that does not",
         )
 
+    def _check_magnitudes(self) -> None:
+        """Refuse numbers that are not finite or beyond what legged robots do."""
+        for name, limit in _MAX_MAGNITUDES.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if isinstance(value, dict):
+                value = tuple(value.values())
+            within = bool((np.abs(np.ravel(value)) <= limit).all())
+            _demand(within, name, value, f"finite and within {limit:g} of 0")
+
+    def _check_joints(self) -> None:
+        """Refuse another number of values than of joints, and values of an impossible sign."""
+        count = len(self.joint_names)
+        for name in ("default_position", "action_scale", "stiffness", "damping"):
+            values = getattr(self, name)
+            _demand(len(values) == count, name, values, f"one number for each of {count} joints")
+        for name in ("action_scale", "stiffness"):
+            values = getattr(self, name)
+            _demand(all(value > 0.0 for value in values), name, values, "positive")
+        for name in ("delay_range_s", "damping"):
+            values = getattr(self, name)
+            _demand(all(value >= 0.0 for value in values), name, values, "not negative")
+
 
 def to_json(contract: Contract) -> str:
-    """The contract as JSON, `schema` first."""
+    """Return the contract as JSON, `schema` first."""
     return msgspec.json.encode(contract).decode()
 
 
@@ -189,41 +212,68 @@ def from_json(text: str, *, source: object) -> Contract:
 
 
 def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = None) -> None:
-    """Refuse a policy that is not for this robot; the ArtefactError names the field.
+    """Refuse a policy that is not for this robot.
 
-    `gains_sha256` is that of the `gains.yaml` that the policy must be trained with, if any.
+    Args:
+        contract: That of the policy.
+        robot: The robot that the policy is to run.
+        gains_sha256: Hash of the `gains.yaml` that the policy must be trained with, if any.
+
+    Raises:
+        ArtefactError: A field of the contract contradicts the robot; the message names it.
     """
-    for field, want in {
+    expected_values = {
         "robot": robot.name,
         "joint_names": robot.joint_names,
         "policy_rate_hz": robot.policy_rate_hz,
         "timestep_s": robot.timestep_s,
         "decimation": robot.decimation,
-    }.items():
-        got = getattr(contract, field)
-        _demand(got == want, field, got, f"{want!r}, as the robot has it")
+    }
+    for field, expected in expected_values.items():
+        value = getattr(contract, field)
+        _demand(value == expected, field, value, f"{expected!r}, as the robot has it")
     for joint, position in zip(robot.joints, contract.default_position, strict=True):
-        low, high = joint.range
-        name, expected = f"default_position of {joint.name}", f"{low} to {high} rad"
-        met = low <= position <= high
-        _demand(met, name, position, f"within the joint's limits, {expected}")
-    for name in ("stiffness", "damping"):
-        gains = dict(zip(contract.joint_names, getattr(contract, name), strict=True))
-        for joint in robot.joints:
-            # Matched gains are per group; naive ones are those of the real drive.
-            expected, reason = getattr(joint, name), "that of the drive"
-            if contract.gains != "naive":
-                expected = gains[robot.group(joint.group)[0].name]
-                reason = f"as in all of {joint.group}"
-            got = gains[joint.name]
-            met = math.isclose(got, expected, rel_tol=1e-6)
-            _demand(met, f"{name} of {joint.name}", got, f"{expected:g}, {reason}")
+        lower, upper = joint.range
+        _demand(
+            lower <= position <= upper,
+            f"default_position of {joint.name}",
+            position,
+            f"within the joint's limits, {lower} to {upper} rad",
+        )
+    _check_gains("stiffness", contract, contract.stiffness, robot)
+    _check_gains("damping", contract, contract.damping, robot)
     if gains_sha256 is not None:
-        got = contract.gains_sha256
-        expected = f"{gains_sha256!r}, that of the given gains"
-        _demand(got == gains_sha256, "gains_sha256", got, expected)
+        _demand(
+            contract.gains_sha256 == gains_sha256,
+            "gains_sha256",
+            contract.gains_sha256,
+            f"{gains_sha256!r}, that of the given gains",
+        )
 
 
-def _demand(met: bool, name: str, got: object, expected: str) -> None:
+def _check_gains(
+    name: str, contract: Contract, values: tuple[float, ...], robot: RobotSpec
+) -> None:
+    """Refuse matched gains that differ within a joint group, and nominal ones of another drive."""
+    gains = dict(zip(contract.joint_names, values, strict=True))
+    for joint in robot.joints:
+        if contract.gains == "naive":
+            expected = joint.stiffness if name == "stiffness" else joint.damping
+            reason = "that of the drive"
+        else:
+            expected = gains[robot.group(joint.group)[0].name]
+            reason = f"as in all of {joint.group}"
+        value = gains[joint.name]
+        same = math.isclose(value, expected, rel_tol=1e-6)
+        _demand(same, f"{name} of {joint.name}", value, f"{expected:g}, {reason}")
+
+
+def _demand_order(name: str, lower: float, upper: float) -> None:
+    """Refuse a range whose ends are not finite or not in order."""
+    _demand(lower <= upper, name, (lower, upper), "finite, the smaller number first")
+
+
+def _demand(met: bool, name: str, value: object, expected: str) -> None:
+    """Raise an ArtefactError unless a condition on a field is met."""
     if not met:
-        raise ArtefactError(f"the contract's {name} is {got!r}; it must be {expected}.")
+        raise ArtefactError(f"the contract's {name} is {value!r}; it must be {expected}.")

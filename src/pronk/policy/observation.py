@@ -101,10 +101,14 @@ class History:
         self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
 
     def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
-        """Add a sample; returns the measured vector, laid out as `MEASURED`. (105,).
+        """Add a sample and return the measured vector, laid out as `MEASURED`, shape (105,).
 
-        The command is forward and left [m/s], yaw rate [rad/s] (3,). One that is not finite is
-        refused by an ArtefactError, and nothing is added.
+        Args:
+            measurement: The sensors now.
+            command: Forward and left [m/s], yaw rate [rad/s], shape (3,).
+
+        Raises:
+            ArtefactError: The command is not finite; nothing is added then.
         """
         commanded = finite("the command", command, (3,))
         position = np.asarray(measurement.position, np.float32) - self._default
@@ -122,30 +126,40 @@ class History:
         return np.concatenate([np.asarray(part, np.float32).ravel() for part in parts])
 
     def acted(self, action: Floats) -> None:
-        """Add the network's action for the last observation. (12,)."""
+        """Add the network's action for the latest observation, shape (12,)."""
         self._actions = np.concatenate([self._actions[1:], action[None]])
 
 
 def _pushed(history: Floats | None, sample: Floats) -> Floats:
+    """Return a history without its oldest sample and with a new one, shape (3, 12)."""
     if history is None:
         return np.tile(sample, (HISTORY, 1))
     return np.concatenate([history[1:], sample[None]])
 
 
 def finite(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """`value` as float32; an ArtefactError names it `what` if it is not finite or of that shape."""
-    given = np.asarray(value)
-    if given.shape != shape:
-        raise ArtefactError(f"{what} has the shape {given.shape}; expected {shape}.")
-    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused
-        array = given.astype(np.float32, copy=False)
+    """Return a value as float32.
+
+    Args:
+        what: Name of the value, for the message.
+        value: Numbers of any type.
+        shape: The shape that is expected.
+
+    Raises:
+        ArtefactError: The value has another shape, or a number of it is not finite as float32.
+    """
+    numbers = np.asarray(value)
+    if numbers.shape != shape:
+        raise ArtefactError(f"{what} has the shape {numbers.shape}; expected {shape}.")
+    with np.errstate(over="ignore"):  # Overflow gives infinity, which is refused.
+        array = numbers.astype(np.float32, copy=False)
         flat = array.ravel()
         # A finite sum of squares has finite parts; this is the fastest check.
         if math.isfinite(flat.dot(flat)):
             return array
     for index in np.argwhere(~np.isfinite(array)):
-        where = ", ".join(map(str, index))
+        place = ", ".join(map(str, index))
         raise ArtefactError(
-            f"{what} is {array[tuple(index)]} at [{where}]; a policy reads finite numbers only."
+            f"{what} is {array[tuple(index)]} at [{place}]; a policy reads finite numbers only."
         )
     return array

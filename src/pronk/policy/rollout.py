@@ -24,23 +24,23 @@ from pronk.robots.robot import RobotSpec
 Source = Callable[[float], Commanded]
 """The command at a time since the policy started [s]."""
 
-NEAR = 0.5
-"""Farthest that a joint of a standing robot may be from its default position [rad]."""
-UPRIGHT = math.cos(math.radians(30.0))
-"""Least cosine of the tilt of a standing robot."""
+MAX_STANDING_DEVIATION_RAD = 0.5
+"""Largest distance of a standing robot's joint from its default position [rad]."""
+MAX_STANDING_TILT_DEG = 30.0
+"""Largest tilt of a standing robot's trunk [degrees]."""
 
 
 def projected_gravity(orientation: Array) -> Array:
-    """Unit vector of gravity in the trunk's frame, R^T (0, 0, -1). (3,).
+    """Return the unit vector of gravity in the trunk's frame, R^T (0, 0, -1), shape (3,).
 
-    `orientation` is trunk to world, unit quaternion w, x, y, z.
+    The orientation is trunk to world, a unit quaternion w, x, y, z.
     """
     w, x, y, z = orientation.tolist()
     return np.array([-2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -1.0 + 2.0 * (x * x + y * y)])
 
 
 def measurement(state: State) -> Measurement:
-    """The policy's input from a state."""
+    """Return the policy's input from a state."""
     return Measurement(
         angular_velocity=state.gyro,
         projected_gravity=projected_gravity(state.orientation),
@@ -56,17 +56,19 @@ def check_standing(robot: RobotSpec, state: State) -> None:
         HardwareError: The robot does not stand in its default pose.
     """
     for joint, position in zip(robot.joints, state.position, strict=True):
-        if not abs(position - joint.default_position) <= NEAR:
+        # NaN is not within the distance.
+        if not abs(position - joint.default_position) <= MAX_STANDING_DEVIATION_RAD:
             raise HardwareError(
                 f"{joint.name} is at {position:.2f} rad; a policy starts on a robot that stands, "
-                f"with this joint within {NEAR:g} rad of {joint.default_position:g}."
+                f"with this joint within {MAX_STANDING_DEVIATION_RAD:g} rad of "
+                f"{joint.default_position:g}."
             )
-    upright = -float(projected_gravity(state.orientation)[2])
-    if not upright >= UPRIGHT:
-        tilt = math.degrees(math.acos(min(1.0, max(-1.0, upright))))
+    cosine = -float(projected_gravity(state.orientation)[2])
+    if not cosine >= math.cos(math.radians(MAX_STANDING_TILT_DEG)):
+        tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
         raise HardwareError(
-            f"the trunk is tilted by {tilt:.0f} degrees; a policy starts on a robot that stands, "
-            "tilted by 30 degrees at most."
+            f"the trunk is tilted by {tilt_deg:.0f} degrees; a policy starts on a robot that "
+            f"stands, tilted by {MAX_STANDING_TILT_DEG:g} degrees at most."
         )
 
 
@@ -75,10 +77,19 @@ def ticks(
 ) -> Iterator[float]:
     """Run a policy on a connected machine that stands in its default pose.
 
-    After each command is sent, yields the time since the first tick [s]. The machine's clock waits
-    between ticks until the caller takes the next one. A caller that stops leaves the last targets
-    in force and must damp or close the machine. Ticks that a real machine's clock has already
-    passed are left out. The policy runs for `seconds`, with the commands of `source`.
+    The machine's clock waits between ticks until the caller takes the next one. A caller that stops
+    leaves the latest targets in force and must damp or close the machine. Ticks that a real
+    machine's clock has already passed are left out.
+
+    Args:
+        machine: The machine, connected.
+        policy: The policy.
+        robot: The robot, whose drives' gains are sent.
+        source: Gives the command at a time since the policy started.
+        seconds: How long the policy runs [s].
+
+    Yields:
+        After each command is sent, the time since the first tick [s].
 
     Raises:
         ArtefactError: The contract does not fit, before anything is sent; or a number is not
@@ -89,21 +100,25 @@ def ticks(
     policy.reset()
     stiffness = np.array([joint.stiffness for joint in robot.joints])
     damping = np.array([joint.damping for joint in robot.joints])
-    rate = policy.contract.policy_rate_hz
+    rate_hz = policy.contract.policy_rate_hz
     check_standing(robot, machine.latest())
-    began, count, sent = machine.now(), 0, 0
-    while count < seconds * rate - 1e-9:
-        now, state = machine.now(), machine.latest()
+    begin = machine.now()
+    tick = 0
+    sequence = 0
+    while tick < seconds * rate_hz - 1e-9:
+        now = machine.now()
+        state = machine.latest()
+        velocity, jump = source(tick / rate_hz)
         command = Command(
-            position=policy.step(measurement(state), *source(count / rate)),
+            position=policy.step(measurement(state), velocity, jump),
             stiffness=stiffness,
             damping=damping,
-            sequence=sent,
+            sequence=sequence,
             state_sequence=state.sequence,
             made=now,
         )
         machine.send(command)
-        sent += 1
-        yield now - began
-        count = max(count + 1, math.ceil((machine.now() - began) * rate - 1e-6))
-        machine.wait(began + count / rate)
+        sequence += 1
+        yield now - begin
+        tick = max(tick + 1, math.ceil((machine.now() - begin) * rate_hz - 1e-6))
+        machine.wait(begin + tick / rate_hz)
