@@ -358,8 +358,9 @@ def test_a_network_that_reads_another_file_is_refused(
             if name == "action":
                 node.output[index] = "acted"
     path.write_bytes(model.SerializeToString())
-    with pytest.raises(ArtefactError, match="policy.onnx"):
+    with pytest.raises(ArtefactError) as refusal:
         load_policy(path)
+    assert str(path) in str(refusal.value)
 
 
 def test_a_file_larger_than_a_policy_is_not_read(tmp_path: Path) -> None:
