@@ -20,7 +20,7 @@ from hopper import DEFAULT, ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import PronkError
 from pronk.jump.trial.films import record, render
-from pronk.jump.trial.films.film import FPS, Film, JumpEvents, plan
+from pronk.jump.trial.films.film import FPS, Film, JumpEvents, plan_film
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.trial import TrialPlan, TrialSetup, run_trial
 from pronk.jump.virtual.capture import Capture
@@ -51,7 +51,7 @@ def captured(*, direction: float = 0.0, yaw: float = 0.0, speed: float = 1.0) ->
 def planned(capture: Capture | None = None, **changes: Any) -> Film:
     kept: dict[str, Any] = {"robot": ROBOT.name, "title": "forward 1", "events": EVENTS}
     kept["span"] = (LIFTOFF - 1.0, LIFTOFF + FLIGHT + 1.2)
-    return plan(capture or captured(), **(kept | changes))
+    return plan_film(capture or captured(), **(kept | changes))
 
 
 def test_only_the_flight_is_slowed_down() -> None:
@@ -163,7 +163,7 @@ def test_without_gl_or_encoder_one_warning_names_what_to_install(
 ) -> None:
     """Rendering processes die at once, as they do where the GL library is broken."""
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert "pronk[video]" in str(record.no_encoder())
+    assert "pronk[video]" in str(record.missing_encoder())
     dying = tmp_path / "python"
     dying.write_text("#!/bin/sh\nexit 139\n", encoding="utf-8")
     dying.chmod(0o755)
@@ -214,7 +214,7 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
     # A robot given by its path is filmed with its own model.
     own = replace(ROBOT, source="mine/robot.yaml")
     how: Any = {"folder": tmp_path / "trial", "robot": own}
-    (stem, hop), (_, still) = record.films_of(found, cases=("forward 1",), **how).items()
+    (stem, hop), (_, still) = record.plan_films(found, cases=("forward 1",), **how).items()
     assert hop.robot == own.source
     assert stem == f"{found.subjects[0].name}_forward_1".replace(" ", "_")
     assert hop.title == "forward 1 m/s"
@@ -226,4 +226,4 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
     assert flight == pytest.approx(figures.duration, abs=0.002)
     assert (hop.rate == 1.0 / record.SLOW).any()
     assert still.events is None
-    assert not record.films_of(found, cases=("back 2",), **how)
+    assert not record.plan_films(found, cases=("back 2",), **how)

@@ -14,20 +14,22 @@ from pronk.jump.trial.jumps import heading
 from pronk.jump.virtual.capture import Capture
 
 Samples = NDArray[np.intp]
+"""Indices of samples."""
 
 FPS = 25.0
-"""Frames per second of a film; half of it in a GIF, whose clock ticks every 10 ms."""
+"""Frames per second of a film; half of it in a GIF, whose clock ticks every 10 ms [1/s]."""
 SCHEMA = "pronk/film/2"
 
 _AROUND_S = 0.06
-"""Time before lift-off and after touchdown that is slowed down with the flight."""
+"""Time before lift-off and after touchdown that is slowed down with the flight [s]."""
 _FOLLOW_S = 0.25
-"""Standard deviation of the Gaussian by which the camera's path is smoothed."""
+"""Standard deviation of the Gaussian by which the camera's path is smoothed [s]."""
 _LOOK_HEIGHT = 0.30
+"""Height that the camera looks at while the trunk is at its median height [m]."""
 _QUARTER = math.radians(20.0)
-"""How far the camera stands off the side, towards the robot's face."""
+"""Angle by which the camera stands off the side, towards the robot's face [rad]."""
 _LANDED_S = 0.35
-"""After touchdown, the last pose of a strip."""
+"""Time of the last pose of a strip after touchdown [s]."""
 _MEASURED = 0.1
 """Shortest displacement that has a direction [m]."""
 
@@ -47,40 +49,43 @@ class Film:
     """F frames to render, and the P poses of the strip (none without a jump)."""
 
     robot: str
-    """Name or path."""
+    """Name or path of the robot."""
     title: str
     """The command."""
     note: str
+    """Text below the title."""
     events: JumpEvents | None
+    """Moments of the jump; None if there was none."""
     origin: tuple[float, float]
     """Zero of the tape on the floor: the trunk at lift-off, or at the start [m]."""
     direction: float
-    """Of travel, and of the tape, in the world [rad]."""
+    """Direction of travel, and of the tape, in the world [rad]."""
     azimuth: float
-    """Of the camera's view, in the world; the robot travels to the right of the image [rad]."""
+    """Azimuth of the camera's view in the world; the robot travels to the right [rad]."""
     time: Array
-    """On the capture's clock [s]. (F,)"""
+    """Time of each frame on the capture's clock [s]. (F,)"""
     rate: Array
     """Speed of the film, 1 for real time. (F,)"""
     qpos: Array
     """Trunk position [m], orientation w, x, y, z, joints [rad]. (F, 7 + joints)"""
     look: Array
-    """Where the camera looks [m]. (F, 3)"""
+    """Point that the camera looks at [m]. (F, 3)"""
     labels: tuple[str, ...]
-    """Of the poses, empty for one in between."""
+    """Labels of the poses, empty for one in between."""
     pose_time: Array
-    """Since lift-off [s]. (P,)"""
+    """Time of each pose since lift-off [s]. (P,)"""
     pose_qpos: Array
-    """(P, 7 + joints)"""
+    """Poses of the strip, as `qpos`. (P, 7 + joints)"""
 
     @property
     def jumping(self) -> Mask:
         """Frames in which the jump input is on. (F,)."""
-        on, off = (self.events.on, self.events.off) if self.events else (math.inf, math.inf)
-        return (self.time >= on) & (self.time < off)
+        if self.events is None:
+            return np.zeros(len(self.time), dtype=bool)
+        return (self.time >= self.events.on) & (self.time < self.events.off)
 
 
-def plan(
+def plan_film(
     capture: Capture,
     *,
     robot: str,
@@ -90,21 +95,31 @@ def plan(
     span: tuple[float, float],
     slow: float = 1.0,
 ) -> Film:
-    """Plan a film of a capture from the first to the last moment of `span` [s].
+    """Plan a film of a capture.
 
-    The flight, if there are `events` of a jump, is `slow` times slower than real time.
+    Args:
+        capture: The recorded motion.
+        robot: Name or path of the robot.
+        title: The command.
+        note: Text below the title.
+        events: Moments of the jump; None if there was none.
+        span: First and last moment of the film on the capture's clock [s].
+        slow: How many times slower than real time the flight is [1].
     """
-    begin, end = max(float(capture.time[0]), span[0]), min(float(capture.time[-1]), span[1])
-    since, until = (events.liftoff, events.touchdown) if events else (math.inf, math.inf)
-    now, times, rates = begin, [], []
-    while now <= end + 1e-9:
-        times.append(now)
-        rates.append(1.0 / slow if since - _AROUND_S <= now < until + _AROUND_S else 1.0)
-        now += rates[-1] / FPS
-    frames = _samples(capture, *times)
-    poses, labels = _poses(capture, events) if events else (frames[:0], ())
-    (zero,) = _samples(capture, events.liftoff if events else begin)
+    begin = max(float(capture.time[0]), span[0])
+    end = min(float(capture.time[-1]), span[1])
+    times, rates = _frame_times(begin, end, events, slow)
+    frames = _samples(capture, times)
     direction = _direction(capture, events, begin, end)
+    zero_time = begin
+    labels: tuple[str, ...] = ()
+    poses = frames[:0]
+    pose_time = capture.time[poses]
+    if events is not None:
+        zero_time = events.liftoff
+        labels, poses = _poses(capture, events)
+        pose_time = capture.time[poses] - events.liftoff
+    zero = _sample(capture, zero_time)
     facing = math.cos(direction - float(heading(capture.orientation[zero])))
     # The trunk's path, smoothed, with half of its rise.
     look = gaussian_filter1d(capture.position, _FOLLOW_S / capture.dt, axis=0, mode="nearest")
@@ -123,41 +138,75 @@ def plan(
         qpos=qpos[frames],
         look=look[frames],
         labels=labels,
-        pose_time=capture.time[poses] - (events.liftoff if events else 0.0),
+        pose_time=pose_time,
         pose_qpos=qpos[poses],
     )
 
 
-def _samples(capture: Capture, *times: float) -> Samples:
-    """The nearest samples to times on the capture's clock [s]."""
+def _frame_times(
+    begin: float, end: float, events: JumpEvents | None, slow: float
+) -> tuple[list[float], list[float]]:
+    """Return the time of each frame [s], and the speed of the film there [1]."""
+    slow_from = math.inf
+    slow_until = math.inf
+    if events is not None:
+        slow_from = events.liftoff - _AROUND_S
+        slow_until = events.touchdown + _AROUND_S
+    times = []
+    rates = []
+    time = begin
+    while time <= end + 1e-9:
+        rate = 1.0 / slow if slow_from <= time < slow_until else 1.0
+        times.append(time)
+        rates.append(rate)
+        time += rate / FPS
+    return times, rates
+
+
+def _samples(capture: Capture, times: list[float]) -> Samples:
+    """Return the nearest samples to times on the capture's clock [s]."""
     dt = capture.dt if len(capture.time) > 1 else 1.0
     nearest = np.rint((np.array(times) - capture.time[0]) / dt).astype(np.intp)
     clipped: Samples = np.clip(nearest, 0, len(capture.time) - 1)
     return clipped
 
 
+def _sample(capture: Capture, time: float) -> int:
+    """Return the nearest sample to a time on the capture's clock [s]."""
+    return int(_samples(capture, [time])[0])
+
+
 def _direction(capture: Capture, events: JumpEvents | None, begin: float, end: float) -> float:
-    """Of travel: in flight, else over the film, else the robot's heading [rad]."""
-    spans = [(events.liftoff, events.touchdown)] if events else []
-    for span in (*spans, (begin, end)):
-        x, y, _ = np.diff(capture.position[_samples(capture, *span)], axis=0)[0]
+    """Return the direction of travel in flight, else over the film, else the heading [rad]."""
+    spans = [(begin, end)]
+    if events is not None:
+        spans.insert(0, (events.liftoff, events.touchdown))
+    for start, stop in spans:
+        first = capture.position[_sample(capture, start)]
+        last = capture.position[_sample(capture, stop)]
+        x, y, _ = last - first
         if math.hypot(x, y) >= _MEASURED:
             return math.atan2(y, x)
-    return float(heading(capture.orientation[_samples(capture, begin)])[0])
+    return float(heading(capture.orientation[_sample(capture, begin)]))
 
 
-def _poses(capture: Capture, events: JumpEvents) -> tuple[Samples, tuple[str, ...]]:
-    """Samples of the strip and their labels."""
-    z = capture.position[:, 2]
-    on, up, down = _samples(capture, events.on, events.liftoff, events.touchdown).tolist()
-    on, top = min(on, up), up + int(np.argmax(z[up : down + 1]))
-    labelled = {
-        "crouch": on + int(np.argmin(z[on : up + 1])),
-        "lift-off": up,
-        "": (up + top) // 2,
-        "apex": top,
-        " ": (top + down) // 2,
-        "touchdown": down,
-        "landed": min(down + round(_LANDED_S / capture.dt), len(z) - 1),
-    }
-    return np.array([*labelled.values()], dtype=np.intp), tuple(map(str.strip, labelled))
+def _poses(capture: Capture, events: JumpEvents) -> tuple[tuple[str, ...], Samples]:
+    """Return the labels of the strip's poses and their samples."""
+    height = capture.position[:, 2]
+    liftoff = _sample(capture, events.liftoff)
+    touchdown = _sample(capture, events.touchdown)
+    on = min(_sample(capture, events.on), liftoff)
+    crouch = on + int(np.argmin(height[on : liftoff + 1]))
+    apex = liftoff + int(np.argmax(height[liftoff : touchdown + 1]))
+    landed = min(touchdown + round(_LANDED_S / capture.dt), len(height) - 1)
+    labels = ("crouch", "lift-off", "", "apex", "", "touchdown", "landed")
+    samples = (
+        crouch,
+        liftoff,
+        (liftoff + apex) // 2,
+        apex,
+        (apex + touchdown) // 2,
+        touchdown,
+        landed,
+    )
+    return labels, np.array(samples, dtype=np.intp)

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -28,32 +28,47 @@ from pronk.jump.trial.films.film import FPS, SCHEMA, Film
 from pronk.robots import load_robot
 
 Point = tuple[float, float]
+"""Right and down of the upper left corner of an image [px]."""
 Colour = tuple[int, int, int, int]
+"""Red, green, blue and opacity, 0 to 255."""
 
 FOV_DEG = 40.0
-"""Vertical field of view of the camera."""
+"""Vertical field of view of the camera [deg]."""
 ELEVATION = math.radians(-13.0)
-"""Of the camera's view, negative down."""
+"""Elevation of the camera's view, negative down [rad]."""
 DISTANCE = 1.9
-"""From the camera to where it looks [m]."""
+"""Distance from the camera to where it looks [m]."""
 TAPE_M = 0.2
-"""From tape to tape."""
+"""Distance from tape to tape [m]."""
 TAPE_HALF_M = 0.26
-"""Half the length of a tape, which lies across the direction of travel."""
+"""Half the length of a tape, which lies across the direction of travel [m]."""
 
-_INK, _WHITE, _PANEL = (24, 28, 34, 255), (255, 255, 255, 255), (250, 250, 250, 200)
-_DARK, _GREY, _ACCENT = (24, 28, 34, 215), (90, 97, 106, 255), (214, 95, 10, 235)
+_INK = (24, 28, 34, 255)
+_WHITE = (255, 255, 255, 255)
+_PANEL = (250, 250, 250, 200)
+_DARK = (24, 28, 34, 215)
+_GREY = (90, 97, 106, 255)
+_ACCENT = (214, 95, 10, 235)
+_FLIGHT = (214, 95, 10, 45)
 _REFERENCE = 400.0
 """Height of the image for which sizes are given [px]."""
 
-WIDTH, HEIGHT = 640, 400
-"""Of a frame [px]."""
+WIDTH = 640
+"""Width of a frame [px]."""
+HEIGHT = 400
+"""Height of a frame [px]."""
 STRIP_WIDTH = 270
-"""Of a pose in a strip [px]."""
+"""Width of a pose in a strip [px]."""
 GIF_WIDTH = 360
-"""[px]"""
-_GIF_BEFORE_S, _GIF_AFTER_S, _GIF_SKIP = 0.6, 0.8, 2
-"""A GIF has every second frame of the jump and a little around it."""
+"""Width of a GIF [px]."""
+_GIF_BEFORE_S = 0.6
+"""Time before lift-off that a GIF shows [s]."""
+_GIF_AFTER_S = 0.8
+"""Time after touchdown that a GIF shows [s]."""
+_GIF_SKIP = 2
+"""A GIF has every second frame."""
+_GIF_COLOURS = 80
+"""Number of colours of a GIF."""
 _OVERSAMPLE = 2
 """Pixels rendered for each pixel of the image, each way."""
 _WORLD = f"""
@@ -115,17 +130,21 @@ def images(film: Film) -> Iterator[Image.Image]:
     """Render the film's frames, then the poses of its strip, without text."""
     model = stage(film)
     data = mujoco.MjData(model)
-    columns = [model.joint(name).qposadr[0] for name in load_robot(film.robot).joint_names]
-    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-    camera.distance, camera.elevation = DISTANCE, math.degrees(ELEVATION)
+    joint_qpos = [model.joint(name).qposadr[0] for name in load_robot(film.robot).joint_names]
+    camera = mujoco.MjvCamera()
+    camera.distance = DISTANCE
+    camera.elevation = math.degrees(ELEVATION)
     camera.azimuth = math.degrees(film.azimuth)
+    option = mujoco.MjvOption()
     option.geomgroup[:] = [1, 1, 1, 0, 0, 0]
-    beside = film.pose_qpos[:, :3].copy()
-    beside[:, 2] = film.look[:, 2].mean()
-    poses, looks = np.vstack([film.qpos, film.pose_qpos]), np.vstack([film.look, beside])
+    pose_look = film.pose_qpos[:, :3].copy()
+    pose_look[:, 2] = film.look[:, 2].mean()
+    poses = np.vstack([film.qpos, film.pose_qpos])
+    looks = np.vstack([film.look, pose_look])
     with closing(mujoco.Renderer(model, HEIGHT * _OVERSAMPLE, WIDTH * _OVERSAMPLE)) as renderer:
         for pose, look in zip(poses, looks, strict=True):
-            data.qpos[:7], data.qpos[columns] = pose[:7], pose[7:]
+            data.qpos[:7] = pose[:7]
+            data.qpos[joint_qpos] = pose[7:]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
@@ -139,68 +158,101 @@ def images(film: Film) -> Iterator[Image.Image]:
 
 
 def tape_points(film: Film, side: float) -> dict[int, Array]:
-    """Points on the tapes under the film [m], by distance from lift-off in units of 0.2 m.
+    """Return points on the tapes under the film.
 
-    `side` is the place across a tape: -1 and 1 are its right and left end.
+    Args:
+        film: The film.
+        side: Place across a tape: -1 and 1 are its right and left end [1].
+
+    Returns:
+        Points [m] (3,) by distance from lift-off in units of 0.2 m.
     """
     along = np.array([math.cos(film.direction), math.sin(film.direction), 0.0])
     across = np.array([-along[1], along[0], 0.0])
-    way = (film.qpos[:, :2] - film.origin) @ along[:2]
-    marks = range(math.floor(way.min() / TAPE_M) - 2, math.ceil(way.max() / TAPE_M) + 5)
+    travelled = (film.qpos[:, :2] - film.origin) @ along[:2]
+    first = math.floor(travelled.min() / TAPE_M) - 2
+    last = math.ceil(travelled.max() / TAPE_M) + 4
     origin = np.array([*film.origin, 0.0])
-    return {k: origin + k * TAPE_M * along + side * TAPE_HALF_M * across for k in marks}
+    points = {}
+    for mark in range(first, last + 1):
+        points[mark] = origin + mark * TAPE_M * along + side * TAPE_HALF_M * across
+    return points
 
 
 def project(points: Array, look: Array, azimuth: float, size: tuple[int, int]) -> Array:
-    """Project points of the world [m] (N, 3) into an image of a width and height [px].
+    """Project points of the world into an image.
 
-    `look` is where the camera looks [m] (3,), `azimuth` that of its view [rad]. Returns right and
-    down of the upper left corner [px], NaN behind the camera. (N, 2)
+    Args:
+        points: Points [m]. (N, 3)
+        look: Point that the camera looks at [m]. (3,)
+        azimuth: Azimuth of its view [rad].
+        size: Width and height of the image [px].
+
+    Returns:
+        Right and down of the upper left corner [px], NaN behind the camera. (N, 2)
     """
-    c, s = math.cos(ELEVATION), math.sin(ELEVATION)
-    ahead = np.array([math.cos(azimuth) * c, math.sin(azimuth) * c, s])
+    cosine = math.cos(ELEVATION)
+    sine = math.sin(ELEVATION)
+    ahead = np.array([math.cos(azimuth) * cosine, math.sin(azimuth) * cosine, sine])
     right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     relative = np.asarray(points) - (look - DISTANCE * ahead)
     depth = relative @ ahead
     focal = 0.5 * size[1] / math.tan(math.radians(0.5 * FOV_DEG))
     scale = focal / np.where(depth > 0, depth, np.nan)
-    x, y = scale * (relative @ right), scale * (relative @ np.cross(right, ahead))
+    x = scale * (relative @ right)
+    y = scale * (relative @ np.cross(right, ahead))
     return np.stack([0.5 * size[0] + x, 0.5 * size[1] - y], axis=1)
 
 
 def draw_frame(image: Image.Image, film: Film, frame: int) -> None:
-    """Write title, time, height, speed and distances on a frame, in place."""
-    scale, size = image.height / _REFERENCE, image.size
+    """Write title, tape distances, time, jump input and height of one frame, in place."""
+    scale = image.height / _REFERENCE
     draw = ImageDraw.Draw(image, "RGBA")
-    # Distances, at the end of every tape that is nearer to the camera.
-    places = tape_points(film, -1.12 if math.sin(film.azimuth - film.direction) > 0.0 else 1.12)
-    pixels = project(np.array([*places.values()]), film.look[frame], film.azimuth, size)
-    for mark, (x, y) in zip(places, pixels.tolist(), strict=True):
-        if 0.0 <= x <= size[0] and 0.0 <= y <= size[1] - 56.0 * scale:
+    _draw_distances(draw, film, frame, image.size)
+    _draw_title(draw, film, image.size)
+    is_jumping = bool(film.jumping[frame])
+    if film.events is None:
+        words = [f"{film.time[frame] - film.time[0]:+.2f} s"]
+    else:
+        words = [f"lift-off {film.time[frame] - film.events.liftoff:+.2f} s"]
+    words.append(f"trunk {film.qpos[frame, 2]:.2f} m")
+    if film.rate[frame] < 1.0:
+        words.append(f"1/{1.0 / film.rate[frame]:g} speed")
+    if is_jumping:
+        words.append("jump!")
+    corner = (14.0 * scale, image.height - 14.0 * scale)
+    fill = _ACCENT if is_jumping else _PANEL
+    ink = _WHITE if is_jumping else _INK
+    _draw_label(draw, "    ".join(words), corner, "ld", 13.0 * scale, fill=fill, ink=ink)
+    _HeightPlot.of(film, image.size).draw_on(draw, film, frame)
+
+
+def _draw_distances(
+    draw: ImageDraw.ImageDraw, film: Film, frame: int, size: tuple[int, int]
+) -> None:
+    """Write the distance at the end of every tape that is nearer to the camera."""
+    width, height = size
+    scale = height / _REFERENCE
+    near_side = -1.12 if math.sin(film.azimuth - film.direction) > 0.0 else 1.12
+    points = tape_points(film, near_side)
+    pixels = project(np.array(list(points.values())), film.look[frame], film.azimuth, size)
+    for mark, (x, y) in zip(points, pixels.tolist(), strict=True):
+        if 0.0 <= x <= width and 0.0 <= y <= height - 56.0 * scale:
             text = f"{TAPE_M * mark:.1f}" if mark else "0 m"
             draw.text((x, y), text, font=_font(11.0 * scale), fill=_WHITE, anchor="mt")
-    _title(draw, film, image.width, scale)
-    jumping, zero = film.jumping[frame], film.events.liftoff if film.events else film.time[0]
-    parts = [f"{'lift-off ' * bool(film.events)}{film.time[frame] - zero:+.2f} s"]
-    parts.append(f"trunk {film.qpos[frame, 2]:.2f} m")
-    parts += [f"1/{1.0 / film.rate[frame]:g} speed"] if film.rate[frame] < 1.0 else []
-    fill, ink = (_ACCENT, _WHITE) if jumping else (_PANEL, _INK)
-    corner = (14.0 * scale, image.height - 14.0 * scale)
-    words = "    ".join([*parts, *["jump!"] * bool(jumping)])
-    _label(draw, words, corner, "ld", 13.0 * scale, fill=fill, ink=ink)
-    _height_plot(draw, film, frame, (size[0] - 10.0 * scale, size[1] - 10.0 * scale), scale)
 
 
 def draw_strip(image: Image.Image, film: Film) -> None:
     """Write title, and label, time and height of each of the side-by-side poses, in place."""
     scale = image.height / _REFERENCE
     draw = ImageDraw.Draw(image, "RGBA")
-    _title(draw, film, image.width, scale)
+    _draw_title(draw, film, image.size)
     step = image.width / len(film.labels)
-    for k, (label, since) in enumerate(zip(film.labels, film.pose_time.tolist(), strict=True)):
-        words = f"{label}\n{since + 0.0:+.2f} s, {film.pose_qpos[k, 2]:.2f} m".strip()
-        corner = ((k + 0.5) * step, image.height - 14.0 * scale)
-        _label(draw, words, corner, "md", 14.0 * scale)
+    for index, label in enumerate(film.labels):
+        since = float(film.pose_time[index]) + 0.0  # no -0.00
+        text = f"{label}\n{since:+.2f} s, {film.pose_qpos[index, 2]:.2f} m".strip()
+        corner = ((index + 0.5) * step, image.height - 14.0 * scale)
+        _draw_label(draw, text, corner, "md", 14.0 * scale)
 
 
 @cache
@@ -208,7 +260,7 @@ def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(max(8.0, round(size)))
 
 
-def _label(
+def _draw_label(
     draw: ImageDraw.ImageDraw,
     text: str,
     corner: Point,
@@ -218,68 +270,131 @@ def _label(
     fill: Colour = _PANEL,
     ink: Colour = _INK,
 ) -> None:
-    """Write lines of text of a size [px] in a box; `anchor` is Pillow's, of the text's corner."""
-    inner, align = 0.35 * size, "center" if anchor[0] == "m" else "left"
-    how: Any = {"font": _font(size), "anchor": anchor, "align": align}
-    left, top, right, bottom = draw.multiline_textbbox(corner, text, **how)
-    box = (left - inner, top - inner, right + inner, bottom + inner)
-    draw.rounded_rectangle(box, inner, fill=fill)
-    draw.multiline_text(corner, text, fill=ink, **how)
+    """Write lines of text in a box.
+
+    Args:
+        draw: The image.
+        text: The lines.
+        corner: Place of the anchor.
+        anchor: Pillow's name of the corner of the text that is there.
+        size: Size of the letters [px].
+        fill: Colour of the box.
+        ink: Colour of the text.
+    """
+    margin = 0.35 * size
+    font = _font(size)
+    align = "center" if anchor[0] == "m" else "left"
+    left, top, right, bottom = draw.multiline_textbbox(
+        corner, text, font=font, anchor=anchor, align=align
+    )
+    box = (left - margin, top - margin, right + margin, bottom + margin)
+    draw.rounded_rectangle(box, margin, fill=fill)
+    draw.multiline_text(corner, text, fill=ink, font=font, anchor=anchor, align=align)
 
 
-def _title(draw: ImageDraw.ImageDraw, film: Film, width: int, scale: float) -> None:
+def _draw_title(draw: ImageDraw.ImageDraw, film: Film, size: tuple[int, int]) -> None:
+    """Write the title, and that the robot is virtual, into the upper corners."""
+    width, height = size
+    scale = height / _REFERENCE
     pad = 14.0 * scale
-    _label(draw, f"{film.title}\n{film.note}".strip(), (pad, pad), "la", 15.0 * scale)
+    _draw_label(draw, f"{film.title}\n{film.note}".strip(), (pad, pad), "la", 15.0 * scale)
     corner = (width - pad, pad)
-    _label(draw, "virtual robot", corner, "ra", 13.0 * scale, fill=_DARK, ink=_WHITE)
+    _draw_label(draw, "virtual robot", corner, "ra", 13.0 * scale, fill=_DARK, ink=_WHITE)
 
 
-def _height_plot(
-    draw: ImageDraw.ImageDraw, film: Film, frame: int, corner: Point, scale: float
-) -> None:
-    """Plot the trunk's height over time in a box with the given lower right corner."""
-    (right, bottom), inner, width, depth = corner, 6.0 * scale, 150.0 * scale, 54.0 * scale
-    draw.rounded_rectangle((right - width, bottom - depth, right, bottom), inner, fill=_PANEL)
-    height, time = film.qpos[:, 2], film.time
-    high = max(0.5, 1.08 * float(height.max()))
+class _HeightPlot(NamedTuple):
+    """A small plot of the trunk's height over time, in the lower right corner of an image."""
 
-    def at(moment: float, z: float) -> Point:
-        share = (moment - time[0]) / max(time[-1] - time[0], 1e-9)
-        x = right - width + inner + (width - 2 * inner) * share
-        return x, bottom - inner - (depth - 2 * inner) * z / high
+    left: float
+    top: float
+    right: float
+    bottom: float
+    """Edges of its box [px]."""
+    margin: float
+    """Width of the box around the plot [px]."""
+    begin: float
+    """First time [s]."""
+    seconds: float
+    """Time that it shows [s]."""
+    highest: float
+    """Height at its upper edge [m]."""
+    scale: float
+    """Size of the image over the reference [1]."""
 
-    if film.events:
-        box = (*at(film.events.liftoff, high), *at(film.events.touchdown, 0.0))
-        draw.rectangle(box, fill=(*_ACCENT[:3], 45))
-    points = [at(t, z) for t, z in zip(time.tolist(), height.tolist(), strict=True)]
-    draw.line(points, fill=_GREY, width=max(1, round(1.2 * scale)))
-    draw.line(points[: frame + 1], fill=_INK, width=max(1, round(2.0 * scale)))
-    draw.circle(points[frame], 3.2 * scale, fill=_ACCENT)
+    @classmethod
+    def of(cls, film: Film, size: tuple[int, int]) -> _HeightPlot:
+        """Return the plot of a film, in an image of a width and height [px]."""
+        width, height = size
+        scale = height / _REFERENCE
+        right = width - 10.0 * scale
+        bottom = height - 10.0 * scale
+        return cls(
+            left=right - 150.0 * scale,
+            top=bottom - 54.0 * scale,
+            right=right,
+            bottom=bottom,
+            margin=6.0 * scale,
+            begin=float(film.time[0]),
+            seconds=max(float(film.time[-1] - film.time[0]), 1e-9),
+            highest=max(0.5, 1.08 * float(film.qpos[:, 2].max())),
+            scale=scale,
+        )
+
+    def point(self, time: float, height: float) -> Point:
+        """Return the place of a time [s] and a height [m] in the image."""
+        width = self.right - self.left - 2.0 * self.margin
+        depth = self.bottom - self.top - 2.0 * self.margin
+        x = self.left + self.margin + width * (time - self.begin) / self.seconds
+        y = self.bottom - self.margin - depth * height / self.highest
+        return x, y
+
+    def draw_on(self, draw: ImageDraw.ImageDraw, film: Film, frame: int) -> None:
+        """Draw it, with the present frame marked."""
+        box = (self.left, self.top, self.right, self.bottom)
+        draw.rounded_rectangle(box, self.margin, fill=_PANEL)
+        if film.events is not None:
+            left, top = self.point(film.events.liftoff, self.highest)
+            right, bottom = self.point(film.events.touchdown, 0.0)
+            draw.rectangle((left, top, right, bottom), fill=_FLIGHT)
+        points = []
+        for time, height in zip(film.time.tolist(), film.qpos[:, 2].tolist(), strict=True):
+            points.append(self.point(time, height))
+        draw.line(points, fill=_GREY, width=max(1, round(1.2 * self.scale)))
+        draw.line(points[: frame + 1], fill=_INK, width=max(1, round(2.0 * self.scale)))
+        draw.circle(points[frame], 3.2 * self.scale, fill=_ACCENT)
 
 
 # ---- files ----
 
 
-def in_gif(film: Film) -> range:
-    """Frames of the GIF."""
-    if not film.events:
+def gif_frames(film: Film) -> range:
+    """Return the frames of the GIF: those of the jump and a little around it."""
+    if film.events is None:
         return range(0, len(film.time), _GIF_SKIP)
-    span = film.events.liftoff - _GIF_BEFORE_S, film.events.touchdown + _GIF_AFTER_S
-    first, last = np.searchsorted(film.time, span[0]), np.searchsorted(film.time, span[1], "right")
-    return range(int(first), int(last), _GIF_SKIP)
+    first = np.searchsorted(film.time, film.events.liftoff - _GIF_BEFORE_S)
+    end = np.searchsorted(film.time, film.events.touchdown + _GIF_AFTER_S, "right")
+    return range(int(first), int(end), _GIF_SKIP)
 
 
 def write_gif(path: Path, frames: list[Image.Image]) -> None:
-    """Write an animation that loops, with one palette and no dither: what stands still is small."""
-    chosen = frames[:: max(1, len(frames) // 5)]
-    montage = Image.fromarray(np.vstack([np.asarray(image) for image in chosen]))
-    palette = montage.quantize(80, Image.Quantize.MAXCOVERAGE)
-    first, *rest = [i.quantize(palette=palette, dither=Image.Dither.NONE) for i in frames]
-    duration = round(1000.0 * _GIF_SKIP / FPS)
-    first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
+    """Write an animation that loops, with one palette and no dither, so that it is small."""
+    samples = frames[:: max(1, len(frames) // 5)]
+    montage = Image.fromarray(np.vstack([np.asarray(image) for image in samples]))
+    palette = montage.quantize(_GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
+    quantized = []
+    for image in frames:
+        quantized.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
+    quantized[0].save(
+        path,
+        "GIF",
+        save_all=True,
+        append_images=quantized[1:],
+        duration=round(1000.0 * _GIF_SKIP / FPS),
+        loop=0,
+    )
 
 
-def movie(path: Path) -> Any:
+def open_mp4(path: Path) -> Any:
     """Open an MP4 in H.264, 4:2:0, which every browser plays; frames are sent to it."""
     import imageio_ffmpeg
 
@@ -296,33 +411,38 @@ def movie(path: Path) -> Any:
     )
 
 
-def render(film: Film, files: dict[str, Path]) -> None:
+def render_film(film: Film, files: Mapping[str, Path]) -> None:
     """Render a film into files by suffix (.mp4, .gif, .png), each whole or not at all."""
-    kept = set(in_gif(film)) if ".gif" in files else set()
-    animation, strip = [], []
+    gif_indices = gif_frames(film) if ".gif" in files else range(0)
+    gif_images: list[Image.Image] = []
+    strip_parts: list[Any] = []
     with ExitStack() as stack:
-        aside = {end: stack.enter_context(written_whole(path)) for end, path in files.items()}
-        mp4 = stack.enter_context(closing(movie(aside[".mp4"]))) if ".mp4" in files else None
-        if mp4 is not None:
+        partial_files = {}
+        for suffix, path in files.items():
+            partial_files[suffix] = stack.enter_context(written_whole(path))
+        mp4 = None
+        if ".mp4" in files:
+            mp4 = stack.enter_context(closing(open_mp4(partial_files[".mp4"])))
             mp4.send(None)
         for index, image in enumerate(images(film)):
             if index >= len(film.time):
                 left = (WIDTH - STRIP_WIDTH) // 2
-                strip.append(np.asarray(image)[:, left : left + STRIP_WIDTH])
+                strip_parts.append(np.asarray(image)[:, left : left + STRIP_WIDTH])
                 continue
-            if index in kept:
+            if index in gif_indices:
                 size = (GIF_WIDTH, GIF_WIDTH * HEIGHT // WIDTH)
-                animation.append(image.resize(size, Image.Resampling.BOX))
-                draw_frame(animation[-1], film, index)
+                small = image.resize(size, Image.Resampling.BOX)
+                draw_frame(small, film, index)
+                gif_images.append(small)
             if mp4 is not None:
                 draw_frame(image, film, index)
                 mp4.send(image.tobytes())
         if ".gif" in files:
-            write_gif(aside[".gif"], animation)
+            write_gif(partial_files[".gif"], gif_images)
         if ".png" in files:
-            still = Image.fromarray(np.hstack(strip))
-            draw_strip(still, film)
-            still.save(aside[".png"], "PNG", optimize=True)
+            strip = Image.fromarray(np.hstack(strip_parts))
+            draw_strip(strip, film)
+            strip.save(partial_files[".png"], "PNG", optimize=True)
 
 
 def check_gl() -> None:
@@ -338,13 +458,18 @@ def check_gl() -> None:
             raise PronkError("the image is black.")
 
 
+def main() -> None:
+    """Render the film that the command line names, or check the backend without one."""
+    paths = [Path(argument) for argument in sys.argv[1:]]
+    if not paths:
+        check_gl()
+        return
+    film = load_artefact(paths[0], Film, SCHEMA, what="a film", writer="pronk trial")
+    render_film(film, {path.suffix: path for path in paths[1:]})
+
+
 if __name__ == "__main__":
-    source, *targets = map(Path, sys.argv[1:] or [""])
     try:
-        if targets:
-            made = load_artefact(source, Film, SCHEMA, what="a film", writer="pronk trial")
-            render(made, {path.suffix: path for path in targets})
-        else:
-            check_gl()
+        main()
     except Exception as error:
         sys.exit(f"{type(error).__name__}: {' '.join(str(error).split())}")
