@@ -28,6 +28,7 @@ from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.torque import (
     BLOCK_S,
@@ -70,7 +71,7 @@ def read(name: str, data: Path = DATA) -> JointLog:
         for ours, theirs in names.items()
         for i, joint in enumerate(JOINTS)
     }
-    return read_log(path, robot=rig(), unit="rad", columns=columns)
+    return read_log(path, robot=rig(), options=ReadOptions(unit="rad", columns=columns))
 
 
 @dataclass(frozen=True, kw_only=True)

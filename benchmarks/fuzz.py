@@ -47,6 +47,7 @@ from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import records
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match import result as match_file
 from pronk.identify.match.export.targets import export
@@ -181,7 +182,7 @@ def _kinds() -> dict[str, _Kind]:
     """How each kind is read; the files lie in the folder that `_write` filled."""
 
     def log(**options: Any) -> Callable[[Path], Any]:
-        return lambda path: read_log(path, **options)
+        return lambda path: read_log(path, options=ReadOptions(**options))
 
     def gains(path: Path) -> None:
         found = gains_file.load_gains(path)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pronk.version import VERSION
 
 if TYPE_CHECKING:
+    from pronk.identify.logs.options import ReadOptions
     from pronk.identify.logs.readers import read_log, read_logs
     from pronk.identify.match.export.targets import export
     from pronk.identify.match.pipeline import match_logs as match
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 __version__ = VERSION
 __all__ = [
+    "ReadOptions",
     "export",
     "load_policy",
     "load_robot",
@@ -38,6 +40,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "ReadOptions": ("pronk.identify.logs.options", "ReadOptions"),
     "export": ("pronk.identify.match.export.targets", "export"),
     "load_policy": ("pronk.policy.runtime", "load_policy"),
     "load_robot": ("pronk.robots", "load_robot"),
@@ -47,7 +50,7 @@ _HOMES = {
     "read_logs": ("pronk.identify.logs.readers", "read_logs"),
     "response": ("pronk.identify.response.estimate", "estimate"),
 }
-"""Module and name of each public function."""
+"""Module and name of each public function and class."""
 
 
 def __getattr__(name: str) -> Any:

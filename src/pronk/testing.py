@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 from pronk.deploy.links.link import Codec, Transport
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import Reader
 from pronk.identify.simulators.simulator import PARAMETERS, Simulator
 from pronk.robots.machine import Command, RefusedError, damping_command
@@ -91,15 +91,20 @@ def check_simulator(simulator: Simulator) -> None:
 
 
 def check_reader(
-    chosen: Reader, path: Path, *, robot: RobotSpec | None = None, **options: Any
+    reader: Reader,
+    path: Path,
+    *,
+    robot: RobotSpec | None = None,
+    options: ReadOptions | None = None,
 ) -> None:
     """Check a log reader on a file that it should read.
 
     The log has two samples or more, one command and one position a joint, finite and increasing
     timestamps in seconds, its source and hash; reading twice gives the same log; a missing
-    and an empty file are refused with a LogError. `options` are passed to the reader.
+    and an empty file are refused with a LogError. The reader gets the robot and the options.
     """
-    log = chosen.read(path, robot=robot, **options)
+    stated = ReadOptions() if options is None else options
+    log = reader.read(path, robot, stated)
     _require(isinstance(log, JointLog), "read: a JointLog is returned")
     shape = (len(log.time), len(log.joints))
     _require(shape[0] >= 2 and shape[1] >= 1, "read: two samples and one joint or more")
@@ -110,14 +115,14 @@ def check_reader(
     _require(bool((np.diff(log.time) > 0.0).all()), "read: timestamps increase")
     _require(log.source == str(path), "read: source is the path")
     _require(len(log.origin.sha256) == 64, "read: sha256 of the file")
-    again = chosen.read(path, robot=robot, **options)
+    again = reader.read(path, robot, stated)
     _require(np.array_equal(again.position, log.position), "read: repeatable")
     with TemporaryDirectory() as folder:
         missing, empty = Path(folder, f"missing{path.suffix}"), Path(folder, f"empty{path.suffix}")
         empty.touch()
         for wrong in (missing, empty):
             rule = f"read: a file that is {wrong.stem} is refused with a LogError"
-            _require_refused(LogError, rule, partial(chosen.read, wrong, robot=robot, **options))
+            _require_refused(LogError, rule, partial(reader.read, wrong, robot, stated))
 
 
 def check_link(

@@ -10,6 +10,7 @@ import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
 from pronk.identify.match import gains as gains_file
@@ -206,7 +207,7 @@ def test_recorded_sweep_is_matched_and_what_it_does_not_identify_held(matched: M
 
 @recorded
 def test_jaw_is_included_once_its_travel_is_given() -> None:
-    log = read_log(SO101 / "step_response", robot=ARM, scale={"gripper": 1.5})
+    log = read_log(SO101 / "step_response", robot=ARM, options=ReadOptions(scale={"gripper": 1.5}))
     with ChainSimulation(ARM, [log]) as bench:
         assert bench.joints == ARM.joint_names
         assert bench.excluded == {}

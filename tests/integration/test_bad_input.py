@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from command_line import refused
 from pronk.errors import LogError, PronkError
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log, read_logs
 from pronk.robots import load_robot
 
@@ -128,7 +129,7 @@ def test_a_command_refuses_in_one_sentence_and_writes_nothing(
 def reads_or_refuses(path: Path, **options: Any) -> None:
     """Read a log, or get one sentence with its name; anything else fails the test."""
     try:
-        read_log(path, **options)
+        read_log(path, options=ReadOptions(**options))
     except PronkError as error:
         text = str(error)
         assert "\n" not in text
@@ -216,7 +217,7 @@ def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
             read_log(path, robot=ROBOT)
     np.savez(tmp_path / "a.npz", time=np.array([Bomb(boom)], dtype=object))
     with pytest.raises(LogError, match="pickle"):
-        read_log(tmp_path / "a.npz", **OPTIONS[".npz"])
+        read_log(tmp_path / "a.npz", options=ReadOptions(**OPTIONS[".npz"]))
     assert not boom.exists()
 
 
@@ -263,7 +264,7 @@ def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(mcap)
     for suffix in (".npz", ".mcap"):
         with pytest.raises(LogError, match=f"a{suffix}"):
-            read_log(tmp_path / f"a{suffix}", **OPTIONS[suffix])
+            read_log(tmp_path / f"a{suffix}", options=ReadOptions(**OPTIONS[suffix]))
 
 
 def test_tensors_whose_numbers_are_cut(tmp_path: Path) -> None:
@@ -277,9 +278,9 @@ def test_tensors_whose_numbers_are_cut(tmp_path: Path) -> None:
             for name, data in parts.items():
                 file.writestr(name, data[:size] if "/data/" in name else data)
         if size == 240:
-            assert len(read_log(path, **OPTIONS[".pt"]).time) == 60
+            assert len(read_log(path, options=ReadOptions(**OPTIONS[".pt"])).time) == 60
     with pytest.raises(LogError, match=r"a\.pt"):
-        read_log(path, **OPTIONS[".pt"])
+        read_log(path, options=ReadOptions(**OPTIONS[".pt"]))
 
 
 # --- Mistakes in logs and options ---------------------------------------------------------------
@@ -303,7 +304,7 @@ def test_tensors_whose_numbers_are_cut(tmp_path: Path) -> None:
 )
 def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], named: str) -> None:
     with pytest.raises(LogError, match=named) as caught:
-        read_log(csv(tmp_path / "a.csv", *rows), unit="rad")
+        read_log(csv(tmp_path / "a.csv", *rows), options=ReadOptions(unit="rad"))
     assert "\n" not in str(caught.value)
     assert "a.csv" in str(caught.value)
 
@@ -319,13 +320,13 @@ def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], na
         ({"rate_hz": 100.0}, r"50\.00 Hz"),
         ({"joint_order": ["a", "b"]}, "by the file"),
         ({"command_topic": "/x"}, "command_topic"),
-        ({"units": "rad"}, "units"),
+        ({"reader_options": {"units": "rad"}}, "units"),
         ({"format": "hdf5"}, "mcap, csv, sage, pace, npz"),
     ],
 )
 def test_wrong_options_are_named(tmp_path: Path, options: dict[str, Any], named: str) -> None:
     with pytest.raises(LogError, match=named):
-        read_log(csv(tmp_path / "a.csv", *GOOD), **{"unit": "rad"} | options)
+        read_log(csv(tmp_path / "a.csv", *GOOD), options=ReadOptions(**{"unit": "rad"} | options))
 
 
 def test_files_that_are_not_there(tmp_path: Path) -> None:
@@ -337,4 +338,4 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
         with pytest.raises(LogError, match="no logs"):
             read_logs(paths)
     with pytest.raises(LogError, match=r"control\.csv"):
-        read_log(tmp_path, format="sage")
+        read_log(tmp_path, options=ReadOptions(format="sage"))

@@ -21,6 +21,7 @@ from pronk.identify.logs import mcap_log
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 
 LOG = example()
@@ -37,9 +38,9 @@ def assert_same(a: JointLog, b: JointLog) -> None:
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", LOG)
-    assert_same(LOG, read_mcap(tmp_path / "a.mcap"))
+    assert_same(LOG, read_mcap(tmp_path / "a.mcap", None, ReadOptions()))
     with pytest.raises(LogError, match="leave them out"):
-        read_log(tmp_path / "a.mcap", command_topic="/sweep/sample")
+        read_log(tmp_path / "a.mcap", options=ReadOptions(command_topic="/sweep/sample"))
 
 
 @settings(max_examples=30, deadline=None)
@@ -58,7 +59,7 @@ def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.Dat
     )
     path = tmp_path_factory.mktemp("any") / "a.mcap"
     write_mcap(path, log)
-    assert_same(log, read_mcap(path))
+    assert_same(log, read_mcap(path, None, ReadOptions()))
 
 
 def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
@@ -152,7 +153,7 @@ def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.kill()
-    log = read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap", None, ReadOptions())
     assert not log.origin.complete
     assert len(log.time) == 768  # Whole chunks of 256 samples.
     assert log.segments[0].kind == "chirp"
@@ -164,7 +165,7 @@ def test_the_reason_of_an_early_end_is_kept(tmp_path: Path) -> None:
     for k in range(5):
         writer.sample(float(k), [0.0], [0.0])
     writer.end(complete=False, reason="the belt broke")
-    log = read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap", None, ReadOptions())
     assert not log.origin.complete
     assert "the belt broke" in log.notes[0]
 
@@ -182,4 +183,4 @@ def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
     start = data.index(b"\x06")  # The chunk record.
     path.write_bytes(data[:start] + b"\x06" + number(len(record + bomb)) + record + bomb)
     with pytest.raises(LogError, match="300 MiB"):
-        read_mcap(path)
+        read_mcap(path, None, ReadOptions())

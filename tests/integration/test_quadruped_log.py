@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.pipeline import match_logs
 from pronk.identify.match.predict import predict, rmse
@@ -45,7 +46,7 @@ def record(path: Path) -> None:
 @pytest.mark.slow
 def test_all_legs_at_once_are_matched_leg_by_leg(tmp_path: Path) -> None:
     record(tmp_path / "all.pt")
-    log = read_log(tmp_path / "all.pt", robot=ROBOT, joint_order="default")
+    log = read_log(tmp_path / "all.pt", robot=ROBOT, options=ReadOptions(joint_order="default"))
     halves = []
     for rows in (slice(None, len(log.time) // 2), slice(len(log.time) // 2, None)):
         columns = {name: getattr(log, name)[rows] for name in ("time", "command", "position")}

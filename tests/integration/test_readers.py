@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import zipfile
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +21,11 @@ from pronk.identify.logs.checks import (
     check_motion,
     check_rate,
     check_unit,
-    examine,
+    examine_time,
     saturation_note,
 )
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log, read_logs, readers
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -80,12 +80,12 @@ def test_the_jaw_is_no_angle_without_a_scale() -> None:
     log = read_log(SO101 / "multisine")
     assert log.unit("gripper") == "unknown"
     assert log.unit("shoulder_pan") == "rad"
-    scaled = read_log(SO101 / "multisine", scale={"gripper": 1.9})
+    scaled = read_log(SO101 / "multisine", options=ReadOptions(scale={"gripper": 1.9}))
     assert scaled.unit("gripper") == "rad"
     np.testing.assert_allclose(scaled.position[:, 5], 1.9 * log.position[:, 5])
     np.testing.assert_array_equal(scaled.position[:, :5], log.position[:, :5])
     np.testing.assert_array_equal(scaled.velocity, log.velocity)  # type: ignore[arg-type]
-    renamed = read_log(SO101 / "multisine", joint_names={"Jaw": "claw"})
+    renamed = read_log(SO101 / "multisine", options=ReadOptions(joint_names={"Jaw": "claw"}))
     assert (renamed.joints[0], renamed.unit("claw")) == ("Rotation", "unknown")
 
 
@@ -93,10 +93,10 @@ def test_the_jaw_is_no_angle_without_a_scale() -> None:
 def test_expectations_that_the_timestamps_contradict_are_refused() -> None:
     path = SO101 / "chirp_sweep"
     with pytest.raises(LogError, match=r"49\.85 Hz"):
-        read_log(path, rate_hz=50.0)
-    read_log(path, rate_hz=49.85)
+        read_log(path, options=ReadOptions(rate_hz=50.0))
+    read_log(path, options=ReadOptions(rate_hz=49.85))
     with pytest.raises(LogError, match="probably in us"):
-        read_log(path, time_unit="s")
+        read_log(path, options=ReadOptions(time_unit="s"))
     with pytest.raises(RobotError, match="FR_hip_roll"):
         read_log(path, robot=load_robot("mini_cheetah"))
 
@@ -131,7 +131,9 @@ def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
 def test_round_trip(tmp_path: Path, name: str) -> None:
     log, path = example(), tmp_path / name
     (write_npz if name == "a.npz" else write_csv)(path, log)
-    back = read_log(path, unit="rad", format="csv" if name == "a.txt" else None)
+    back = read_log(
+        path, options=ReadOptions(unit="rad", format="csv" if name == "a.txt" else None)
+    )
     for quantity in ("time", "command", "position", "velocity", "torque"):
         np.testing.assert_array_equal(getattr(back, quantity), getattr(log, quantity))
     assert back.joints == log.joints
@@ -154,10 +156,12 @@ def test_csv_in_degrees_with_names_of_its_own(
     path.write_bytes(("\ufeff" * bom + text).encode())
     log = read_log(
         path,
-        unit="deg",
-        time_unit="ms",
-        columns={"time": "t_ms", "position.FR_knee": "q", "command.FR_knee": "q_des"},
         robot=load_robot("mini_cheetah"),
+        options=ReadOptions(
+            unit="deg",
+            time_unit="ms",
+            columns={"time": "t_ms", "position.FR_knee": "q", "command.FR_knee": "q_des"},
+        ),
     )
     np.testing.assert_allclose(log.position[:, 0], np.deg2rad(values), atol=1e-15)
     np.testing.assert_allclose(log.command[:, 0], np.deg2rad(values) / 2.0, atol=1e-15)
@@ -174,7 +178,9 @@ def test_a_pace_recording_gives_the_numbers_of_pytorch(tmp_path: Path) -> None:
     position = torch.rand(12, 400, generator=generator, dtype=torch.float64).T
     path = tmp_path / "chirp_data.pt"
     torch.save({"time": time, "dof_pos": position, "des_dof_pos": command, "note": "x"}, path)
-    log = read_log(path, robot=load_robot("mini_cheetah"), joint_order="default")
+    log = read_log(
+        path, robot=load_robot("mini_cheetah"), options=ReadOptions(joint_order="default")
+    )
     np.testing.assert_array_equal(log.position, position.numpy())
     np.testing.assert_array_equal(log.command, command.numpy().astype(float))
     assert log.joints == load_robot("mini_cheetah").joint_names
@@ -196,7 +202,7 @@ def test_without_pytorch_a_pace_recording_is_refused_with_the_way_out(
 def test_jitter_gaps_and_lost_samples_are_counted() -> None:
     rng = np.random.default_rng(0)
     time = np.arange(2000) / 500.0 + rng.normal(0.0, 50e-6, 2000)
-    found = examine(np.delete(time, np.r_[300:310, 900:905]))
+    found = examine_time(np.delete(time, np.r_[300:310, 900:905]))
     assert (len(found.gaps), found.lost) == (2, 15)
     # Each interval has the jitter of two stamps.
     assert found.jitter_s == pytest.approx(50e-6 * np.sqrt(2.0), rel=0.1)
@@ -207,10 +213,12 @@ def test_jitter_gaps_and_lost_samples_are_counted() -> None:
 
 def test_a_perfect_clock_and_one_that_drifts() -> None:
     index = np.arange(1000)
-    found = examine(index / 500.0)
+    found = examine_time(index / 500.0)
     assert (found.rate_hz, found.lost) == (pytest.approx(500.0), 0)
     assert max(found.jitter_s, found.drift_s) < 1e-9
-    assert 0.3e-3 < examine(index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0)).drift_s < 1e-3
+    assert (
+        0.3e-3 < examine_time(index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0)).drift_s < 1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -230,24 +238,24 @@ def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> No
     rows = [kept[k] for k in sorted([*range(50), 7, 7, 20])]
     path.write_text("\n".join(["time,position.a,command.a", *rows]))
     with pytest.raises(LogError, match="row 10 repeats the timestamp"):
-        read_log(path, unit="rad")
+        read_log(path, options=ReadOptions(unit="rad"))
     done = invoke(["response", path, "--unit", "rad", "--drop-duplicates"])
     assert "repeats the timestamp" not in done.stderr
-    back = read_log(path, unit="rad", drop_duplicates=True)
+    back = read_log(path, options=ReadOptions(unit="rad", drop_duplicates=True))
     np.testing.assert_allclose(back.time, 0.01 * np.arange(50))
     assert any(note.startswith("3 rows") for note in back.notes)
     # The same timestamp with another value is not a duplicate, and stays an error.
     rows[8] = f"{0.01 * 7},0.5,0.5"
     path.write_text("\n".join(["time,position.a,command.a", *rows]))
     with pytest.raises(LogError, match="repeats the timestamp"):
-        read_log(path, unit="rad", drop_duplicates=True)
+        read_log(path, options=ReadOptions(unit="rad", drop_duplicates=True))
 
 
 def test_an_epoch_clock_begins_at_zero(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = [f"{1_700_000_000_000_000 + 2000 * k},0.1,{0.01 * k}" for k in range(50)]
     path.write_text("\n".join(["time,position.a,command.a", *rows]))
-    log = read_log(path, unit="rad", time_unit="us")
+    log = read_log(path, options=ReadOptions(unit="rad", time_unit="us"))
     assert log.time[0] == 0.0
     assert log.rate_hz == pytest.approx(500.0)
     assert any("made to begin at zero" in note for note in log.notes)
@@ -303,8 +311,8 @@ def test_no_motion_is_refused(position: np.ndarray, command: np.ndarray, words: 
 def test_degrees_read_as_radians_are_refused(tmp_path: Path, wrong: np.ndarray) -> None:
     write_csv(tmp_path / "a.csv", moved(wrong, wrong))
     with pytest.raises(LogError, match="probably in degrees"):
-        read_log(tmp_path / "a.csv", unit="rad")
-    assert np.ptp(read_log(tmp_path / "a.csv", unit="deg").position) < 0.6
+        read_log(tmp_path / "a.csv", options=ReadOptions(unit="rad"))
+    assert np.ptp(read_log(tmp_path / "a.csv", options=ReadOptions(unit="deg")).position) < 0.6
 
 
 def test_a_log_of_another_robot_is_refused(tmp_path: Path) -> None:
@@ -339,7 +347,9 @@ def test_an_order_of_joints_is_never_assumed(tmp_path: Path) -> None:
     theirs = (*robot.joint_names[3:6], *robot.joint_names[:3], *robot.joint_names[6:])
 
     def joints(order: object, known: RobotSpec | None = robot) -> tuple[str, ...]:
-        return read_log(path, unit="rad", robot=known, joint_order=order).joints
+        return read_log(
+            path, robot=known, options=ReadOptions(unit="rad", joint_order=order)
+        ).joints
 
     np.savez(path, **arrays)  # type: ignore[arg-type]
     for known, proposal in ((None, "--robot"), (robot, ",".join(robot.joint_names))):
@@ -382,7 +392,7 @@ def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") ->
 def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     bag(path)
-    log = read_log(path, command_topic="/joint_command")
+    log = read_log(path, options=ReadOptions(command_topic="/joint_command"))
     assert log.joints == ("knee", "hip")
     assert log.rate_hz == pytest.approx(200.0)
     # States before the first command are dropped; the command is the last at or before a state.
@@ -398,12 +408,12 @@ def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
 def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     bag(tmp_path / "bag_0.mcap", stamped=False, command="/array")
-    read = partial(read_log, tmp_path, command_topic="/array", command_field="data")
+    unnamed = ReadOptions(command_topic="/array", command_field="data")
     with pytest.raises(LogError, match="--joint-order NAME"):
-        read()
+        read_log(tmp_path, options=unnamed)
     with pytest.raises(LogError, match="lack hip"):
-        read(joint_order=["knee", "hop"])
-    log = read(joint_order=["knee", "hip"])
+        read_log(tmp_path, options=replace(unnamed, joint_order=["knee", "hop"]))
+    log = read_log(tmp_path, options=replace(unnamed, joint_order=["knee", "hip"]))
     k = np.arange(8, 400)
     np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
     assert any("times of reception" in note for note in log.notes)
@@ -426,7 +436,7 @@ def test_a_wrong_topic_or_field_lists_what_there_is(
     path = tmp_path / "bag.mcap"
     bag(path)
     with pytest.raises(LogError, match=words) as caught:
-        read_log(path, **options)  # type: ignore[arg-type]
+        read_log(path, options=ReadOptions(**options))  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     if "topic" in words:
         assert "/joint_states (sensor_msgs/msg/JointState)" in str(caught.value)
@@ -440,28 +450,32 @@ import hashlib
 import numpy as np
 
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.logs.readers import reader
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
+from pronk.identify.logs.readers import Reader
 
 
-@reader("turns", ".turns")
-def read_turns(path, *, robot=None, joint="knee", sign: float = 1.0):
+def read_turns(path, robot, options):
     """Time; command; position: the angles of one joint in turns."""
     try:
         rows = [list(map(float, line.split(";"))) for line in path.read_text().splitlines()]
         time, command, position = np.array(rows).T
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: no log in turns ({error}).") from None
-    scale = 2.0 * np.pi * sign
+    stated = options.reader_options
+    scale = 2.0 * np.pi * float(stated.get("sign", "1"))
     return JointLog(
         robot="unknown" if robot is None else robot.name,
-        joints=(joint,),
+        joints=(stated.get("joint", "knee"),),
         time=time,
         command=scale * command[:, None],
         position=scale * position[:, None],
-        source=str(path),
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        origin=LogOrigin(
+            source=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest()
+        ),
     )
+
+
+TURNS = Reader(name="turns", suffixes=(".turns",), read=read_turns, options=("joint", "sign"))
 '''
 
 
@@ -473,7 +487,7 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     info.mkdir(parents=True)
     (site / "turns_reader.py").write_text(READER)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: turns-reader\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[pronk.readers]\nturns = turns_reader:read_turns\n")
+    (info / "entry_points.txt").write_text("[pronk.readers]\nturns = turns_reader:TURNS\n")
     monkeypatch.syspath_prepend(site)
     monkeypatch.delitem(sys.modules, "turns_reader", raising=False)
     time = np.arange(5000) / 500.0
@@ -486,11 +500,11 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_reader_of_another_package_is_found_and_conforms(recording: Path) -> None:
     check_reader(readers()["turns"], recording)
-    log = read_log(recording, joint="elbow", sign=-1.0)
+    log = read_log(recording, options=ReadOptions(reader_options={"joint": "elbow", "sign": "-1"}))
     assert log.joints == ("elbow",)
     assert np.abs(log.command).max() == pytest.approx(2.0 * np.pi * 0.04, rel=1e-3)
     with pytest.raises(LogError, match="columns"):
-        read_log(recording, columns={"time": "t"})
+        read_log(recording, options=ReadOptions(columns={"time": "t"}))
     options = ["--reader-option", "joint=elbow", "--reader-option", "sign=-1"]
     out = recording.with_name("out")
     assert "elbow" in accepted("response", recording, *options, "--out", out, "--no-plots")

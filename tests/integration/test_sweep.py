@@ -16,6 +16,7 @@ from pronk.errors import HardwareError, PlanError
 from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.identify.logs.options import ReadOptions
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
@@ -69,7 +70,7 @@ def test_one_whole_log_for_each_joint(recorded: Recorded) -> None:
     machine, plan, paths = recorded
     assert [path.name for path in paths] == ["FR_hip_roll.mcap", "FR_knee.mcap"]
     for path, joint in zip(paths, plan.joints, strict=True):
-        log = read_mcap(path)
+        log = read_mcap(path, None, ReadOptions())
         assert (log.origin.complete, log.notes, log.virtual) == (True, (), True)
         assert log.robot == "mini_cheetah"
         assert log.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
@@ -88,7 +89,7 @@ def test_one_whole_log_for_each_joint(recorded: Recorded) -> None:
 def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) -> None:
     _, plan, paths = recorded
     for path, joint in zip(paths, plan.joints, strict=True):
-        log = read_mcap(path)
+        log = read_mcap(path, None, ReadOptions())
         column = log.column(joint)
         assert log.pose is not None
         excitations = [each for each in plan.excitations if each.joint == joint]
@@ -107,7 +108,7 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
 
 def test_frequency_and_motion_of_other_joints_are_logged(recorded: Recorded) -> None:
     _, _, paths = recorded
-    hip, knee = (read_mcap(path) for path in paths)
+    hip, knee = (read_mcap(path, None, ReadOptions()) for path in paths)
     assert hip.frequency is not None
     for segment in hip.segments:
         inside = (hip.time >= segment.start) & (hip.time <= segment.start + SHORT.length_s - 0.05)
@@ -175,7 +176,7 @@ def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
     assert why in str(caught.value) or machine is Interrupted
     # At once where it happened, and again on the way out (closing damps too).
     assert watched.calls[-4:] == ["damp", "damp", "close", "damp"]
-    log = read_mcap(tmp_path / "FR_knee.mcap")
+    log = read_mcap(tmp_path / "FR_knee.mcap", None, ReadOptions())
     assert not log.origin.complete
     assert why in log.notes[0]
     assert log.time[-1] > 4.9 or drive
@@ -186,7 +187,7 @@ def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> No
     joints = tuple(replace(j, range=(1.5, 1.7)) if "knee" in j.name else j for j in ROBOT.joints)
     plan = replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
     sweep(Watched(), plan, tmp_path)
-    log = read_mcap(tmp_path / "FR_knee.mcap")
+    log = read_mcap(tmp_path / "FR_knee.mcap", None, ReadOptions())
     commands = log.command[:, log.column("FR_knee")]
     np.testing.assert_allclose([commands.min(), commands.max()], [1.5, 1.7], atol=1e-5)
 

@@ -14,6 +14,7 @@ from pronk.deploy.bench.virtual_sweep import sweep_virtual
 from pronk.errors import LogError
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match import match_logs
 from virtual_robot import ROBOT, SIM_PARAMS
@@ -31,7 +32,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> JointLog:
 def read(folder: Path, log: JointLog, factor: float = 1.0, offset: float = 0.0) -> JointLog:
     """The log on another clock as a file without segments gives it, with the drives' gains."""
     write_npz(folder / "a.npz", replace(log, time=factor * log.time + offset))
-    back = read_log(folder / "a.npz", robot=ROBOT, unit="rad")
+    back = read_log(folder / "a.npz", robot=ROBOT, options=ReadOptions(unit="rad"))
     return replace(back, stiffness=log.stiffness, damping=log.damping)
 
 

@@ -31,6 +31,7 @@ from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_reader import read_mcap
+from pronk.identify.logs.options import ReadOptions
 from pronk.robots import load_robot
 from wire import ROBOT, over_lcm
 
@@ -72,7 +73,7 @@ def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:
 def written(path: Path) -> JointLog | None:
     """What can be read of a log that is being written; None before its first half second."""
     try:
-        return read_mcap(path)
+        return read_mcap(path, None, ReadOptions())
     except LogError:
         return None
 
@@ -81,7 +82,7 @@ def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
     plan = plan_of("gripper", "so101", 0.05)
     link = Link(robot="so101", address=Address.parse("sim://bench"))
     recorded = record_wire(plan, tmp_path, link, ages=PATIENT, real_time=False)
-    log = read_mcap(recorded["logs"][0])
+    log = read_mcap(recorded["logs"][0], None, ReadOptions())
     assert recorded["virtual"]
     assert log.origin.complete
     assert log.joints == plan.robot.joint_names
@@ -94,7 +95,7 @@ def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     assert recorded["virtual"]
     assert recorded["servo"]["n"] > 100
     assert [path.name for path in recorded["logs"]] == ["FR_knee.mcap"]
-    log = read_mcap(recorded["logs"][0])
+    log = read_mcap(recorded["logs"][0], None, ReadOptions())
     assert log.origin.complete
     assert log.virtual
     assert log.origin.metadata["link"] == f"lcm://?port={port}"
@@ -140,7 +141,7 @@ def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
     # A killed servo's joints are damped by the standby.
     when, damps = wire.received()
     assert damps[-1]
-    log = read_mcap(tmp_path / "FR_hip_roll.mcap")
+    log = read_mcap(tmp_path / "FR_hip_roll.mcap", None, ReadOptions())
     assert not log.origin.complete
     assert reason in log.notes[0]
     assert "FR_hip_roll.mcap" in capsys.readouterr().err
@@ -178,7 +179,7 @@ def test_a_killed_program_leaves_the_joints_damped_and_a_log(port: int, tmp_path
     first = when[damps & (when > killed)][0]
     assert when[~damps][-1] < first < gone + DAMPED_S
     assert when[-1] - first >= 0.95  # as far as this thread can tell
-    log = read_mcap(path)
+    log = read_mcap(path, None, ReadOptions())
     assert not log.origin.complete
     # The logger outlives the program that started it.
     assert killed - log.time[-1] < 0.7

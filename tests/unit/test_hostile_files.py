@@ -21,6 +21,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import McapWriter
 from pronk.identify.logs.mcap_log import HEADER, SAMPLE, SEGMENT, TOPICS
 from pronk.identify.logs.mcap_log import SCHEMA as SWEEP
+from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import find_logs, read_log
 from pronk.identify.match import gains
 from pronk.identify.response.response import FrequencyResponse
@@ -108,7 +109,7 @@ def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> Non
     body["joints"] = {name: body["joints"]["knee"]}
     (tmp_path / "gains.yaml").write_text(yaml.safe_dump(body))
     with pytest.raises(LogError) as caught:
-        read_log(tmp_path / "a.npz", unit="rad")
+        read_log(tmp_path / "a.npz", options=ReadOptions(unit="rad"))
     with pytest.raises(ArtefactError) as other:
         gains.load_gains(tmp_path / "gains.yaml")
     with pytest.raises(ArtefactError):
@@ -200,7 +201,7 @@ def test_many_columns_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "wide.csv"
     path.write_text(",".join(map(str, range(100_000))) + "\n" + ",".join(["0"] * 100_000))
     with pytest.raises(LogError, match="columns"):
-        read_log(path, unit="rad")
+        read_log(path, options=ReadOptions(unit="rad"))
 
 
 def response(**changed: object) -> FrequencyResponse:
@@ -301,16 +302,18 @@ def test_arrays_of_an_npz_log_that_are_no_text_or_no_arrays_or_not_read(tmp_path
     t = np.arange(1000) / 500.0
     wave, path = np.sin(t)[:, None], tmp_path / "a.npz"
     np.savez(path, time=t, command=wave, position=wave, joints=np.array(["knee"]), velocities=wave)
-    assert any("velocities" in note for note in read_log(path, unit="rad").notes)
+    assert any(
+        "velocities" in note for note in read_log(path, options=ReadOptions(unit="rad")).notes
+    )
     beyond = np.array([0x110000], np.uint32).view("<U1")
     np.savez(path, time=t, command=wave, position=wave, joints=beyond)
     with pytest.raises(LogError):
-        read_log(path, unit="rad")
+        read_log(path, options=ReadOptions(unit="rad"))
     with zipfile.ZipFile(path, "w") as archive:
         for name in ("time", "command", "position"):
             archive.writestr(f"{name}.npy", b"no array")
     with pytest.raises(LogError):
-        read_log(path, unit="rad")
+        read_log(path, options=ReadOptions(unit="rad"))
 
 
 def test_results_with_numbers_of_some_joints_are_refused(tmp_path: Path) -> None:

@@ -111,25 +111,25 @@ class Reading:
 
     def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
         """Read every log that some paths stand for, on all cores."""
+        from pronk.identify.logs.options import ReadOptions
         from pronk.identify.logs.readers import read_logs
 
-        options: dict[str, Any] = {
-            "unit": self.unit,
-            "time_unit": self.time_unit,
-            "columns": named_values("--columns", self.columns, str),
-            "joint_names": named_values("--joint-names", self.joint_names, str),
-            "joint_order": self.joint_order,
-            "drop_duplicates": self.drop_duplicates or None,
-            "scale": named_values("--scale", self.scale, float),
-            "rate_hz": self.rate_hz,
-            "format": self.log_format,
-            "measured_topic": self.measured_topic,
-            "command_topic": self.command_topic,
-            "command_field": self.command_field,
-        }
-        options |= named_values("--reader-option", self.reader_options, str)
-        stated = {name: value for name, value in options.items() if value not in (None, {})}
-        return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **stated)
+        options = ReadOptions(
+            format=self.log_format,
+            rate_hz=self.rate_hz,
+            unit=self.unit,
+            time_unit=self.time_unit,
+            joint_names=named_values("--joint-names", self.joint_names, str) or None,
+            joint_order=self.joint_order,
+            drop_duplicates=self.drop_duplicates,
+            scale=named_values("--scale", self.scale, float),
+            columns=named_values("--columns", self.columns, str),
+            measured_topic=self.measured_topic,
+            command_topic=self.command_topic,
+            command_field=self.command_field,
+            reader_options=named_values("--reader-option", self.reader_options, str),
+        )
+        return read_logs(paths, robot=robot, options=options, processes=os.cpu_count() or 1)
 
 
 def named_values(

@@ -11,14 +11,14 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation, JointLog
+from pronk.identify.logs.options import TIME_UNITS
 
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds in each unit of time."""
 PLAUSIBLE_HZ = (5.0, 50_000.0)
-"""Rates outside mean a wrong unit: slower ones do not resolve a joint, no drive logs faster."""
+"""Lowest and highest sample rate that a log can have [Hz]; another one means a wrong unit, as a
+slower log does not resolve a joint and no drive logs faster."""
 RATE_TOLERANCE = 1e-3
 """Largest relative difference of the measured from an expected rate. Crystals keep 1e-4; at 1e-3 a
-20 s sweep slips by one 50 Hz tick from its end to its start."""
+sweep of 20 s slips by one tick of 50 Hz from its start to its end."""
 _GAP = 2.5
 """Intervals longer than this many typical ones are gaps: more than one sample is lost."""
 
@@ -35,17 +35,18 @@ _FEW_STEPS = 3.0
 _NEAR_END = 0.005
 """Share of the position's travel that counts as being at its end."""
 _MOVES_ON = 0.15
-"""Share of its own travel that the command must move outward meanwhile. A joint that friction holds
-at its turning point stands still while the command comes back, not while it moves on."""
-_LONG_RUN_S = 0.1
-"""Time at an end from which on it is not the turning point of an oscillation [s]."""
+"""Share of the command's travel that the command must move outward while the joint is at its end. A
+joint that friction holds at its turning point stands still while the command comes back, not while
+it moves on."""
+_LONGEST_TURN_S = 0.1
+"""Longest time at an end that is the turning point of an oscillation [s]."""
 _SATURATED = 0.05
-"""Share of the time at an end, in such runs, that makes a joint saturated."""
+"""Share of the time at an end that makes a joint saturated."""
 
 CORRELATION_LIMIT = 0.1
 """Highest absolute correlation of two simultaneous commands that passes without a warning."""
-_REACH_S = 0.5
-"""Lags that are searched [s]: longer than a joint's impulse response."""
+_LONGEST_LAG_S = 0.5
+"""Largest lag at which commands are correlated [s]: longer than a joint's impulse response."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +54,11 @@ class Timing:
     """Regularity of measured timestamps."""
 
     samples: int
+    """Number of samples."""
     duration_s: float
+    """Time from the first sample to the last [s]."""
     rate_hz: float
-    """Mean over the whole record."""
+    """Mean sample rate over the whole record [Hz]."""
     typical_s: float
     """Median interval [s]."""
     jitter_s: float
@@ -68,10 +71,13 @@ class Timing:
     @property
     def lost(self) -> int:
         """Samples missing in the gaps, by the typical interval."""
-        return sum(round(length / self.typical_s) - 1 for _, length in self.gaps)
+        count = 0
+        for _, length in self.gaps:
+            count += round(length / self.typical_s) - 1
+        return count
 
     def words(self) -> str:
-        """One line for a log's notes."""
+        """Return one line for a log's notes."""
         text = (
             f"{self.samples} samples at {self.rate_hz:.2f} Hz over {self.duration_s:.2f} s, "
             f"jitter {1e3 * self.jitter_s:.3f} ms, drift {1e3 * self.drift_s:.2f} ms"
@@ -85,53 +91,65 @@ class Timing:
         return text
 
 
-def examine(time: Array) -> Timing:
-    """Rate, jitter, drift and gaps of two or more increasing timestamps [s]."""
-    steps = np.diff(time)
-    typical = float(np.median(steps))
-    gap = steps > _GAP * typical
-    straight = np.polynomial.Polynomial.fit(np.arange(len(time)), time, 1)
+def examine_time(time: Array) -> Timing:
+    """Measure rate, jitter, drift and gaps of two or more increasing timestamps [s]."""
+    intervals = np.diff(time)
+    typical = float(np.median(intervals))
+    is_gap = intervals > _GAP * typical
+    samples = np.arange(len(time))
+    straight = np.polynomial.Polynomial.fit(samples, time, 1)
     duration = float(time[-1] - time[0])
+    gaps = [(float(time[i]), float(intervals[i])) for i in np.flatnonzero(is_gap)]
     return Timing(
         samples=len(time),
         duration_s=duration,
         rate_hz=(len(time) - 1) / duration,
         typical_s=typical,
-        jitter_s=float(np.std(steps[~gap])),
-        drift_s=float(np.abs(time - straight(np.arange(len(time)))).max()),
-        gaps=tuple((float(time[i]), float(steps[i])) for i in np.flatnonzero(gap)),
+        jitter_s=float(np.std(intervals[~is_gap])),
+        drift_s=float(np.abs(time - straight(samples)).max()),
+        gaps=tuple(gaps),
     )
 
 
-def check_unit(time: Array, where: str, unit: str) -> None:
-    """Refuse timestamps [s], converted from `unit`, whose rate fits another, which is named."""
-    rate = 1.0 / float(np.median(np.diff(time)))
+def check_unit(time: Array, source: str, unit: str) -> None:
+    """Refuse timestamps whose rate fits another unit of time, which the LogError names.
+
+    Args:
+        time: Timestamps, converted from `unit` to seconds, shape (n,).
+        source: The file, for the message.
+        unit: Unit they were read in, one of `TIME_UNITS`.
+    """
+    rate_hz = 1.0 / float(np.median(np.diff(time)))
     low, high = PLAUSIBLE_HZ
-    if low <= rate <= high:
+    if low <= rate_hz <= high:
         return
-    rates = {name: rate * TIME_UNITS[unit] / scale for name, scale in TIME_UNITS.items()}
+    # Of several units that fit, the likely one is nearest to the usual rate of 500 Hz.
+    likely = ""
+    likely_distance = np.inf
+    for name, seconds in TIME_UNITS.items():
+        rate_in_unit = rate_hz * TIME_UNITS[unit] / seconds
+        distance = abs(np.log(rate_in_unit / 500.0))
+        if low <= rate_in_unit <= high and distance < likely_distance:
+            likely = name
+            likely_distance = distance
     hint = "no unit of time fits them"
-    if fitting := [name for name, hz in rates.items() if low <= hz <= high]:
-        # Where several fit, the one nearest to the 500 Hz at which joints are usually logged.
-        likely = min(fitting, key=lambda name: abs(np.log(rates[name] / 500.0)))
+    if likely:
         hint = f"the timestamps are probably in {likely} (--time-unit {likely}, or convert them)"
     raise LogError(
-        f"{where}: read in {unit!r}, its samples come at {rate:.4g} Hz; expected {low:g} to "
+        f"{source}: read in {unit!r}, its samples come at {rate_hz:.4g} Hz; expected {low:g} to "
         f"{high:g} Hz; {hint}."
     )
 
 
-def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
+def check_rate(timing: Timing, source: str, expected_hz: float) -> None:
     """Refuse an expected rate that differs from the measured one; the LogError gives both."""
-    if not (np.isfinite(expected_hz) and expected_hz > 0.0):
-        raise LogError(f"{where}: --rate-hz {expected_hz}; expected a positive number.")
     # Lost samples do not make the clock slow.
-    measured = (timing.samples + timing.lost - 1) / timing.duration_s
-    if abs(measured / expected_hz - 1.0) > RATE_TOLERANCE:
-        late = abs(timing.samples / expected_hz - timing.samples / measured)
+    measured_hz = (timing.samples + timing.lost - 1) / timing.duration_s
+    if abs(measured_hz / expected_hz - 1.0) > RATE_TOLERANCE:
+        apart_s = abs(timing.samples / expected_hz - timing.samples / measured_hz)
         raise LogError(
-            f"{where}: --rate-hz {expected_hz:g}, but the timestamps come at {measured:.2f} Hz "
-            f"({late:.2f} s apart by the end); leave --rate-hz out to use the timestamps."
+            f"{source}: --rate-hz {expected_hz:g}, but the timestamps come at {measured_hz:.2f} Hz "
+            f"({apart_s:.2f} s apart by the end); leave --rate-hz out to use the timestamps."
         )
 
 
@@ -154,21 +172,26 @@ def check_motion(excitation: Excitation) -> None:
 
 
 def saturation_note(log: JointLog, joint: str) -> str:
-    """A warning for a joint that rests at an end while its command moves on, or ""."""
+    """Return a warning if a joint rests at an end while its command moves on, or ""."""
     column = log.column(joint)
-    position, command = log.position[:, column], log.command[:, column]
-    travel, commanded = float(np.ptp(position)), float(np.ptp(command))
+    position = log.position[:, column]
+    command = log.command[:, column]
+    travel = float(np.ptp(position))
+    commanded = float(np.ptp(command))
     if travel == 0.0 or commanded == 0.0:
         return ""
-    total = 0.0
+    saturated_s = 0.0
     for sign in (1.0, -1.0):
-        near = sign * position >= (sign * position).max() - _NEAR_END * travel
-        for first, stop in np.flatnonzero(np.diff(np.pad(near, 1))).reshape(-1, 2):
-            length = float(log.time[stop - 1] - log.time[first])
-            outward = sign * command[first:stop]
-            if length >= _LONG_RUN_S and outward.max() - outward[0] > _MOVES_ON * commanded:
-                total += length
-    if (share := total / float(log.time[-1] - log.time[0])) <= _SATURATED:
+        outward = sign * position
+        at_end = outward >= outward.max() - _NEAR_END * travel
+        for first, stop in np.flatnonzero(np.diff(np.pad(at_end, 1))).reshape(-1, 2):
+            length_s = float(log.time[stop - 1] - log.time[first])
+            stretch = sign * command[first:stop]
+            moves_on = stretch.max() - stretch[0] > _MOVES_ON * commanded
+            if length_s >= _LONGEST_TURN_S and moves_on:
+                saturated_s += length_s
+    share = saturated_s / float(log.time[-1] - log.time[0])
+    if share <= _SATURATED:
         return ""
     return (
         f"{joint} is saturated: for {100.0 * share:.0f} % of the time it stays at an end of its "
@@ -178,29 +201,38 @@ def saturation_note(log: JointLog, joint: str) -> str:
 
 
 def check_radians(log: JointLog, joint: str) -> None:
-    """Refuse a joint in radians that moves as only degrees would."""
+    """Refuse a joint in radians that moves as only degrees would, with a LogError."""
+    if log.unit(joint) != "rad":
+        return
     column = log.column(joint)
-    command, position = log.command[:, column], log.position[:, column]
+    command = log.command[:, column]
+    position = log.position[:, column]
     peak = 0.5 * float(np.ptp(command))
     farthest = float(max(np.abs(position).max(), np.abs(command).max()))
-    if log.unit(joint) != "rad" or (peak <= LARGEST_COMMAND and farthest <= LARGEST_POSITION):
-        return
-    what = f"it reaches {farthest:.3g}"
     if peak > LARGEST_COMMAND:
-        what = f"its command swings by {peak:.3g}"
+        excess = f"its command swings by {peak:.3g}"
+    elif farthest > LARGEST_POSITION:
+        excess = f"it reaches {farthest:.3g}"
+    else:
+        return
     raise LogError(
-        f"{log.source or 'log'}: {joint} is read in radians and {what}, more than a joint "
+        f"{log.source or 'log'}: {joint} is read in radians and {excess}, more than a joint "
         "turns; the file is probably in degrees (--unit deg, or convert it)."
     )
 
 
 def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
-    """A warning naming the two most alike commands (n, joints), or "" where none exceeds the limit.
+    """Return a warning that names the two most correlated commands, or "" below the limit.
 
     The largest absolute correlation over lags up to half a second counts. With correlated commands,
     the motion that one joint causes in another looks like a response to the other's own command:
     the coherence stays near one while the response is wrong. A command that never changes
     correlates with nothing.
+
+    Args:
+        time: Timestamps [s], shape (n,).
+        command: Commands in force [rad], shape (n, joints).
+        joints: Names of the columns.
     """
     from scipy.signal import correlate  # slow to import
 
@@ -209,19 +241,22 @@ def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
     grid = time[0] + np.arange(len(time)) / rate_hz
     index = np.clip(np.searchsorted(time, grid + 0.5 / rate_hz) - 1, 0, len(time) - 1)
     centred = command[index] - command[index].mean(axis=0)
-    size = np.linalg.norm(centred, axis=0)
-    moving = [i for i in range(len(joints)) if size[i] > 1e-9 * np.sqrt(len(time))]
-    middle = len(time) - 1
-    reach = min(round(_REACH_S * rate_hz), middle)
-    largest, alike = CORRELATION_LIMIT, ""
-    for one, other in combinations(moving, 2):
-        first, second = (centred[:, i] / size[i] for i in (other, one))
-        lags = correlate(first, second, method="fft")
-        peak = float(np.abs(lags[middle - reach : middle + reach + 1]).max())
+    norms = np.linalg.norm(centred, axis=0)
+    moving = [i for i in range(len(joints)) if norms[i] > 1e-9 * np.sqrt(len(time))]
+    no_lag = len(time) - 1
+    reach = min(round(_LONGEST_LAG_S * rate_hz), no_lag)
+    largest = CORRELATION_LIMIT
+    pair = ""
+    for i, j in combinations(moving, 2):
+        correlation = correlate(centred[:, j] / norms[j], centred[:, i] / norms[i], method="fft")
+        peak = float(np.abs(correlation[no_lag - reach : no_lag + reach + 1]).max())
         if peak > largest:
-            largest, alike = peak, f"{joints[other]} and {joints[one]}"
-    return alike and (
-        f"the commands of {alike} correlate to {min(largest, 1.0):.2f} (limit "
+            largest = peak
+            pair = f"{joints[j]} and {joints[i]}"
+    if not pair:
+        return ""
+    return (
+        f"the commands of {pair} correlate to {min(largest, 1.0):.2f} (limit "
         f"{CORRELATION_LIMIT:g}): a response may contain the effect of one joint on the other; "
         "excite one joint at a time or use multisines on different harmonics"
     )

@@ -3,101 +3,101 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.arrays import Array
 from pronk.errors import LogError
-from pronk.identify.logs.checks import TIME_UNITS, check_unit, correlation_note
+from pronk.identify.logs.checks import check_unit, correlation_note
 from pronk.identify.logs.joint_log import JointLog, LogOrigin, check_increasing
+from pronk.identify.logs.options import ANGLE_UNITS, TIME_UNITS, ReadOptions
 from pronk.names import check_names
 from pronk.robots.robot import RobotSpec
 
-UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
-"""Radians in each unit of angle."""
 _EPOCH_S = 1e6
 """Clocks that begin later than this count from an epoch, and are made to begin at zero [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Columns of a file, as they stand there. Shapes (n,) and (n, joints)."""
+    """Columns of a file in its own units and under its own names."""
 
-    where: str
-    """File, for messages."""
+    origin: LogOrigin
+    """The file."""
+    time: Array
+    """Timestamps, shape (n,)."""
+    position: Array
+    """Measured positions, shape (n, joints)."""
+    command: Array | None = None
+    """Commanded positions, shape (n, joints); None where the drives were commanded in torque."""
+    velocity: Array | None = None
+    """Measured velocities, shape (n, joints), if there are any."""
+    torque: Array | None = None
+    """Measured torques [N m], shape (n, joints), if there are any."""
     joints: tuple[str, ...] = ()
     """Names of the columns; empty if the file has none."""
-    time: Array
-    position: Array
-    command: Array | None = None
-    """None where the drives were commanded in torque."""
-    velocity: Array | None = None
-    torque: Array | None = None
-    unit: str | None = None
-    """Unit of the angles, one of `UNITS`, where the format defines it."""
-    time_unit: str = "s"
-    """One of `TIME_UNITS`."""
-    no_angles: tuple[str, ...] = ()
+    standard_names: Mapping[str, str] | None = None
+    """The robot's joint names by those of the format, where these are known."""
+    not_angles: tuple[str, ...] = ()
     """Joints whose position is on another scale than `unit`, by their names in the file."""
-    names: Mapping[str, str] | None = None
-    """Joint names that the format's own stand for."""
+    unit: str | None = None
+    """Unit of the angles, one of `ANGLE_UNITS`; None where the format does not define it."""
+    time_unit: str = "s"
+    """Unit of the timestamps, one of `TIME_UNITS`."""
     row: Callable[[int], str] = "sample {}".format
     """Names a sample as the user finds it in the file."""
     robot: str = "unknown"
+    """Name of the robot, where the format tells."""
     notes: tuple[str, ...] = ()
-    sha256: str = ""
-    metadata: dict[str, str] = field(default_factory=dict)
+    """Remarks of the reader."""
 
 
-def import_columns(
-    columns: Columns,
-    robot: RobotSpec | None = None,
-    *,
-    unit: str | None = None,
-    time_unit: str | None = None,
-    joint_names: Mapping[str, str] | None = None,
-    joint_order: Sequence[str] | None = None,
-    drop_duplicates: bool = False,
-    scale: Mapping[str, float] | None = None,
-) -> JointLog:
-    """Check columns and make a log of them; a LogError names what is implausible and the way out.
+def import_columns(columns: Columns, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
+    """Check the columns of a file and make a log of them.
 
-    `unit` of the angles is `rad` or `deg`, and required where the format has none; `time_unit` is
-    one of `TIME_UNITS`. `joint_names` gives new names by the file's own; `joint_order` names
-    columns that have no names (see `ordered`). Duplicates are rows that repeat the one before in
-    full. `scale` gives radians per unit of joints whose unit is unknown, by (new) joint name, for
-    command and position; the velocity is left as it is.
+    Args:
+        columns: Columns as they stand in the file.
+        robot: The robot, if it is known, for its name and the default joint order.
+        options: Units, joint names, scales, and whether repeated rows are dropped.
+
+    Returns:
+        The log, in seconds and radians, without segments.
+
+    Raises:
+        LogError: Something is missing or implausible; the message names it and the way out.
     """
-    where, sent, scale = columns.where, columns.command, scale or {}
-    unit, time_unit = unit or columns.unit, time_unit or columns.time_unit
+    source = columns.origin.source
+    unit = options.unit or columns.unit
+    time_unit = options.time_unit or columns.time_unit
     if unit is None:
         raise LogError(
-            f"{where}: the file does not say whether its angles are radians or degrees; give "
+            f"{source}: the file does not say whether its angles are radians or degrees; give "
             "--unit rad or --unit deg."
         )
-    for name, value, known in (("--unit", unit, UNITS), ("--time-unit", time_unit, TIME_UNITS)):
-        if value not in known:
-            raise LogError(f"{where}: {name} {value}; expected one of {', '.join(known)}.")
-    if sent is None and columns.torque is None:
-        raise LogError(f"{where}: neither a commanded position nor a torque; expected one of them.")
-    joints = _named(columns, robot, joint_names, joint_order)
-    keep, notes = np.arange(len(columns.time)), list(columns.notes)
-    if sent is None:
+    if columns.command is None and columns.torque is None:
+        raise LogError(
+            f"{source}: neither a commanded position nor a torque; expected one of them."
+        )
+    joints = _joint_names(columns, robot, options)
+    notes = list(columns.notes)
+    command = columns.command
+    if command is None:
         # A command that stands still excites nothing.
-        sent = np.repeat(columns.position[:1], len(columns.time), axis=0)
+        command = np.repeat(columns.position[:1], len(columns.time), axis=0)
         notes.append("no commanded position, so the drives count as commanded in torque")
-    if drop_duplicates and len(keep) > 1:
-        every = (sent, columns.position, columns.velocity, columns.torque)
-        table = np.column_stack([columns.time, *(v for v in every if v is not None)])
-        same = (np.diff(table, axis=0) == 0.0).all(axis=1)
-        keep = np.flatnonzero(np.concatenate(([True], ~same)))
-        if dropped := int(same.sum()):
+    rows = np.arange(len(columns.time))
+    if options.drop_duplicates:
+        rows = _distinct_rows(columns, command)
+        if len(rows) < len(columns.time):
+            dropped = len(columns.time) - len(rows)
             notes.append(f"{dropped} rows that repeat the one before were dropped")
-    time, seconds = columns.time[keep], TIME_UNITS[time_unit]
-    check_increasing(time, where, lambda i: columns.row(int(keep[i])))
-    check_unit(time * seconds, where, time_unit)
+
+    time = columns.time[rows]
+    seconds = TIME_UNITS[time_unit]
+    check_increasing(time, source, lambda sample: columns.row(int(rows[sample])))
+    check_unit(time * seconds, source, time_unit)
     if abs(time[0] * seconds) > _EPOCH_S:
         notes.append(
             f"the clock is made to begin at zero (the first timestamp is {time[0] * seconds:.6f} s)"
@@ -105,100 +105,136 @@ def import_columns(
         # Before the unit is changed: nothing is rounded away.
         time = time - time[0]
     time = time * seconds
-    for joint, factor in scale.items():
+
+    stated_scales = options.scale or {}
+    for joint in stated_scales:
         if joint not in joints:
-            raise LogError(f"{where}: --scale names {joint}; the joints are {', '.join(joints)}.")
-        if not (np.isfinite(factor) and factor != 0.0):
-            raise LogError(f"{where}: the scale of {joint} is {factor}; expected a number.")
-    renamed = dict(zip(columns.joints, joints, strict=False))
-    other = {renamed[name] for name in columns.no_angles if name in renamed}
-    angle = {joint: 1.0 if joint in other else UNITS[unit] for joint in joints}
-    factors = np.array([scale.get(joint, angle[joint]) for joint in joints])
-    # A scale defines the unit of position; the velocity beside it may be an angle already.
-    rates = np.array([1.0 if joint in scale else angle[joint] for joint in joints])
-    command = sent[keep] * factors
+            raise LogError(f"{source}: --scale names {joint}; the joints are {', '.join(joints)}.")
+    position_scale = np.full(len(joints), ANGLE_UNITS[unit])
+    velocity_scale = np.full(len(joints), ANGLE_UNITS[unit])
+    units = ["rad"] * len(joints)
+    for k, joint in enumerate(joints):
+        if joint in stated_scales:
+            # The velocity beside a position on another scale may be an angle already.
+            position_scale[k] = stated_scales[joint]
+            velocity_scale[k] = 1.0
+        elif columns.joints and columns.joints[k] in columns.not_angles:
+            position_scale[k] = 1.0
+            velocity_scale[k] = 1.0
+            units[k] = "unknown"
+
+    command = command[rows] * position_scale
     # A command that is not finite is refused below, by name.
-    if np.isfinite(command).all() and (note := correlation_note(time, command, joints)):
-        notes.append(note)
+    if np.isfinite(command).all():
+        correlation = correlation_note(time, command, joints)
+        if correlation:
+            notes.append(correlation)
     return JointLog(
         robot=robot.name if robot is not None else columns.robot,
         joints=joints,
         time=time,
         command=command,
-        position=columns.position[keep] * factors,
-        velocity=None if columns.velocity is None else columns.velocity[keep] * rates,
-        torque=None if columns.torque is None else columns.torque[keep],
-        units=tuple(
-            "unknown" if joint in other and joint not in scale else "rad" for joint in joints
-        ),
+        position=columns.position[rows] * position_scale,
+        velocity=None if columns.velocity is None else columns.velocity[rows] * velocity_scale,
+        torque=None if columns.torque is None else columns.torque[rows],
+        units=tuple(units),
         notes=tuple(notes),
-        origin=LogOrigin(source=where, sha256=columns.sha256, metadata=columns.metadata),
+        origin=columns.origin,
     )
 
 
-def _named(
-    columns: Columns,
-    robot: RobotSpec | None,
-    names: Mapping[str, str] | None,
-    order: Sequence[str] | None,
+def _joint_names(
+    columns: Columns, robot: RobotSpec | None, options: ReadOptions
 ) -> tuple[str, ...]:
-    """Names of the joints, as many as there are columns."""
-    where, joints = columns.where, columns.joints
+    """Names of the joints of a log, as many as the file has columns."""
+    source = columns.origin.source
     shape = (len(columns.time), columns.position.shape[-1])
     command = columns.position if columns.command is None else columns.command
     if command.shape != shape or columns.position.shape != shape:
         raise LogError(
-            f"{where}: time has shape {columns.time.shape}, command {command.shape} and position "
+            f"{source}: time has shape {columns.time.shape}, command {command.shape} and position "
             f"{columns.position.shape}; expected (n,), (n, joints) and (n, joints)."
         )
-    stated = ordered(f"{where}: its {shape[1]} columns", shape[1], robot, order, joints)
-    names = columns.names if names is None else names
-    if unknown := [name for name in names or {} if name not in stated]:
-        raise LogError(
-            f"{where}: --joint-names renames {', '.join(unknown)}; the joints are "
-            f"{', '.join(stated)}."
-        )
-    named = tuple((names or {}).get(joint, joint) for joint in stated)
-    check_names(named, f"{where} (--joint-names THEIRS=OURS renames joints)", LogError)
-    return named
+    names = ordered_joints(
+        f"{source}: its {shape[1]} columns", shape[1], robot, options.joint_order, columns.joints
+    )
+    new_names = columns.standard_names if options.joint_names is None else options.joint_names
+    if new_names is not None:
+        unknown = [name for name in new_names if name not in names]
+        if unknown:
+            raise LogError(
+                f"{source}: --joint-names renames {', '.join(unknown)}; the joints are "
+                f"{', '.join(names)}."
+            )
+        names = tuple(new_names.get(name, name) for name in names)
+    check_names(names, f"{source} (--joint-names THEIRS=OURS renames joints)", LogError)
+    return names
 
 
-def ordered(
-    what: str,
+def _distinct_rows(columns: Columns, command: Array) -> NDArray[np.intp]:
+    """Indices of the rows that do not repeat the one before in full."""
+    table = [columns.time, command, columns.position]
+    if columns.velocity is not None:
+        table.append(columns.velocity)
+    if columns.torque is not None:
+        table.append(columns.torque)
+    repeats = (np.diff(np.column_stack(table), axis=0) == 0.0).all(axis=1)
+    return np.flatnonzero(np.concatenate(([True], ~repeats)))
+
+
+def ordered_joints(
+    values: str,
     count: int,
     robot: RobotSpec | None,
-    order: Sequence[str] | None,
-    joints: Sequence[str] = (),
+    order: str | Sequence[str] | None,
+    names: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Joint of each of several values (`what`): by the file, or in the order that the user states.
+    """Name the joint of each of several values; an order is never assumed.
 
-    `order` is joint names, one a value (a list, or text with commas), or `default`: the robot's
-    joints in its own order. An order is never assumed: a LogError says that neither the file
-    (`joints`) nor the user names the joints, or that they differ.
+    Args:
+        values: The values in words, for messages, as in `log.npz: its 3 columns`.
+        count: Number of the values.
+        robot: The robot, whose joints `default` stands for.
+        order: The order that the user states: see `ReadOptions.joint_order`.
+        names: Names of the joints by the file; empty if it has none.
+
+    Returns:
+        One name a value.
+
+    Raises:
+        LogError: Neither the file nor the user names the joints, or the two differ, or the names
+            are not as many as the values.
     """
-    own = () if robot is None else robot.joint_names
-    stated = tuple(order.split(",") if isinstance(order, str) else order or ())
+    robot_joints = () if robot is None else robot.joint_names
+    stated: tuple[str, ...] = ()
+    if order is not None:
+        stated = tuple(order.split(",")) if isinstance(order, str) else tuple(order)
     if stated == ("default",):
-        stated = tuple(joints) or own
-    if not stated and not joints:
-        default = f"default if that is {','.join(own)}" if own else "default with --robot"
+        stated = tuple(names) or robot_joints
+    if not stated and not names:
+        default = "default with --robot"
+        if robot_joints:
+            default = f"default if that is {','.join(robot_joints)}"
         raise LogError(
-            f"{what} have no joint names; give --joint-order NAME,NAME,... in the file's order, or "
-            f"--joint-order {default}."
+            f"{values} have no joint names; give --joint-order NAME,NAME,... in the file's order, "
+            f"or --joint-order {default}."
         )
-    if stated and joints and stated != tuple(joints):
+    if stated and names and stated != tuple(names):
         raise LogError(
-            f"{what} are {', '.join(joints)} by the file and {', '.join(stated)} by --joint-order; "
-            "leave the option out; --joint-names THEIRS=OURS renames joints."
+            f"{values} are {', '.join(names)} by the file and {', '.join(stated)} by "
+            "--joint-order; leave the option out; --joint-names THEIRS=OURS renames joints."
         )
-    stated = stated or tuple(joints)
-    if len(stated) != count:
+    joints = stated or tuple(names)
+    if len(joints) != count:
         raise LogError(
-            f"{what} have {len(stated)} joint names ({', '.join(stated)}); expected one each."
+            f"{values} have {len(joints)} joint names ({', '.join(joints)}); expected one each."
         )
-    return stated
+    return joints
 
 
-def in_force(sent: Array, time: Array) -> NDArray[np.intp]:
-    """Index of the last command sent at or before each instant; -1 before the first."""
+def command_index(sent: Array, time: Array) -> NDArray[np.intp]:
+    """Return the index of the last command sent at or before each instant; -1 before the first.
+
+    `sent` holds the increasing instants of the commands and `time` the instants asked for [s].
+    """
     return np.asarray(np.searchsorted(sent, time, side="right") - 1)

@@ -5,25 +5,28 @@ from __future__ import annotations
 import csv
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pronk.arrays import Array
 from pronk.errors import LogError, printable
 from pronk.files import check_archive, check_size, sha256
-from pronk.identify.logs.columns import Columns
+from pronk.identify.logs.columns import Columns, import_columns
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
+from pronk.identify.logs.options import ReadOptions
 from pronk.robots.robot import RobotSpec
 
 QUANTITIES = ("command", "position", "velocity", "torque")
+"""Quantities of a joint: beginnings of column names, and names of arrays."""
 _MOST_COLUMNS = 4096
 _CELL_BYTES = 64
-"""What a cell of a CSV file takes in memory, about [bytes]."""
+"""Memory that a cell of a CSV file takes, about [bytes]."""
 
 
 def read_text(path: Path) -> str:
-    """Read a text file, UTF-8 with or without byte order mark."""
+    """Read a text file, UTF-8 with or without byte order mark; a LogError if it is none."""
     try:
         check_size(path, path.stat().st_size, LogError)
         return path.read_text(encoding="utf-8-sig")
@@ -34,13 +37,18 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a CSV file; comma, semicolon or tab, whichever the header has most of.
+    """Read the header and the rows of a CSV file, all of the same length.
 
-    A LogError names a row of another length.
+    The delimiter is the comma, semicolon or tab, whichever the header has most of.
+
+    Raises:
+        LogError: The file is no table, or a row, which the message names, has another length.
     """
     text = read_text(path)
-    delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
-    check_size(path, _CELL_BYTES * (text.count(delimiter) + text.count("\n")), LogError)
+    first_line = text.split("\n", 1)[0]
+    delimiter = max(",;\t", key=first_line.count)
+    cells = text.count(delimiter) + text.count("\n")
+    check_size(path, _CELL_BYTES * cells, LogError)
     try:
         rows = [row for row in csv.reader(text.splitlines(), delimiter=delimiter) if row]
     except csv.Error as error:
@@ -59,76 +67,168 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     return header, rows[1:]
 
 
-def read_csv(
-    path: Path, *, robot: RobotSpec | None = None, columns: Mapping[str, str] | None = None
-) -> Columns:
-    """Read a CSV file; a LogError names the column and row where something is missing.
+def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
+    """Read a CSV file.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
-    [angle/s] and `torque.JOINT` [N m]; with torques, commands need not be there. `columns` gives
-    the file's own name for each of them, for instance
+    [angle/s] and `torque.JOINT` [N m]; with torques, commands need not be there. A file with other
+    names is read by `options.columns`, for instance
     `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
+
+    Raises:
+        LogError: A column is missing or a cell is no number; the message names column and row.
     """
     header, rows = read_rows(path)
-    given, listed = dict(columns or {}), ", ".join(header)
-    names = {name: name for name in header if _is_ours(name) and name not in given.values()}
-    names |= given
-    if wrong := [name for name in given if not _is_ours(name)]:
-        raise LogError(
-            f"{path}: --columns names {wrong[0]!r}; expected time, or a quantity and a joint, for "
-            f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
-        )
-    joints = tuple(name.partition(".")[2] for name in names if name.startswith("position."))
-    by_torque = all(f"torque.{joint}" in names for joint in joints)
-    commanded = [name for name in names if name.startswith("command.")]
-    needed = ["time", *(f"command.{joint}" for joint in joints if commanded or not by_torque)]
-    missing = [name for name in needed if name not in names] or ["position.JOINT"] * (not joints)
+    names = _column_names(path, header, options)
+    joints = []
+    for name in names:
+        quantity, _, joint = name.partition(".")
+        if quantity == "position":
+            joints.append(joint)
+    has_torque = all(f"torque.{joint}" in names for joint in joints)
+    has_command = any(name.startswith("command.") for name in names)
+    needed = ["time"]
+    if not joints:
+        needed.append("position.JOINT")
+    if has_command or not has_torque:
+        needed += [f"command.{joint}" for joint in joints]
+    missing = [name for name in needed if name not in names]
     if missing:
         raise LogError(
-            f"{path}: no column called {', '.join(missing)}; the header is {listed}; "
+            f"{path}: no column called {', '.join(missing)}; the header is {', '.join(header)}; "
             f"say which it is with --columns {missing[0]}=NAME."
         )
-    for name, theirs in names.items():
-        if header.count(theirs) != 1:
-            many = "several columns" if theirs in header else "no column"
-            raise LogError(f"{path}: {many} called {theirs!r} (for {name}); it has {listed}.")
-
-    def numbers(name: str) -> Array:
-        index = header.index(names[name])
-        values = np.array([_number(row[index]) for row in rows])
-        if len(wrong := np.flatnonzero(~np.isfinite(values))):
+    for name, file_name in names.items():
+        if header.count(file_name) != 1:
+            count = "several columns" if file_name in header else "no column"
             raise LogError(
-                f"{path}: row {wrong[0] + 2} holds {rows[wrong[0]][index][:40]!r} in column "
-                f"{names[name]!r}; expected a finite number; repair or remove that row."
+                f"{path}: {count} called {file_name!r} (for {name}); it has {', '.join(header)}."
             )
-        return values
-
-    found = {
-        quantity: np.stack([numbers(f"{quantity}.{joint}") for joint in joints], axis=1)
-        for quantity in QUANTITIES
-        if all(f"{quantity}.{joint}" in names for joint in joints)
-    }
-    return Columns(
-        where=str(path),
-        joints=joints,
-        time=numbers("time"),
-        row=lambda i: f"row {i + 2}",
-        sha256=sha256(path),
-        **found,  # type: ignore[arg-type]
+    arrays: dict[str, Array] = {}
+    for quantity in QUANTITIES:
+        chosen = [f"{quantity}.{joint}" for joint in joints]
+        if all(name in names for name in chosen):
+            columns = [_column(path, header, rows, names[name]) for name in chosen]
+            arrays[quantity] = np.stack(columns, axis=1)
+    columns_of_file = Columns(
+        origin=LogOrigin(source=str(path), sha256=sha256(path)),
+        joints=tuple(joints),
+        time=_column(path, header, rows, names["time"]),
+        command=arrays.get("command"),
+        position=arrays["position"],
+        velocity=arrays.get("velocity"),
+        torque=arrays.get("torque"),
+        row=lambda sample: f"row {sample + 2}",
     )
+    return import_columns(columns_of_file, robot, options)
 
 
-def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
+def _column_names(path: Path, header: list[str], options: ReadOptions) -> dict[str, str]:
+    """Names of the columns in the file by those of pronk: stated ones, or their own."""
+    stated = options.columns or {}
+    for name in stated:
+        if not _is_column_name(name):
+            raise LogError(
+                f"{path}: --columns names {name!r}; expected time, or a quantity and a joint, for "
+                f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
+            )
+    names = {}
+    for name in header:
+        if _is_column_name(name) and name not in stated.values():
+            names[name] = name
+    names.update(stated)
+    return names
+
+
+def _is_column_name(name: str) -> bool:
+    """Return True for `time`, and for a quantity and a joint with a dot between them."""
+    quantity, _, joint = name.partition(".")
+    return name == "time" or (quantity in QUANTITIES and bool(joint))
+
+
+def _column(path: Path, header: list[str], rows: list[list[str]], name: str) -> Array:
+    """Numbers of one column, shape (n,)."""
+    index = header.index(name)
+    values = np.array([_number(row[index]) for row in rows])
+    bad_rows = np.flatnonzero(~np.isfinite(values))
+    if len(bad_rows):
+        cell = rows[bad_rows[0]][index]
+        raise LogError(
+            f"{path}: row {bad_rows[0] + 2} holds {cell[:40]!r} in column {name!r}; expected a "
+            "finite number; repair or remove that row."
+        )
+    return values
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def read_npz(path: Path, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
     """Read the arrays `time` (n,), `command` and `position` (n, joints).
 
     `velocity`, `torque` and `joints` (the names) are read where they are there; with `torque`, a
     `command` need not be.
+
+    Raises:
+        LogError: An array is missing, or is no array of numbers.
     """
+    arrays, names_in_file = _load_arrays(path)
+    needed = ["time", "position"]
+    if "torque" not in arrays:
+        needed.append("command")
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise LogError(
+            f"{path}: no array {', '.join(missing)}; it holds {', '.join(names_in_file) or 'none'}."
+        )
+    check_size(path, sum(8 * array.size for array in arrays.values()), LogError)
+    joints = _text(path, arrays.pop("joints", np.empty(0, dtype=str)))
+    numbers: dict[str, Array] = {}
+    for name, array in arrays.items():
+        try:
+            numbers[name] = np.asarray(array, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise LogError(f"{path}: the array {name} does not hold numbers.") from None
+    time = numbers.pop("time")
+    for name, values in numbers.items():
+        if time.ndim != 1 or values.shape[:1] != time.shape:
+            raise LogError(
+                f"{path}: time has shape {time.shape} and {name} {values.shape}; expected (n,) and "
+                "(n, joints)."
+            )
+        if len(time):
+            numbers[name] = values.reshape(len(time), -1)
+    notes = []
+    unread = [name for name in names_in_file if name not in ("time", *QUANTITIES, "joints")]
+    if unread:
+        notes.append(f"arrays that are not read: {printable(', '.join(unread)[:200])}")
+    columns = Columns(
+        origin=LogOrigin(source=str(path), sha256=sha256(path)),
+        joints=joints,
+        time=time,
+        command=numbers.get("command"),
+        position=numbers["position"],
+        velocity=numbers.get("velocity"),
+        torque=numbers.get("torque"),
+        notes=tuple(notes),
+    )
+    return import_columns(columns, robot, options)
+
+
+def _load_arrays(path: Path) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
+    """Load the arrays that a log has, and the names of all that the file holds."""
+    arrays = {}
     try:
         check_archive(path, LogError)
         with np.load(path, allow_pickle=False) as stored:
-            others, known = stored.files, ("time", *QUANTITIES, "joints")
-            arrays = {name: np.asarray(stored[name]) for name in known if name in others}
+            names = list(stored.files)
+            for name in ("time", *QUANTITIES, "joints"):
+                if name in names:
+                    arrays[name] = np.asarray(stored[name])
     except LogError:
         raise
     except OSError as error:
@@ -138,49 +238,18 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         # zipfile, zlib and the npy parser fail in many ways on a damaged file.
         reason = f"{type(error).__name__}: {error}"[:120]
         raise LogError(f"{path}: not a readable NPZ file ({reason}).") from error
-    extra = ", ".join(name for name in others if name not in arrays)
-    needed = ("time", "position", *["command"] * ("torque" not in arrays))
-    if missing := [name for name in needed if name not in arrays]:
-        raise LogError(
-            f"{path}: no array {', '.join(missing)}; it holds {', '.join(others) or 'none'}."
-        )
-    check_size(path, sum(8 * array.size for array in arrays.values()), LogError)
-    names = arrays.pop("joints", np.empty(0, dtype=str)).reshape(-1)
-    if len(names) > _MOST_COLUMNS:
-        raise LogError(f"{path}: {len(names)} joints; expected {_MOST_COLUMNS} at most.")
+    return arrays, names
+
+
+def _text(path: Path, array: NDArray[np.generic]) -> tuple[str, ...]:
+    """Names in an array of text."""
+    if array.size > _MOST_COLUMNS:
+        raise LogError(f"{path}: {array.size} joints; expected {_MOST_COLUMNS} at most.")
     try:
-        found = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items()}
-        names = np.ascontiguousarray(names, dtype=str)
-        # NumPy takes numbers beyond Unicode for characters; Python then fails anywhere.
-        if names.size and (names.view(np.uint32) > sys.maxunicode).any():
-            raise ValueError
+        names = np.ascontiguousarray(array.reshape(-1), dtype=str)
     except (TypeError, ValueError):
-        raise LogError(f"{path}: its arrays are not numbers, or its joints no text.") from None
-    time = found.pop("time")
-    for name, values in found.items():
-        if time.ndim != 1 or values.shape[:1] != time.shape:
-            raise LogError(
-                f"{path}: time has shape {time.shape} and {name} {values.shape}; expected (n,) and "
-                "(n, joints)."
-            )
-        found[name] = values.reshape(len(time), -1) if len(time) else values
-    return Columns(
-        where=str(path),
-        joints=tuple(map(str, names)),
-        notes=(f"arrays that are not read: {printable(extra[:200])}",) if extra else (),
-        time=time,
-        sha256=sha256(path),
-        **found,  # type: ignore[arg-type]
-    )
-
-
-def _is_ours(name: str) -> bool:
-    kind, _, joint = name.partition(".")
-    return name == "time" or (kind in QUANTITIES and bool(joint))
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+        raise LogError(f"{path}: its joints are no text.") from None
+    # NumPy takes numbers beyond Unicode for characters; Python then fails anywhere.
+    if names.size and (names.view(np.uint32) > sys.maxunicode).any():
+        raise LogError(f"{path}: its joints are no text.")
+    return tuple(str(name) for name in names)

@@ -74,15 +74,15 @@ class JointLog:
 
     def __post_init__(self) -> None:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
-        where = self.source or "log"
+        source = self.source or "log"
         samples = len(self.time)
         width = len(self.joints)
-        check_names((self.robot, *self.joints), where, LogError)
-        check_increasing(self.time, where, "sample {}".format)
+        check_names((self.robot, *self.joints), source, LogError)
+        check_increasing(self.time, source, "sample {}".format)
         if width == 0:
-            raise LogError(f"{where}: no joints.")
+            raise LogError(f"{source}: no joints.")
         if len(set(self.joints)) != width:
-            raise LogError(f"{where}: a joint is named twice in {', '.join(self.joints)}.")
+            raise LogError(f"{source}: a joint is named twice in {', '.join(self.joints)}.")
         per_sample = {
             "command": self.command,
             "position": self.position,
@@ -186,7 +186,7 @@ class JointLog:
         """
         self.column(joint)
         log = self.segmented()
-        where = self.source or "log"
+        source = self.source or "log"
         excitations = []
         for segment in log.segments:
             if joint not in segment.joints:
@@ -197,8 +197,8 @@ class JointLog:
             travel = float(np.ptp(excitation.command))
             if travel == 0.0:
                 raise LogError(
-                    f"{where}: the command of {joint} stands still between {segment.start:.3f} and "
-                    f"{segment.stop:.3f} s; the joint was not excited."
+                    f"{source}: the command of {joint} stands still between {segment.start:.3f} "
+                    f"and {segment.stop:.3f} s; the joint was not excited."
                 )
             if np.isnan(segment.amplitude):
                 stated = replace(segment, amplitude=travel / 2.0)
@@ -206,7 +206,7 @@ class JointLog:
             excitations.append(excitation)
         if not excitations:
             excited = ", ".join(log.excited_joints) or "no joints"
-            raise LogError(f"{where}: {joint} was not excited; {excited} were.")
+            raise LogError(f"{source}: {joint} was not excited; {excited} were.")
         ordered: list[Excitation] = []
         for repeats in group_repeats(excitations):
             ordered += repeats
@@ -334,26 +334,31 @@ def group_repeats(excitations: Sequence[Excitation]) -> tuple[tuple[Excitation, 
     return tuple(tuple(repeats) for repeats in by_amplitude)
 
 
-def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None:
-    """Refuse timestamps that are not finite, repeat or go back.
+def check_increasing(time: Array, source: str, row: Callable[[int], str]) -> None:
+    """Refuse timestamps that are not finite, repeat or go back, with a LogError.
 
-    The LogError begins with `where`, the file, and names the sample by `row`, as in `row 7`.
+    Args:
+        time: Timestamps, shape (n,).
+        source: The file, for the message.
+        row: Names a sample as the user finds it in the file, as in `row 7`.
     """
     if len(time) < 2:
-        raise LogError(f"{where}: {len(time)} samples; a log needs at least 2.")
-    if not np.isfinite(time).all():
-        lost = row(int(np.argmin(np.isfinite(time))))
-        raise LogError(f"{where}: the timestamp in {lost} is missing or not a number.")
-    steps = np.diff(time)
-    if (steps > 0.0).all():
-        return
-    i = int(np.argmin(steps > 0.0)) + 1
-    if steps[i - 1] == 0.0:
+        raise LogError(f"{source}: {len(time)} samples; a log needs at least 2.")
+    missing = np.flatnonzero(~np.isfinite(time))
+    if len(missing):
         raise LogError(
-            f"{where}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
+            f"{source}: the timestamp in {row(int(missing[0]))} is missing or not a number."
+        )
+    not_later = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(not_later) == 0:
+        return
+    i = int(not_later[0]) + 1
+    if time[i] == time[i - 1]:
+        raise LogError(
+            f"{source}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
             "must increase (--drop-duplicates drops rows that repeat the one before in full)."
         )
     raise LogError(
-        f"{where}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
+        f"{source}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
         "split the file."
     )

@@ -14,7 +14,9 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import check_archive, check_size, sha256
-from pronk.identify.logs.columns import Columns
+from pronk.identify.logs.columns import Columns, import_columns
+from pronk.identify.logs.joint_log import JointLog, LogOrigin
+from pronk.identify.logs.options import ReadOptions
 from pronk.robots.robot import RobotSpec
 
 KEYS = ("time", "dof_pos", "des_dof_pos")
@@ -22,7 +24,7 @@ KEYS = ("time", "dof_pos", "des_dof_pos")
 _EXPECTED = f"expected a dictionary of the tensors {', '.join(KEYS)}, saved with torch.save"
 
 
-def read_pace(path: Path, *, robot: RobotSpec | None = None) -> Columns:
+def read_pace(path: Path, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
     """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints).
 
     Raises:
@@ -46,25 +48,32 @@ def read_pace(path: Path, *, robot: RobotSpec | None = None) -> Columns:
             f"{path}: dof_pos has shape {position.shape} and des_dof_pos {command.shape}; expected "
             "(n, joints)."
         )
-    return Columns(
-        where=str(path),
+    columns = Columns(
+        origin=LogOrigin(source=str(path), sha256=sha256(path), metadata={"format": "pace"}),
         time=time.reshape(-1),
         command=command,
         position=position,
         unit="rad",
-        sha256=sha256(path),
-        metadata={"format": "pace"},
     )
+    return import_columns(columns, robot, options)
 
 
 def _load(path: Path) -> dict[Any, Any]:
     """Load the tensors of a file by name; other entries of its dictionary are left out."""
     try:
         check_archive(path, LogError)
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()  # PyTorch does not check the checksums.
+    except LogError:
+        raise
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
-    except zipfile.BadZipFile:
-        raise LogError(f"{path}: not a file of PyTorch; {_EXPECTED}.") from None
+    except Exception as error:
+        # zipfile and zlib fail in many ways on a damaged archive.
+        reason = type(error).__name__
+        raise LogError(f"{path}: not a file of PyTorch ({reason}); {_EXPECTED}.") from None
+    if damaged is not None:
+        raise LogError(f"{path}: the checksum of its part {damaged!r} does not fit.")
     try:
         import torch
     except ImportError:

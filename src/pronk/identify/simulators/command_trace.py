@@ -14,7 +14,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import LogError
-from pronk.identify.logs.columns import in_force
+from pronk.identify.logs.columns import command_index
 from pronk.identify.logs.joint_log import Excitation
 from pronk.robots.robot import RobotSpec
 
@@ -151,7 +151,7 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
         period = tick
     count = int(np.ceil((time[-1] - start) / period))
     middle = start + (np.arange(count) + 0.5) * period
-    steps = command[np.maximum(in_force(time, middle), 0)]
+    steps = command[np.maximum(command_index(time, middle), 0)]
     if on_clock:
         early = _early_ticks(steps)
         start -= early * tick
