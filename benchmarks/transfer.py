@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 LAWS = ("mjlab-builtin", "isaaclab-implicit", "drake")
 _UNLIMITED = 1e6
-"""Of the part of the torque that stiffness gives; the sum is limited by the actuator [N m]."""
+"""Limit of the part of the torque that stiffness gives [N m]; the actuator limits the sum."""
 
 
 @dataclass(kw_only=True)
@@ -55,7 +55,7 @@ class ImplicitDriveCfg(DcMotorActuatorCfg):  # type: ignore[misc]
     bias: float
     """Damping that with the substep gives the law [N m s/rad]."""
     limit: float
-    """Of the torque [N m]."""
+    """Largest torque of the drive [N m]."""
 
     def build(
         self, entity: Entity, target_ids: list[int], target_names: list[str]

@@ -20,39 +20,46 @@ def write_linear(
 ) -> Path:
     """Write the ONNX of `action = measured @ input + jump @ jump input`; contacts 1, velocity 0.
 
-    `measured` is (MEASURED_SIZE, JOINTS), `jump` (JOINTS,), of a contract with a jump input.
+    Args:
+        path: The file.
+        contract: The contract of the policy.
+        measured: Weights of the measured input, shape (MEASURED_SIZE, JOINTS).
+        jump: Weights of the jump input, shape (JOINTS,), of a contract with a jump input.
     """
     from onnx import TensorProto, helper, numpy_helper, save
 
     weights = {
-        "still": np.zeros((MEASURED_SIZE, ESTIMATE["linear_velocity"])),
-        "in_air": np.zeros((MEASURED_SIZE, ESTIMATE["contact"])),
+        "no_velocity": np.zeros((MEASURED_SIZE, ESTIMATE["linear_velocity"])),
+        "no_contact": np.zeros((MEASURED_SIZE, ESTIMATE["contact"])),
         "one": np.ones((1, 1)),
         "linear": measured,
     }
-    nodes = [
-        helper.make_node("MatMul", ["measured", "still"], ["linear_velocity"]),
-        helper.make_node("MatMul", ["measured", "in_air"], ["none"]),
-        helper.make_node("Add", ["none", "one"], ["contact"]),
-        helper.make_node("MatMul", ["measured", "linear"], ["action" if jump is None else "rest"]),
-    ]
     inputs = {"measured": MEASURED_SIZE}
-    if jump is not None:
-        inputs["jump"], weights["straight"] = 1, jump[None]
-        nodes.append(helper.make_node("MatMul", ["jump", "straight"], ["thrown"]))
-        nodes.append(helper.make_node("Add", ["rest", "thrown"], ["action"]))
+    nodes = [
+        helper.make_node("MatMul", ["measured", "no_velocity"], ["linear_velocity"]),
+        helper.make_node("MatMul", ["measured", "no_contact"], ["zero_contact"]),
+        helper.make_node("Add", ["zero_contact", "one"], ["contact"]),
+    ]
+    if jump is None:
+        nodes.append(helper.make_node("MatMul", ["measured", "linear"], ["action"]))
+    else:
+        weights["jump_weights"] = jump[None]
+        inputs["jump"] = 1
+        nodes.append(helper.make_node("MatMul", ["measured", "linear"], ["measured_action"]))
+        nodes.append(helper.make_node("MatMul", ["jump", "jump_weights"], ["jump_action"]))
+        nodes.append(helper.make_node("Add", ["measured_action", "jump_action"], ["action"]))
 
     def values(sizes: dict[str, int]) -> list[Any]:
-        kind = TensorProto.FLOAT
-        return [helper.make_tensor_value_info(n, kind, ["batch", s]) for n, s in sizes.items()]
+        infos = []
+        for name, size in sizes.items():
+            infos.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]))
+        return infos
 
-    graph = helper.make_graph(
-        nodes,
-        "linear",
-        values(inputs),
-        values({"action": JOINTS, **ESTIMATE}),
-        [numpy_helper.from_array(w.astype(np.float32), name) for name, w in weights.items()],
-    )
+    initializers = []
+    for name, array in weights.items():
+        initializers.append(numpy_helper.from_array(array.astype(np.float32), name))
+    outputs = {"action": JOINTS, **ESTIMATE}
+    graph = helper.make_graph(nodes, "linear", values(inputs), values(outputs), initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     helper.set_model_props(model, {METADATA_KEY: to_json(contract)})
     save(model, str(path))
@@ -81,14 +88,15 @@ def write_swaying(path: Path, robot: RobotSpec) -> Path:
     0.15 rad a joint (knees: twice that) about the default pose.
     """
     joints = robot.joints
+    forward, left, yaw = MEASURED["command"]
     weights = np.zeros((MEASURED_SIZE, JOINTS))
-    for i, joint in enumerate(joints):
-        front = 1.0 if joint.name.startswith("F") else -1.0
+    for column, joint in enumerate(joints):
         bend = {"hip_roll": 0.0, "hip_pitch": 0.15, "knee": -0.3}[joint.group]
-        weights[list(MEASURED["command"]), i] = (
-            *(bend, 0.15 if joint.group == "hip_roll" else 0.0),
-            bend * front,
-        )
+        weights[forward, column] = bend
+        if joint.group == "hip_roll":
+            weights[left, column] = 0.15
+        # Front and rear legs bend in opposite directions, which tilts the trunk.
+        weights[yaw, column] = bend if joint.name.startswith("F") else -bend
     contract = Contract(
         robot=robot.name,
         joint_names=robot.joint_names,

@@ -44,8 +44,10 @@ class Resting:
 
     def rollout(self, command, values, *, locked=()):
         os.write(1, b"more than once")
-        return np.array([[self.links.rest(q, k) for q in run]
-                         for run, k in zip(command, values["stiffness"])])
+        positions = np.empty(command.shape)
+        for run, step in np.ndindex(command.shape[:2]):
+            positions[run, step] = self.links.rest(command[run, step], values["stiffness"][run])
+        return positions
 
 class Modelled(Resting):
     def __init__(self, robot):
@@ -76,8 +78,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("other")
     venv.create(folder, symlinks=True)
     (site,) = folder.glob("lib/python*/site-packages")
-    for found in Path(np.__file__).parents[1].glob("numpy*"):
-        (site / found.name).symlink_to(found)
+    for package in Path(np.__file__).parents[1].glob("numpy*"):
+        (site / package.name).symlink_to(package)
     code = "import importlib.util as u, numpy; assert not (u.find_spec('mujoco'))"
     subprocess.run([folder / "bin" / "python", "-c", code], check=True)
     return folder / "bin" / "python"
@@ -94,12 +96,16 @@ def test_it_gives_the_same_positions_to_the_last_bit(python: Path) -> None:
     here = load_simulator(EXAMPLE, ROBOT)
     generator = np.random.default_rng(0)
     command = 0.1 * generator.normal(size=(3, 50, 12)).cumsum(axis=1)
-    values = {name: generator.uniform(1.0, 2.0, (3, 12)) for name in ("stiffness", "damping")}
+    values = {
+        "stiffness": generator.uniform(1.0, 2.0, (3, 12)),
+        "damping": generator.uniform(1.0, 2.0, (3, 12)),
+    }
     with load_simulator(EXAMPLE, ROBOT, python=python) as there:  # type: ignore[attr-defined]
-        for name in ("info", "joints", "parameters"):
-            assert getattr(there, name) == getattr(here, name)
-        got = there.rollout(command, values, locked=("FL_knee",))
-        assert np.array_equal(got, here.rollout(command, values, locked=("FL_knee",)))
+        assert there.info == here.info
+        assert there.joints == here.joints
+        assert there.parameters == here.parameters
+        position = there.rollout(command, values, locked=("FL_knee",))
+        assert np.array_equal(position, here.rollout(command, values, locked=("FL_knee",)))
         check_simulator(there)
 
 
@@ -108,7 +114,8 @@ def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) 
     rigs = joint_rigs(EXAMPLE, ROBOT)
     log = synthetic_log(ROBOT, "FR_knee", [chirp], 19.3, 0.41, simulator=rigs)
     write_mcap(tmp_path / "log.mcap", log)
-    gains, figures = tmp_path / "gains.yaml", tmp_path / "figures.json"
+    gains = tmp_path / "gains.yaml"
+    figures = tmp_path / "figures.json"
     here = [tmp_path / "log.mcap", "--robot", ROBOT.name, "--simulator", EXAMPLE]
     there = [*here, "--simulator-python", python]
     assert invoke(["match", *there, "--out", gains]).exit_code in (0, WARNING_STATUS)
@@ -121,13 +128,15 @@ def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) 
 
 
 def test_chains_arrive_as_they_are_and_prints_do_no_harm(python: Path, adapters: Path) -> None:
-    command, stiffness = np.full((2, 4, 3), 0.3), np.array([[10.0] * 3, [20.0] * 3])
+    command = np.full((2, 4, 3), 0.3)
+    stiffness = np.array([[10.0] * 3, [20.0] * 3])
     with load_simulator(f"{adapters}:Resting", ROBOT, python=python) as there:  # type: ignore[attr-defined]
-        got = there.rollout(command, {"stiffness": stiffness, "damping": stiffness})
+        position = there.rollout(command, {"stiffness": stiffness, "damping": stiffness})
     links = links_of(ROBOT, "FR_hip_roll")
-    expected = [links.rest(command[0, 0], one) for one in stiffness]
-    assert np.array_equal(got, np.repeat(np.array(expected)[:, None], 4, axis=1))
-    assert np.ptp(got) > 1e-3
+    for run in range(2):
+        expected = links.rest(command[run, 0], stiffness[run])
+        assert np.array_equal(position[run], np.tile(expected, (4, 1)))
+    assert np.ptp(position) > 1e-3
 
 
 def test_what_fails_there_is_one_sentence_here(python: Path, adapters: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +17,8 @@ from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passi
 from pronk.robots.motor import torque_limits
 from pronk.robots.robot import RobotSpec
 
-CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")
+CHEETAH = load_robot("mini_cheetah")
+ARM = load_robot("so101")
 
 
 def held_chirp(robot: RobotSpec, seconds: float, amplitude: float) -> Array:
@@ -30,9 +30,9 @@ def held_chirp(robot: RobotSpec, seconds: float, amplitude: float) -> Array:
 
 def commands(model: mujoco.MjModel, joint: str, offset: Array) -> Array:
     """Default commands with one joint's offset added, shape (steps, nu)."""
-    out = np.tile(model.key("default").ctrl, (len(offset), 1))
-    out[:, model.actuator(joint).id] += offset
-    return out
+    command = np.tile(model.key("default").ctrl, (len(offset), 1))
+    command[:, model.actuator(joint).id] += offset
+    return command
 
 
 def start(model: mujoco.MjModel) -> mujoco.MjData:
@@ -43,7 +43,8 @@ def start(model: mujoco.MjModel) -> mujoco.MjData:
 
 def simulate(model: mujoco.MjModel, command: Array) -> Array:
     """Positions at the start of each step, shape (steps, nq)."""
-    data, positions = start(model), []
+    data = start(model)
+    positions = []
     for target in command:
         positions.append(data.qpos.copy())
         data.ctrl[:] = target
@@ -69,42 +70,52 @@ def explicit_law(
     data = start(model)
     data.ctrl[:] = 0.0
     drives = [robot.joint(name).drive for name in names]
-    positions, clipped = [], 0
+    positions = []
+    clipped_steps = 0
     for target in command:
         positions.append(data.qpos.copy())
-        wanted = stiffness * (target - data.qpos) - damping * data.qvel
-        for i, drive in enumerate(drives):
-            limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
-            data.ctrl[i] = np.clip(wanted[i], *torque_limits(data.qvel[i], *limits))
-        clipped += bool(np.any(data.ctrl != wanted))
+        torque = stiffness * (target - data.qpos) - damping * data.qvel
+        for index, drive in enumerate(drives):
+            low, high = torque_limits(
+                data.qvel[index], drive.stall_torque, drive.no_load_speed, drive.effort_limit
+            )
+            data.ctrl[index] = np.clip(torque[index], low, high)
+        if np.any(data.ctrl != torque):
+            clipped_steps += 1
         mujoco.mj_step(model, data)
-    return np.array(positions), clipped / len(command)
+    return np.array(positions), clipped_steps / len(command)
 
 
 @pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll", "HL_hip_pitch"])
 def test_bench_is_the_free_robot_with_its_base_held(name: str) -> None:
     """Gravity torque, inertia and foot position agree with the whole robot's."""
-    found = []
+    figures = []
     for spec in (bench_spec(CHEETAH, name), free_spec(CHEETAH)):
         model = spec.compile()
-        data, dof = start(model), model.joint(name).dofadr[0]
+        data = start(model)
+        dof = model.joint(name).dofadr[0]
         mujoco.mj_forward(model, data)
-        full = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, full)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
         foot = data.site(f"{name[:2]}_foot").xpos
-        found.append([full[dof, dof], data.qfrc_bias[dof], *foot])
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-12)
+        figures.append(np.concatenate([[mass[dof, dof], data.qfrc_bias[dof]], foot]))
+    np.testing.assert_allclose(figures[0], figures[1], rtol=1e-9, atol=1e-12)
 
 
 def changed(
-    name: str = "FR_knee", drive: Mapping[str, float] | None = None, **own: Any
+    name: str = "FR_knee",
+    drive: Mapping[str, float] | None = None,
+    clamped: tuple[str, ...] = (),
 ) -> RobotSpec:
-    """The robot with other values of one joint and its drive."""
-    joint = CHEETAH.joint(name)
-    joint = replace(joint, drive=replace(joint.drive, **drive or {}), **own)
-    return replace(
-        CHEETAH, joints=tuple(joint if each.name == name else each for each in CHEETAH.joints)
-    )
+    """The robot with other values of a drive, or with other joints clamped."""
+    joints = []
+    for joint in CHEETAH.joints:
+        if joint.name == name:
+            joint = replace(joint, drive=replace(joint.drive, **drive or {}))
+            if clamped:
+                joint = replace(joint, clamped=clamped)
+        joints.append(joint)
+    return replace(CHEETAH, joints=tuple(joints))
 
 
 def assert_equal_models(a: mujoco.MjModel, b: mujoco.MjModel) -> None:
@@ -129,7 +140,8 @@ def test_edited_model_is_the_recompiled_one(name: str, rotor_inertia: float) -> 
 
 
 def test_a_joint_that_is_absent_or_not_in_the_chain_is_refused() -> None:
-    model, absent = bench_spec(CHEETAH, "FR_knee").compile(), CHEETAH.joint("FL_knee").drive
+    model = bench_spec(CHEETAH, "FR_knee").compile()
+    absent = CHEETAH.joint("FL_knee").drive
     with pytest.raises(RobotError, match="FR_knee"):
         set_drive_gains(model, "FL_knee", absent, 17.0, 0.4)
     with pytest.raises(RobotError, match="FR_knee"):
@@ -147,11 +159,13 @@ def test_knee_alone_is_the_second_order_joint_of_the_paper() -> None:
     spec.option.gravity = (0.0, 0.0, 0.0)
     model = spec.compile()
     inertia = 248e-6 + 0.064 * 0.061**2 + 72e-6 * 9.33**2
-    stiffness, damping = 17.0, 0.4 + 0.01
+    stiffness = 17.0
+    damping = 0.4 + 0.01
     steps = np.full(3000, 0.1)
     position = simulate(model, commands(model, "FR_knee", steps))[:, 0] - 1.6
     time = np.arange(len(steps)) * 1e-4
-    decay, natural = damping / (2 * inertia), np.sqrt(stiffness / inertia)
+    decay = damping / (2 * inertia)
+    natural = np.sqrt(stiffness / inertia)
     ringing = np.sqrt(natural**2 - decay**2)
     wave = np.cos(ringing * time) + decay / ringing * np.sin(ringing * time)
     expected = 0.1 * (1.0 - np.exp(-decay * time) * wave)
@@ -193,7 +207,8 @@ def test_mirror_claim_by_simulation(robot: RobotSpec, name: str) -> None:
     """position(self | command) == sign position(mirror | sign command), about the pose."""
     original, sign = robot.joint(name).original
     offset = held_chirp(robot, 2.0, 0.25)
-    model, mirrored = (bench_spec(robot, n).compile() for n in (name, original))
+    model = bench_spec(robot, name).compile()
+    mirrored = bench_spec(robot, original).compile()
     here = simulate(model, commands(model, name, offset))
     there = simulate(mirrored, commands(mirrored, original, sign * offset))
     column = robot.joint(name).chain.index(name)
@@ -221,22 +236,27 @@ def test_bench_is_mjlab_with_its_dc_motor_actuator(monkeypatch: pytest.MonkeyPat
 
     def passive() -> mujoco.MjSpec:
         spec = bench_spec(CHEETAH, name)
-        for element in (*spec.actuators, *spec.keys):
-            spec.delete(element)
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)
+        for key in list(spec.keys):
+            spec.delete(key)
         # The scene has its own options; unequal ones would be warned of.
-        spec.option.timestep, spec.option.disableflags = 0.002, 0
+        spec.option.timestep = 0.002
+        spec.option.disableflags = 0
         return spec
 
     def motor(joint_name: str) -> DcMotorActuatorCfg:
         joint = CHEETAH.joint(joint_name)
-        same = ("armature", "frictionloss", "viscous_damping", "effort_limit")
         return DcMotorActuatorCfg(
             target_names_expr=(joint_name,),
             stiffness=joint.stiffness,
             damping=joint.damping,
             saturation_effort=joint.drive.stall_torque,
             velocity_limit=joint.drive.no_load_speed,
-            **{field: getattr(joint.drive, field) for field in same},
+            armature=joint.drive.armature,
+            frictionloss=joint.drive.frictionloss,
+            viscous_damping=joint.drive.viscous_damping,
+            effort_limit=joint.drive.effort_limit,
         )
 
     pose = {joint: CHEETAH.joint(joint).default_position for joint in chain}

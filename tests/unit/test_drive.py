@@ -34,16 +34,29 @@ POWER = {
     ],
 )
 def test_stall_torque_and_no_load_speed_by_hand(
-    motor: tuple[float, ...], phases: int, stall: float, free: float
+    motor: tuple[float, float, float, float], phases: int, stall: float, free: float
 ) -> None:
-    names = ("gear_ratio", "torque_constant", "bus_voltage", "resistance")
-    values = dict(zip(names, motor, strict=True))
-    found = DriveEntry(effort_limit=17.0, phases=phases, **values).drive("")  # type: ignore[arg-type]
-    assert (found.stall_torque, found.no_load_speed) == pytest.approx((stall, free), rel=2e-4)
-    line = {"stall_torque": found.stall_torque, "no_load_speed": found.no_load_speed}
-    volts = {"gear_ratio": motor[0], "bus_voltage": motor[2], "phases": phases}
-    again = DriveEntry(effort_limit=17.0, **line, **volts).drive("")  # type: ignore[arg-type]
-    assert (again.torque_constant, again.resistance) == pytest.approx((motor[1], motor[3]))
+    gear_ratio, torque_constant, bus_voltage, resistance = motor
+    from_motor = DriveEntry(
+        effort_limit=17.0,
+        phases=phases,
+        gear_ratio=gear_ratio,
+        torque_constant=torque_constant,
+        bus_voltage=bus_voltage,
+        resistance=resistance,
+    ).drive("")
+    assert from_motor.stall_torque == pytest.approx(stall, rel=2e-4)
+    assert from_motor.no_load_speed == pytest.approx(free, rel=2e-4)
+    from_line = DriveEntry(
+        effort_limit=17.0,
+        phases=phases,
+        gear_ratio=gear_ratio,
+        bus_voltage=bus_voltage,
+        stall_torque=from_motor.stall_torque,
+        no_load_speed=from_motor.no_load_speed,
+    ).drive("")
+    assert from_line.torque_constant == pytest.approx(torque_constant)
+    assert from_line.resistance == pytest.approx(resistance)
 
 
 def test_limits_at_stall_corner_no_load_and_beyond() -> None:
@@ -70,8 +83,14 @@ def test_limits_are_odd_and_bounded(speed: float) -> None:
 
 def test_winding_loss_and_power_of_motoring_and_regenerating() -> None:
     # A brushed motor at stall: V^2 / R.
-    d = load_robot("so101").joints[0].drive
-    loss = drive.winding_loss(d.stall_torque, **{n: getattr(d, n) for n in POWER})
+    servo = load_robot("so101").joints[0].drive
+    loss = drive.winding_loss(
+        servo.stall_torque,
+        gear_ratio=servo.gear_ratio,
+        torque_constant=servo.torque_constant,
+        bus_voltage=servo.bus_voltage,
+        stall_torque=servo.stall_torque,
+    )
     assert loss == pytest.approx(7.4**2 / 2.6762)
     # 5 N m at the hip: i = 5 / (1.5 * 6 * .05), 1.5 * .173 * i^2 = 32.04 W; 10 rad/s: 50 W more.
     power = drive.electrical_power([5.0, 5.0, 5.0, 5.0], [10.0, -10.0, 0.0, -6.0], **POWER)
