@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import io
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,12 +33,12 @@ from pronk.jump.train.mdp import actions
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import DELAY_STEPS
-from pronk.jump.trial.tables import table
 from pronk.jump.trial.training_sim import adapter
 from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Evaluation, Plan
 from pronk.jump.trial.training_sim.run import evaluate_policy
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
+from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -82,7 +82,8 @@ def environment(
 ) -> ManagerBasedRlEnv:
     """The evaluation's environment with the drives of a framework."""
     task = load_task(subject.robot)
-    robot, law = framework.robot(task.robot), framework.drive_law
+    robot = framework.robot(task.robot)
+    law = framework.drive_law
     parts = law.iterations
     fine = replace(
         robot,
@@ -99,52 +100,56 @@ def environment(
     action.delay_steps = (max(0, middle - parts * DELAY_STEPS), middle + parts * DELAY_STEPS)
     articulation: Any = cfg.scene.entities["robot"].articulation
     if law.kind != "explicit":
-        articulation.actuators = tuple(
-            implicit(drive, law, fine.timestep_s) for drive in articulation.actuators
-        )
+        drives = [implicit(drive, law, fine.timestep_s) for drive in articulation.actuators]
+        articulation.actuators = tuple(drives)
     return ManagerBasedRlEnv(cfg=cfg, device=device)
 
 
 def implicit(drive: DcMotorActuatorCfg, law: DriveLaw, substep: float) -> ImplicitDriveCfg:
     """A drive of training as one of an implicit law."""
-    own = {name: getattr(drive, name) for name in drive.__dataclass_fields__}
-    own |= {"damping": 0.0, "effort_limit": _UNLIMITED, "saturation_effort": _UNLIMITED}
-    bias = law.damping(drive.stiffness, drive.damping, substep)
-    return ImplicitDriveCfg(**own, bias=bias, limit=drive.effort_limit)
+    drive_fields = {field.name: getattr(drive, field.name) for field in fields(drive)}
+    drive_fields["damping"] = 0.0
+    drive_fields["effort_limit"] = _UNLIMITED
+    drive_fields["saturation_effort"] = _UNLIMITED
+    return ImplicitDriveCfg(
+        **drive_fields,
+        bias=law.damping(drive.stiffness, drive.damping, substep),
+        limit=drive.effort_limit,
+    )
 
 
 def translated(
     gains: TrainingGains, robot: RobotSpec, trained: Profile, to: Profile
 ) -> TrainingGains:
     """Training gains of a framework as those of another."""
-    by_joint = {
-        joint.name: (gains.groups[joint.group].stiffness, gains.groups[joint.group].damping)
-        for joint in robot.joints
-    }
-    stated: MatchedGains = stated_gains(robot, by_joint, trained)
+    pairs = {}
+    for joint in robot.joints:
+        group = gains.groups[joint.group]
+        pairs[joint.name] = (group.stiffness, group.damping)
+    stated: MatchedGains = stated_gains(robot, pairs, trained)
     joints = {}
-    for name, one in stated.joints.items():
-        dry, drive = gains.groups[robot.joint(name).group].frictionloss, robot.joint(name).drive
-        dry = drive.frictionloss if np.isnan(dry) else dry
-        joints[name] = replace(
-            one,
+    for joint in robot.joints:
+        frictionloss = gains.groups[joint.group].frictionloss
+        if np.isnan(frictionloss):
+            frictionloss = joint.drive.frictionloss
+        joints[joint.name] = replace(
+            stated.joints[joint.name],
             delay_s=FittedValue(value=gains.delay_s),
-            frictionloss=FittedValue(value=dry),
+            frictionloss=FittedValue(value=frictionloss),
         )
     stated = replace(stated, joints=joints, groups=gains.groups)
-    found, _ = translate(stated, robot, to)
-    delay = float(np.mean([joint.delay_s.value for joint in found.joints.values()]))
-    return replace(gains, groups=found.groups, delay_s=delay)
+    other_gains, _ = translate(stated, robot, to)
+    delay = float(np.mean([joint.delay_s.value for joint in other_gains.joints.values()]))
+    return replace(gains, groups=other_gains.groups, delay_s=delay)
 
 
-def summary(found: Evaluation) -> dict[str, float]:
+def summary(evaluation: Evaluation) -> dict[str, float]:
     """Landings of all jumps, falls and velocity errors of all walks."""
-    walks, jumps = found.walks, found.jumps
     return {
-        "jumped": float(np.mean([one["found"].mean for one in jumps])),
-        "landed": float(np.mean([one["upright"].mean for one in jumps])),
-        "fell": float(np.mean([one["fell"].mean for one in walks])),
-        "speed_error": float(np.mean([one["speed_error"].mean for one in walks])),
+        "jumped": float(np.mean([jump["found"].mean for jump in evaluation.jumps])),
+        "landed": float(np.mean([jump["upright"].mean for jump in evaluation.jumps])),
+        "fell": float(np.mean([walk["fell"].mean for walk in evaluation.walks])),
+        "speed_error": float(np.mean([walk["speed_error"].mean for walk in evaluation.walks])),
     }
 
 
@@ -160,50 +165,58 @@ def transfer(
 
     Args:
         policy: The policy.
-        gains: Those it was trained with.
+        gains: The gains that it was trained with.
         frameworks: Profiles, as `pronk profiles` lists them.
         robots: Robots for each command.
-        seed: Of all draws.
-        device: auto: a GPU if there is one.
+        seed: Seed of all draws.
+        device: auto takes a GPU if there is one.
     """
-    where = "cuda:0" if find_devices(device) else "cpu"
-    subject = adapter.load_subject(policy, where)
-    robot, trained = load_task(subject.robot).robot, profile("mjlab")
-    own = training_gains(gains, robot)
+    torch_device = "cuda:0" if find_devices(device) else "cpu"
+    subject = adapter.load_subject(policy, torch_device)
+    robot = load_task(subject.robot).robot
+    trained_profile = profile("mjlab")
+    trained_gains = training_gains(gains, robot)
     plan = Plan(robot=robot, robots=robots, seed=seed, walks=WALKS, jumps=JUMPS)
-    runs = [("mjlab", "its own", trained, own)]
+    runs = [("mjlab", "its own", trained_profile, trained_gains)]
     for name in frameworks:
-        other = profile(name)
-        runs += [
-            (name, "as they are", other, own),
-            (name, "translated", other, translated(own, robot, trained, other)),
-        ]
+        framework = profile(name)
+        translated_gains = translated(trained_gains, robot, trained_profile, framework)
+        runs.append((name, "as they are", framework, trained_gains))
+        runs.append((name, "translated", framework, translated_gains))
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
-        for name, which, framework, drives in runs:
-            done = report.bar(f"{name} {which}")
+        for name, gains_kind, framework, run_gains in runs:
+            run_progress = report.bar(f"{name} {gains_kind}")
+            # mjlab and Warp print to standard output.
             with redirect_stdout(io.StringIO()):
-                env = environment(subject, drives, plan, framework, where)
+                env = environment(subject, run_gains, plan, framework, torch_device)
                 try:
-                    found = evaluate_policy(
-                        subject.act,
-                        env,
-                        plan,
-                        progress=done,
-                    )
+                    evaluation = evaluate_policy(subject.act, env, plan, progress=run_progress)
                 finally:
                     env.close()
-            first = next(iter(drives.groups.values()))
-            rows.append(
-                {"framework": name, "law": framework.drive_law.label, "gains": which}
-                | {"stiffness": first.stiffness, "damping": first.damping}
-                | summary(found)
-            )
-    columns = "framework | law | gains | hip roll stiffness;2 | damping | jumped | landed;4"
-    sheet = table(
-        f"{columns} | fell walking;4 | speed error [m/s]",
-        [list(row.values()) for row in rows],
+            first_group = next(iter(run_gains.groups.values()))
+            row = {
+                "framework": name,
+                "law": framework.drive_law.label,
+                "gains": gains_kind,
+                "stiffness": first_group.stiffness,
+                "damping": first_group.damping,
+            }
+            rows.append({**row, **summary(evaluation)})
+    result_table = Table(
         title=f"{policy} with {robots} robots a command, seed {seed}",
+        columns=(
+            Column(heading="framework"),
+            Column(heading="law"),
+            Column(heading="gains"),
+            Column(heading="hip roll stiffness", unit="N m/rad", digits=2),
+            Column(heading="hip roll damping", unit="N m s/rad"),
+            Column(heading="jumped", digits=4),
+            Column(heading="landed", digits=4),
+            Column(heading="fell walking", digits=4),
+            Column(heading="speed error", unit="m/s"),
+        ),
+        rows=tuple(tuple(row.values()) for row in rows),
     )
-    console.show_sheet(sheet)
+    console.show(result_table)
     return console.Outcome(figures={"rows": rows, "machine": machine()})
