@@ -153,7 +153,7 @@ def _until(
     """Hold the dead-man button until one of some modes comes; whether it came."""
     until = time.monotonic() + seconds
     while (now := time.monotonic()) < until:
-        deployment.write(OperatorCommand(held=True, request=request, command=command(now)))
+        deployment.write(OperatorCommand(dead_man=True, request=request, command=command(now)))
         request = OperatorRequest.NONE
         if deployment.mode in modes:
             return True

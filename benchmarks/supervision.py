@@ -111,7 +111,7 @@ QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
     "least path of the attitude, share": (SENSORS.stuck_share, _path_share),
     "unit repeats [s]": (SENSORS.repeat_s, _repeated),
     "moved while constant [rad]": (SENSORS.moved, _moved),
-    "others moved while constant [rad]": (SENSORS.others, _others),
+    "others moved while constant [rad]": (SENSORS.others_moved, _others),
     "limited by torque without moving [s]": (LIMITS.blocked.blocked_s, _blocked),
     "limited by torque [s]": (LIMITS.blocked.clipped_s, _clipped),
 }

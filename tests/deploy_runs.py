@@ -41,7 +41,7 @@ def met(
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         request = left.pop(0) if left else OperatorRequest.NONE
-        deployment.write(OperatorCommand(request=request, held=True, **more))
+        deployment.write(OperatorCommand(request=request, dead_man=True, **more))
         if deployment.mode in modes:
             return True
         time.sleep(0.01)

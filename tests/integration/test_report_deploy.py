@@ -17,7 +17,7 @@ from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.deploy.runtime.records import EVENT, REAL, STEP, TICK, VIRTUAL, event_record, put_state
 from pronk.errors import LogError
 from pronk.report import build, deploy_page, deploy_run
-from pronk.report.deploy_page import part
+from pronk.report.deploy_page import deploy_part
 from pronk.report.deploy_run import drive_delay, measured_delay, quantiles
 from virtual_robot import KP, POSE, ROBOT, rolled, still
 
@@ -102,7 +102,7 @@ def test_quantiles_are_those_of_the_sorted_values() -> None:
 @pytest.mark.parametrize("lag", [1, 2, 4])
 def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
     path = flown(tmp_path / "run.mcap", lag=lag)
-    log, made = read_deploy_log(path), part(path)
+    log, made = read_deploy_log(path), deploy_part(path)
     # A state at tick k sees the target sent at tick k - lag, on the wire 0.4 ms after the tick:
     # right for every shift between (lag - 1) ticks and lag ticks, less 0.4 ms.
     latest = lag * TICK_S - 4e-4
@@ -139,8 +139,8 @@ def test_measures_of_a_fault(tmp_path: Path) -> None:
     assert (tilt.largest, tilt.limit) == (pytest.approx(1.0), 0.8)
     parts = {timed.name: timed.seconds for timed in deploy_run.timed_parts(log)}
     assert len(parts["age of the state"]) == 201  # until the fault
-    assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.verdict(log)
-    content = part(tmp_path / "run.mcap").content
+    assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.deploy_verdict(log)
+    content = deploy_part(tmp_path / "run.mcap").content
     assert (content["moved"], content["given"], list(content["damped"])) == (100, 200, [True] * 100)
 
 
@@ -156,7 +156,7 @@ def test_the_hottest_motor_is_named(tmp_path: Path) -> None:
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
     path = faulted(tmp_path / "run.mcap", end=False)
     path.write_bytes(path.read_bytes()[:-20])
-    made = part(path)
+    made = deploy_part(path)
     assert made.figures["complete"] is False
     assert made.warning
     assert "The log was cut" in build.page("cut", [made])
@@ -170,7 +170,7 @@ def test_the_page_of_a_refusal_with_missed_ticks(tmp_path: Path) -> None:
         writer.write(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
-    made = part(path)
+    made = deploy_part(path)
     assert made.summary.endswith("the battery gives 12.0 V; charge it.")
     assert made.figures["delay"]["within"] is None
     assert made.figures["missed_ticks"] == 5

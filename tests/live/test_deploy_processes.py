@@ -176,7 +176,9 @@ def test_states_that_cannot_be_believed(running: Running, faults: dict[str, Any]
     )
     assert followed.any()
     k = int(np.flatnonzero(followed)[0])
-    np.testing.assert_allclose(found.ticks.sent[k], found.steps.target[int(found.ticks.action[k])])
+    np.testing.assert_allclose(
+        found.ticks.sent[k], found.steps.target[int(found.ticks.action.number[k])]
+    )
     assert np.isfinite(found.ticks.latency[found.ticks.mode == Mode.POLICY]).sum() > 10
     assert found.figures["servo"]["ticks"] >= len(found.ticks.tick)
 

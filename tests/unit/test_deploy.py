@@ -484,11 +484,11 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
     assert requested(1.0, Mode.STAND) is OperatorRequest.WALK
     times = (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)
     given = {t: operator.command(10.0 + t, Mode.POLICY) for t in times}
-    assert all(each.held for each in given.values())
+    assert all(each.dead_man for each in given.values())
     assert [t for t, each in given.items() if each.jump] == [2.2, 7.2]
     assert [t for t, each in given.items() if each.command == FORWARD] == [1.5, 2.2, 2.7]
     assert given[6.5].command == (0.0, -1.0, 0.0)
-    sit = OperatorCommand(held=True, request=OperatorRequest.SIT)
+    sit = OperatorCommand(dead_man=True, request=OperatorRequest.SIT)
     assert operator.command(20.1, Mode.POLICY) == sit
     assert [requested(t, Mode.POLICY) for t in (20.2, 20.3)] == [none, none]
     assert requested(22.0, Mode.SIT) is none
@@ -523,15 +523,15 @@ def test_keys_of_a_terminal() -> None:
         os.write(master, keys)
         return keyboard.command(t, Mode.POLICY)
 
-    assert not keyboard.command(0.0, Mode.DAMP).held
+    assert not keyboard.command(0.0, Mode.DAMP).dead_man
     given = pressed(b" wwwad", 1.0)
-    assert (given.held, given.command) == (True, (0.75, 0.0, 0.0))
+    assert (given.dead_man, given.command) == (True, (0.75, 0.0, 0.0))
     given = pressed(b"\n2jj", 1.1)
     assert (given.jump, given.request) == (True, OperatorRequest.WALK)
     assert given.command[2] == pytest.approx(0.4)
     # The jump's press lasts half a second, the dead-man key four fifths.
     assert keyboard.command(1.61, Mode.POLICY).jump is False
-    assert [keyboard.command(t, Mode.POLICY).held for t in (1.79, 1.81)] == [True, False]
+    assert [keyboard.command(t, Mode.POLICY).dead_man for t in (1.79, 1.81)] == [True, False]
     assert pressed(b"s" * 40, 2.0).command[0] == RANGES["vx"][0]
     keyboard.notified("mode", "DAMP")
     assert keyboard.command(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
@@ -555,10 +555,10 @@ def test_a_gamepad(tmp_path: Path) -> None:
 
     # The initial state of the buttons is no press.
     given = moved(0.0, (0, 0x81, 4), (1, 0x81, 3))
-    assert (given.held, given.request) == (False, OperatorRequest.NONE)
+    assert (given.dead_man, given.request) == (False, OperatorRequest.NONE)
     # The last is within the dead zone.
     given = moved(0.1, (1, 1, 4), (1, 1, 3), (-32767, 2, 1), (16384, 2, 0), (2000, 2, 3))
-    assert (given.held, given.request) == (True, OperatorRequest.WALK)
+    assert (given.dead_man, given.request) == (True, OperatorRequest.WALK)
     assert given.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
     # The jump input of a press, short or long, lasts as long as in training.
     assert moved(0.2, (1, 1, 5)).jump
@@ -568,7 +568,7 @@ def test_a_gamepad(tmp_path: Path) -> None:
     assert not moved(1.4).jump
     os.close(wire)
     given = moved(1.5)
-    assert (given.held, given.command) == (False, (0.0, 0.0, 0.0)), "unplugged"
+    assert (given.dead_man, given.command) == (False, (0.0, 0.0, 0.0)), "unplugged"
     pad.close()
 
 
@@ -626,18 +626,23 @@ def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert log.joints == ROBOT.joint_names
     table = np.array(ticks)
     for name in vars(log.ticks):
-        if name != "state":
+        if name not in ("state", "action"):
             np.testing.assert_array_equal(getattr(log.ticks, name), table[name])
+    np.testing.assert_array_equal(log.ticks.action.number, table["action"])
+    np.testing.assert_array_equal(log.ticks.action.state_sequence, table["action_state"])
     for name in vars(log.ticks.state):
         np.testing.assert_array_equal(getattr(log.ticks.state, name), table[name])
     for name in vars(log.steps):
-        np.testing.assert_array_equal(getattr(log.steps, name), steps[name])
+        if name != "network":
+            np.testing.assert_array_equal(getattr(log.steps, name), steps[name])
+    for name in vars(log.steps.network):
+        np.testing.assert_array_equal(getattr(log.steps.network, name), steps[name])
     np.testing.assert_allclose(log.ticks.lateness, 1e-4, atol=1e-12)
     np.testing.assert_allclose(log.ticks.work, 3e-4, atol=1e-12)
     np.testing.assert_allclose(log.ticks.state_age, 1e-4, atol=1e-12)
     np.testing.assert_array_equal(log.ticks.damped, np.arange(count) >= 590)
     np.testing.assert_array_equal(log.ticks.state.time, np.arange(count) / 500)
-    np.testing.assert_array_equal(log.steps.action, steps["action"])
+    np.testing.assert_array_equal(log.steps.network.action, steps["action"])
     assert (log.steps.jump.dtype, log.steps.jump.sum()) == (bool, 29)
     [first] = log.events
     assert (first.kind, first.reason, first.level) == ("fault", "TILT", "LATCH")

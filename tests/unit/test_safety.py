@@ -41,8 +41,8 @@ def judged(
     """What a filter makes of a state and a command, and the filter."""
     held, earlier = more.pop("held", True), more.pop("earlier", [])
     safety = SafetyFilter(limits=limits)
-    safety.last = more.pop("last", None)
-    sent, decision = safety.judge([*earlier, s], c, t, held=held)
+    safety.sent_target = more.pop("last", None)
+    sent, decision = safety.judge([*earlier, s], c, t, dead_man=held)
     return sent, decision, safety
 
 
@@ -60,9 +60,9 @@ def test_a_command_within_all_limits_passes_unchanged() -> None:
     target = POSE + 0.1
     sent, decision, safety = judged(state(), command(position=target), 0.001)
     assert sent is not None
-    assert safety.last is not None
+    assert safety.sent_target is not None
     assert decision.reason is Reason.NONE
-    for values in (sent.position, safety.last):
+    for values in (sent.position, safety.sent_target):
         np.testing.assert_array_equal(values, target)
     assert sent.stiffness is KP
     assert sent.damping is KD
@@ -140,7 +140,7 @@ def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) ->
     assert sent is None
     assert (decision.level, decision.reason) == (FilterAction.LATCH, reason)
     assert safety.faulted
-    assert safety.last is None
+    assert safety.sent_target is None
     assert reason.text in decision.text
     assert "\n" not in decision.text
     # In an earlier state of the tick it counts too.
@@ -270,10 +270,10 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
         command_age=rng.exponential(0.01, count),
         valid_for=rng.choice([0.01, 0.05, math.inf], count),
         lag=rng.integers(0, 35, count).astype(float),
-        last=position + spread(many, 0.0, 0.3),
-        held=rng.random(count) < 0.95,
+        previous=position + spread(many, 0.0, 0.3),
+        dead_man=rng.random(count) < 0.95,
     )
-    for values in (given.position, given.velocity, given.gyro, given.target, given.last):
+    for values in (given.position, given.velocity, given.gyro, given.target, given.previous):
         struck = rng.random(values.shape) < 0.001
         values[struck] = rng.choice([math.nan, math.inf, -math.inf, 1e300], struck.sum())
     return given
@@ -306,7 +306,7 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
             | (target > limits.joints.high - limits.operating.margin + slack)
             | (out & inside)
         ).any(axis=-1),
-        "change": (np.abs(target - given.last) > limits.operating.change + slack).any(axis=-1),
+        "change": (np.abs(target - given.previous) > limits.operating.change + slack).any(axis=-1),
         "torque": (np.abs(torque) > limits.joints.torque + slack).any(axis=-1),
         "power": power > limits.operating.power_w * (1.0 + slack),
         "tilt": upright < math.cos(limits.operating.tilt) - slack,
@@ -315,7 +315,7 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
         "age": given.state_age > limits.ages.damp_s,
         "expiry": given.command_age > np.minimum(given.valid_for, limits.ages.expiry_s),
         "lag": given.lag > limits.ages.lag,
-        "dead man": ~given.held,
+        "dead man": ~given.dead_man,
         "gains": (
             (kp < 0)
             | (kp > limits.operating.stiffness)

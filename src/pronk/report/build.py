@@ -20,7 +20,7 @@ NAME = "report.html"
 LOGS = "*.mcap"
 KINDS: dict[str, Callable[[Path], Part]] = {
     SUMMARY: trial_page.part,
-    LOGS: deploy_page.part,
+    LOGS: deploy_page.deploy_part,
     "match.npz": match_page.part,
 }
 """How the part of each file is made, in the order of the page."""

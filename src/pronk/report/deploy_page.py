@@ -41,7 +41,7 @@ _PROBLEMS = ("fault", "refused")
 """Kinds of events that are told in the summary."""
 
 
-def verdict(log: DeployLog) -> str:
+def deploy_verdict(log: DeployLog) -> str:
     """Return the outcome in one sentence."""
     robot = f"{log.header['robot']} (real or virtual unknown)"
     for event in log.events:
@@ -69,7 +69,7 @@ def verdict(log: DeployLog) -> str:
     return f"{robot}: no fault; the policy was active for {active_s:.1f} s, jump inputs: {jumps}."
 
 
-def part(path: Path) -> Part:
+def deploy_part(path: Path) -> Part:
     """Make the part of a deployment's log; LogError if it is damaged, or of something else."""
     log = read_deploy_log(path)
     delay = measured_delay(log, _robot_of(log))
@@ -79,7 +79,7 @@ def part(path: Path) -> Part:
         later_problems.append((event.kind, float(since_start(log, event.time)), event.text))
     has_target = np.isfinite(log.ticks.desired).any(axis=1)
     was_moved = np.isin(log.ticks.level, (FilterAction.LIMIT, FilterAction.HOLD))
-    summary = verdict(log)
+    summary = deploy_verdict(log)
     figures = _figures(log, delay, summary)
     content: dict[str, Any] = {
         "log": log,

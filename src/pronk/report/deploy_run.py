@@ -347,9 +347,9 @@ def drive_delay(log: DeployLog, robot: RobotSpec) -> tuple[float, float]:
         if compared.sum() < _FEWEST_TICKS or variance == 0.0:
             return _UNKNOWN
         residuals.append(np.mean((torque - expected)[compared] ** 2) / variance)
-    least = min(residuals)
-    good_shifts = _SHIFTS[np.array(residuals) <= _AS_GOOD * least]
-    if 1.0 - least < _EXPLAINED or good_shifts[-1] == _SHIFTS[-1]:
+    smallest = min(residuals)
+    good_shifts = _SHIFTS[np.array(residuals) <= _AS_GOOD * smallest]
+    if 1.0 - smallest < _EXPLAINED or good_shifts[-1] == _SHIFTS[-1]:
         return _UNKNOWN
     return float(good_shifts[0]), float(good_shifts[-1])
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pronk.deploy.links.link import ClampOperator, Freshness
 from pronk.deploy.links.realtime import sleep_until
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.robot import VirtualRobot
@@ -94,7 +95,9 @@ def open_sim(
     interface: str | None = None,
     seed: int = 0,
     params: str | None = None,
-    **common: Any,
+    clamp_operator: ClampOperator | None = None,
+    release: bool = False,
+    fresh: Freshness | None = None,
 ) -> PacedRobot:
     """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`, not yet connected.
 
@@ -103,7 +106,9 @@ def open_sim(
         interface: What holds the trunk, `bench` or `ground`; the ground if None.
         seed: Seed of all noise.
         params: Path of the virtual robot's parameters; those that ship with pronk if None.
-        common: Options of network links, which have no meaning here.
+        clamp_operator: Of a network link; without meaning here.
+        release: Of a network link; without meaning here.
+        fresh: Of a network link; without meaning here.
     """
     base: Any = interface or "ground"
     sim_params = load_sim_params(params, robot)

@@ -63,6 +63,16 @@ class StateLog:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ActionLog:
+    """Action of the policy in force at each of T ticks."""
+
+    number: IntArray
+    """Numbers of the actions, -1 for none, (T,)."""
+    state_sequence: IntArray
+    """Numbers of the states that they were computed from, -1 for none, (T,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TickLog:
     """T ticks of the servo. Times are on CLOCK_MONOTONIC."""
 
@@ -78,10 +88,8 @@ class TickLog:
     """`FilterAction`, (T,)."""
     reason: IntArray
     """`Reason`, (T,)."""
-    action: IntArray
-    """Number of the policy's action in force, -1 for none, (T,)."""
-    action_state: IntArray
-    """Number of the state of that action, -1 for none, (T,)."""
+    action: ActionLog
+    """Action of the policy that was in force."""
     deadline: Array
     """Times at which the ticks were due [s], (T,)."""
     begun: Array
@@ -138,8 +146,7 @@ class TickLog:
             damped=table["damped"].astype(bool),
             level=table["level"],
             reason=table["reason"],
-            action=table["action"],
-            action_state=table["action_state"],
+            action=ActionLog(number=table["action"], state_sequence=table["action_state"]),
             deadline=table["deadline"],
             begun=table["begun"],
             done=table["done"],
@@ -149,6 +156,20 @@ class TickLog:
             desired=table["desired"],
             sent=table["sent"],
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkLog:
+    """Input and outputs of the network in each of P steps."""
+
+    observation: NDArray[np.float32]
+    """Observations, (P, observations)."""
+    action: NDArray[np.float32]
+    """Actions, (P, joints)."""
+    contact: NDArray[np.float32]
+    """Estimated probabilities of contact, (P, 4)."""
+    linear_velocity: NDArray[np.float32]
+    """Estimated velocities of the trunk [m/s], (P, 3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,14 +200,8 @@ class StepLog:
     """Velocity commands: forward, left [m/s], yaw rate [rad/s], (P, 3)."""
     target: Array
     """Joint targets [rad], (P, joints)."""
-    observation: NDArray[np.float32]
-    """Observations of the network, (P, observations)."""
-    action: NDArray[np.float32]
-    """Actions of the network, (P, joints)."""
-    contact: NDArray[np.float32]
-    """Probabilities of contact that the network estimates, (P, 4)."""
-    linear_velocity: NDArray[np.float32]
-    """Velocities of the trunk that the network estimates [m/s], (P, 3)."""
+    network: NetworkLog
+    """Input and outputs of the network."""
 
     @property
     def lateness(self) -> Array:
@@ -214,10 +229,12 @@ class StepLog:
             state_time=table["state_time"],
             command=table["command"],
             target=table["target"],
-            observation=table["observation"],
-            action=table["action"],
-            contact=table["contact"],
-            linear_velocity=table["linear_velocity"],
+            network=NetworkLog(
+                observation=table["observation"],
+                action=table["action"],
+                contact=table["contact"],
+                linear_velocity=table["linear_velocity"],
+            ),
         )
 
 

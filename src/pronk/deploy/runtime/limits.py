@@ -163,7 +163,7 @@ class SensorLimits:
     moved: float = 0.005
     """Largest range of the integral of velocity at a constant position, or the reverse [rad]: three
     steps of an encoder of 12 bits."""
-    others: float = 0.05
+    others_moved: float = 0.05
     """Largest sum of the displacements of other joints while one is constant for `repeat_s` [rad];
     the largest measured is 0.003, with encoders of 12 bits without noise."""
 
@@ -179,7 +179,7 @@ class SensorLimits:
                 "upright": self.upright,
                 "encoder": self.encoder,
                 "moved": self.moved,
-                "others": self.others,
+                "others_moved": self.others_moved,
             },
         )
 
@@ -219,7 +219,7 @@ class Limits:
         joints = self.joints
         hottest = np.full_like(joints.low, self.operating.temperature)
         coldest = np.full_like(joints.low, -np.inf)
-        least = (
+        smallest = (
             joints.low - self.operating.overrun,
             -joints.speed,
             -joints.measured_torque,
@@ -231,7 +231,7 @@ class Limits:
             joints.measured_torque,
             hottest,
         )
-        return np.concatenate(least), np.concatenate(largest)
+        return np.concatenate(smallest), np.concatenate(largest)
 
     @cached_property
     def gains(self) -> Array:

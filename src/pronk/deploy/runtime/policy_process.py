@@ -266,5 +266,5 @@ class PolicyProcess:
         if record is None or self._mode is not Mode.POLICY:
             return STILL, False
         command = np.clip(record["command"], self._lowest_command, self._highest_command)
-        forward, left, yaw = command.tolist()
-        return (forward, left, yaw), bool(record["jump"]) and self._jumps
+        forward, sideways, yaw_rate = command.tolist()
+        return (forward, sideways, yaw_rate), bool(record["jump"]) and self._jumps

@@ -7,7 +7,6 @@ The link checks when it connects that no other program writes to the robot;
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 
 import numpy as np
 
@@ -20,16 +19,21 @@ from pronk.robots.robot import RobotSpec
 RATE_SHARE = 0.6
 """Least share of the states that must arrive: with a third lost, a robot still walks."""
 GRAVITY = 9.81
+"""Specific force of a robot at rest [m/s^2]."""
 GRAVITY_SLACK = 1.0
-"""Of the median specific force of a robot at rest [m/s^2]."""
+"""Largest difference of the median specific force of a robot at rest from it [m/s^2]."""
 ATTITUDE_SLACK = 0.2
-"""Between "up" by the accelerometer and by the attitude filter [rad]."""
+"""Largest angle between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
-"""Of the attitude's quaternion."""
+"""Largest difference of the length of the attitude's quaternion from 1."""
 REST_SPEED = 1.0
 """Fastest that a joint of a robot at rest may turn [rad/s]."""
 BATTERY_SHARE = 0.85
-"""Of the nominal bus voltage: a lithium battery is nearly empty there."""
+"""Least share of the nominal bus voltage: a lithium battery is nearly empty there."""
+_LIVE_S = 0.1
+"""Time in which the sensors of a live robot change [s]."""
+_LIVE_STATES = 10
+"""Number of states in which the sensors of a live robot change."""
 
 
 def refusals(
@@ -41,24 +45,38 @@ def refusals(
     seconds: float,
     state_rate_hz: float = 500.0,
 ) -> tuple[str, ...]:
-    """Why the robot must not move; empty if it may.
+    """Return why the robot must not move; empty if it may.
 
-    `states` were received in the last `seconds` before `now`, oldest first, while nothing was sent;
-    the robot sends `state_rate_hz` a second.
+    Args:
+        states: States of a robot to which nothing was sent, oldest first.
+        robot: The robot.
+        limits: Limits of the safety filter.
+        now: Time of the check [s].
+        seconds: Time before it in which the states were received [s].
+        state_rate_hz: States that the robot sends per second.
+
+    Returns:
+        One sentence for each reason, with its remedy.
     """
     if len(states) < 2:
         return (
             f"{len(states)} states in {seconds:.1f} s; check the link, the network interface and "
             "that the robot's program runs.",
         )
-    stream = _stream(states, limits, now, seconds, state_rate_hz)
-    checks = (stream, _attitude(states, limits))
-    return tuple(chain(*checks, _joints_and_battery(states, robot, limits)))
+    return (
+        *_stream(states, limits, now, seconds, state_rate_hz),
+        *_sensors(states, limits, seconds),
+        *_attitude(states, limits),
+        *_joints(states[-1], robot, limits),
+        *_battery(states, robot),
+        *_temperatures(states[-1], robot, limits),
+    )
 
 
 def _stream(
     states: Sequence[State], limits: Limits, now: float, seconds: float, expected: float
 ) -> Iterator[str]:
+    """Check that enough states come, and that they are fresh."""
     rate = len(states) / seconds
     if rate < RATE_SHARE * expected:
         yield (
@@ -73,23 +91,40 @@ def _stream(
         )
     if age < -limits.ages.future_s:
         yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; correct the link's clock."
+
+
+def _sensors(states: Sequence[State], limits: Limits, seconds: float) -> Iterator[str]:
+    """Check that the sensors are live and give numbers."""
     measured = np.array([np.concatenate((state.position, state.gyro)) for state in states])
-    if seconds >= 0.1 and len(states) > 10 and (measured == measured[0]).all():
-        yield (
-            "no number changed in all states, not even the gyro's noise; the sensors or the "
-            "program that reads them have stopped."
-        )
-    elif seconds >= 0.1 and len(states) > 10 and limits.trunk_is_free:
-        for name in ("gyro", "accelerometer", "orientation"):
-            values = np.array([getattr(state, name) for state in states])
-            if (values == values[0]).all():
-                yield f"the {name} did not change in all states; it has stopped, restart the robot."
-    for name in ("position", "velocity", "gyro", "accelerometer", "orientation"):
-        if not np.isfinite([getattr(state, name) for state in states]).all():
+    trunk = {
+        "gyro": np.array([state.gyro for state in states]),
+        "accelerometer": np.array([state.accelerometer for state in states]),
+        "orientation": np.array([state.orientation for state in states]),
+    }
+    if seconds >= _LIVE_S and len(states) > _LIVE_STATES:
+        if (measured == measured[0]).all():
+            yield (
+                "no number changed in all states, not even the gyro's noise; the sensors or the "
+                "program that reads them have stopped."
+            )
+        elif limits.trunk_is_free:
+            for name, values in trunk.items():
+                if (values == values[0]).all():
+                    yield (
+                        f"the {name} did not change in all states; it has stopped, restart the "
+                        "robot."
+                    )
+    joints = {
+        "position": np.array([state.position for state in states]),
+        "velocity": np.array([state.velocity for state in states]),
+    }
+    for name, values in {**joints, **trunk}.items():
+        if not np.isfinite(values).all():
             yield f"the states' {name} holds something that is not a number; restart the robot."
 
 
 def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
+    """Check the attitude against gravity, and the tilt."""
     quaternion = np.asarray(states[-1].orientation)
     norm = float(np.linalg.norm(quaternion))
     if not abs(norm - 1.0) <= NORM_SLACK:
@@ -119,47 +154,65 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
         )
 
 
-def _joints_and_battery(states: Sequence[State], robot: RobotSpec, limits: Limits) -> Iterator[str]:
-    last = states[-1]
+def _joints(state: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
+    """Check that every joint is in its range and at rest."""
     # Also of a sweep, whose own limit is tighter.
     overrun = robot.limits.overrun
     for i, joint in enumerate(robot.joints):
-        q, v = float(last.position[i]), float(last.velocity[i])
-        if not limits.joints.low[i] - overrun <= q <= limits.joints.high[i] + overrun:
+        position = float(state.position[i])
+        velocity = float(state.velocity[i])
+        low = limits.joints.low[i]
+        high = limits.joints.high[i]
+        if not low - overrun <= position <= high + overrun:
             yield (
-                f"{joint.name} is at {q:.2f} rad, outside {limits.joints.low[i]:.2f} to "
-                f"{limits.joints.high[i]:.2f} rad; zero its encoder."
+                f"{joint.name} is at {position:.2f} rad, outside {low:.2f} to {high:.2f} rad; zero "
+                "its encoder."
             )
-        if not abs(v) <= REST_SPEED:
-            yield f"{joint.name} turns at {v:.1f} rad/s; let the robot come to rest first."
-    least = BATTERY_SHARE * max(joint.drive.bus_voltage for joint in robot.joints)
-    volts = float(np.mean([state.bus_voltage for state in states]))
+        if not abs(velocity) <= REST_SPEED:
+            yield f"{joint.name} turns at {velocity:.1f} rad/s; let the robot come to rest first."
+
+
+def _battery(states: Sequence[State], robot: RobotSpec) -> Iterator[str]:
+    """Check the voltage of the battery."""
+    nominal = max(joint.drive.bus_voltage for joint in robot.joints)
+    lowest = BATTERY_SHARE * nominal
+    voltage = float(np.mean([state.bus_voltage for state in states]))
     # A link that does not carry the voltage gives 0 or NaN.
-    if 0.0 < volts < least:
-        yield f"the battery gives {volts:.1f} V, expected {least:.1f} V at least; charge it."
-    hot = last.temperature
-    for joint, degrees in zip(robot.joints, () if hot is None else hot, strict=hot is not None):
-        if degrees > limits.operating.temperature:
+    if 0.0 < voltage < lowest:
+        yield f"the battery gives {voltage:.1f} V, expected {lowest:.1f} V at least; charge it."
+
+
+def _temperatures(state: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
+    """Check the temperatures of the motors, where they are measured."""
+    if state.temperature is None:
+        return
+    hottest = limits.operating.temperature
+    for joint, degrees in zip(robot.joints, state.temperature, strict=True):
+        if degrees > hottest:
             yield (
-                f"the motor of {joint.name} has {degrees:.0f} deg C, expected "
-                f"{limits.operating.temperature:.0f} at most; let it cool."
+                f"the motor of {joint.name} has {degrees:.0f} deg C, expected {hottest:.0f} at "
+                "most; let it cool."
             )
 
 
-def delay_objection(latency_s: float, count: int, trained: tuple[float, float]) -> str:
-    """Why the policy must not start, from the latency measured while standing; "" if it may.
+def delay_objection(latency_s: float, count: int, trained_delay_s: tuple[float, float]) -> str:
+    """Return why the policy must not start, from the latency while standing; "" if it may.
 
     The latency from a state to the command computed from it is this computer's part of the command
     delay; the drives add theirs, so the lower end of the training range is not compared.
 
-    95 % of `count` steps were faster than `latency_s`; `trained` is the range of training [s].
+    Args:
+        latency_s: Latency than which 95 % of the steps were faster [s].
+        count: Number of steps.
+        trained_delay_s: Range of training [s].
     """
     if count < 10:
         return "the policy's process has sent no action yet; wait a moment or see the events."
-    if latency_s > trained[1]:
+    longest_s = trained_delay_s[1]
+    if latency_s > longest_s:
         return (
             f"state to command takes {1e3 * latency_s:.1f} ms (95 % of {count} steps), more than "
-            f"the {1e3 * trained[1]:.0f} ms that the policy was trained for; free the processor, "
+            f"the {1e3 * longest_s:.0f} ms that the policy was trained for; free the processor, "
             "grant real-time scheduling, or insist with --ignore-latency-check."
         )
     return ""

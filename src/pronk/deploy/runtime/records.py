@@ -194,12 +194,12 @@ REAL = "a real robot"
 
 
 def event_record(
-    time: float, kind: str, text: str, *, reason: int = 0, level: int = 0
+    time: float, event_kind: str, text: str, *, reason: int = 0, level: int = 0
 ) -> np.ndarray[Any, Any]:
     """Make a record of `EVENT`; the text is cut to `TEXT_SIZE` characters."""
     record = np.zeros((), dtype=EVENT)
     record["time"] = time
-    record["kind"] = kind
+    record["kind"] = event_kind
     record["reason"] = reason
     record["level"] = level
     record["text"] = text.encode("ascii", "replace")[:TEXT_SIZE]

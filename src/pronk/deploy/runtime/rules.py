@@ -67,7 +67,7 @@ class SafetyInput:
     """Stiffness of the command [N m/rad], (..., n)."""
     damping: Array
     """Damping of the command [N m s/rad], (..., n)."""
-    last: Array
+    previous: Array
     """Target sent a tick ago, or the measured position after damping [rad], (..., n)."""
     command_age: Array | float
     """Age of the command [s]."""
@@ -75,7 +75,7 @@ class SafetyInput:
     """Time after which the command expires [s]."""
     lag: Array | float
     """States between the newest and the one that the command was computed from."""
-    held: Mask | bool
+    dead_man: Mask | bool
     """Whether the dead-man button is held."""
 
 
@@ -106,7 +106,7 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
         checked.position, checked.velocity, checked.orientation, checked.gyro
     )
     command_is_finite, command = _finite(
-        checked.target, checked.stiffness, checked.damping, checked.last
+        checked.target, checked.stiffness, checked.damping, checked.previous
     )
     position = state[..., :n]
     velocity = state[..., n : 2 * n]
@@ -114,16 +114,16 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     target = command[..., :n]
     stiffness = command[..., n : 2 * n]
     damping = command[..., 2 * n : 3 * n]
-    last = command[..., 3 * n :]
+    previous = command[..., 3 * n :]
     state_age = np.asarray(checked.state_age)
     command_age = np.asarray(checked.command_age)
 
     # The target: held if the state is old, then moved into all limits.
     hold = state_age > ages.hold_s
     if hold.any():
-        target = np.where(hold[..., None], last, target)
+        target = np.where(hold[..., None], previous, target)
     limited, moved_by, possible = limit_targets(
-        position, velocity, target, last, stiffness, damping, limits
+        position, velocity, target, previous, stiffness, damping, limits
     )
 
     # The trunk's z axis against the world's: the last entry of the rotation matrix.
@@ -132,9 +132,9 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     upright = 1.0 - 2.0 * sideways / np.maximum(square, 0.5)
     least_upright = math.cos(min(limits.operating.tilt, math.pi)) - _SLACK
     # NaN, where a quantity is not measured, is within every limit.
-    least, largest = limits.measured
+    smallest, largest = limits.measured
     quantities = np.concatenate((position, velocity, checked.torque, checked.temperature), axis=-1)
-    outside = (quantities < least) | (quantities > largest)
+    outside = (quantities < smallest) | (quantities > largest)
     beyond = np.asarray(outside.reshape(*position.shape[:-1], 4, n).any(axis=-1))
     gains = command[..., n : 3 * n]
     bad_gains = ((gains < 0.0) | (gains > limits.gains)).any(axis=-1)
@@ -159,7 +159,7 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
         (Reason.TEMPERATURE, beyond[..., 3]),
         # After the measurements, which explain more.
         (Reason.IMPOSSIBLE, ~possible),
-        (Reason.DEAD_MAN, np.logical_not(checked.held)),
+        (Reason.DEAD_MAN, np.logical_not(checked.dead_man)),
         (Reason.OVERLOAD, beyond[..., 2]),
     )
     is_fault = np.empty((*moved_by.shape, len(faults)), dtype=np.bool_)
@@ -184,7 +184,7 @@ def limit_targets(
     position: Array,
     velocity: Array,
     target: Array,
-    last: Array,
+    previous: Array,
     stiffness: Array,
     damping: Array,
     limits: Limits,
@@ -201,7 +201,7 @@ def limit_targets(
         position: Measured positions [rad], (..., n).
         velocity: Measured velocities [rad/s], (..., n).
         target: Targets of the command [rad], (..., n).
-        last: Targets sent a tick ago [rad], (..., n).
+        previous: Targets sent a tick ago [rad], (..., n).
         stiffness: Stiffness of the command, not negative [N m/rad], (..., n).
         damping: Damping of the command, not negative [N m s/rad], (..., n).
         limits: Limits that apply.
@@ -221,8 +221,8 @@ def limit_targets(
     ceiling = np.where(ahead > highest, np.minimum(highest, position), highest)
     without_torque = position + damping * velocity / divisor
     reach = np.where(is_stiff, joints.torque / divisor, np.inf)
-    slowest = last - operating.change
-    fastest = last + operating.change
+    slowest = previous - operating.change
+    fastest = previous + operating.change
     least_torque = without_torque - reach
     largest_torque = without_torque + reach
     low = np.maximum(np.maximum(floor, slowest), least_torque)

@@ -235,7 +235,7 @@ class Deployment:
             record["request"] = command.request
             record["requests"] += 1
         record["time"] = time.monotonic()
-        record["held"] = command.held
+        record["held"] = command.dead_man
         record["jump"] = command.jump
         record["command"] = command.command
         # Replaced as a whole; the heartbeat alone writes to the mailbox.

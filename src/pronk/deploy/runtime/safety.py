@@ -47,7 +47,7 @@ class SafetyFilter:
         """Reason of the fault that lasts."""
         self.since = 0.0
         """Time at which it began [s]."""
-        self.last: Array | None = None
+        self.sent_target: Array | None = None
         """Target sent a tick ago [rad], (joints,); None after damping."""
         self.sensors = SensorHistory(joints, state_rate_hz)
         """States since the last damping."""
@@ -76,11 +76,11 @@ class SafetyFilter:
         over = self.faulted and t - self.since >= LEAST_DAMPING_S
         if over and (acknowledged or self.level is FilterAction.DAMP):
             self.reason = Reason.NONE
-            self.last = None
+            self.sent_target = None
 
     def damped(self) -> Decision:
         """Note a tick without a target; the next one is limited to near the measured position."""
-        self.last = None
+        self.sent_target = None
         self.sensors.begin()
         self.targets.begin()
         return Decision(self.reason)
@@ -91,7 +91,7 @@ class SafetyFilter:
         command: Command,
         t: float,
         *,
-        held: bool = True,
+        dead_man: bool = True,
         limits: Limits | None = None,
     ) -> tuple[Command | None, Decision]:
         """Apply the rules to one command.
@@ -101,7 +101,7 @@ class SafetyFilter:
                 them counts.
             command: The command before the filter.
             t: Time of the tick [s].
-            held: Whether the dead-man button is held.
+            dead_man: Whether the dead-man button is held.
             limits: Limits of this tick in place of the robot's own.
 
         Returns:
@@ -109,7 +109,7 @@ class SafetyFilter:
         """
         if limits is None:
             limits = self.limits
-        result = apply_rules(self._input(states, command, t, held), limits)
+        result = apply_rules(self._input(states, command, t, dead_man), limits)
         # A fault in any of the states decides; the newest if there is none.
         is_fault = result.level >= int(FilterAction.DAMP)
         row = int(np.argmax(is_fault)) if is_fault.any() else -1
@@ -124,9 +124,9 @@ class SafetyFilter:
             self.fault(decision.reason, t)
             self.damped()
             return None, Decision(self.reason, detail)
-        self.last = result.target[-1]
-        self.sensors.command(np.asarray(command.stiffness) * self.last)
-        return replace(command, position=self.last), decision
+        self.sent_target = result.target[-1]
+        self.sensors.command(np.asarray(command.stiffness) * self.sent_target)
+        return replace(command, position=self.sent_target), decision
 
     def _judge_history(
         self,
@@ -147,7 +147,7 @@ class SafetyFilter:
         return decision if persistent is None else persistent
 
     def _input(
-        self, states: Sequence[State], command: Command, t: float, held: bool
+        self, states: Sequence[State], command: Command, t: float, dead_man: bool
     ) -> SafetyInput:
         """Return the input of the rules; what has another shape becomes NaN."""
         n = len(self.limits.joints.names)
@@ -167,11 +167,11 @@ class SafetyFilter:
             target=_rows([command.position], n),
             stiffness=_rows([command.stiffness], n),
             damping=_rows([command.damping], n),
-            last=position[-1:] if self.last is None else self.last[None],
+            previous=position[-1:] if self.sent_target is None else self.sent_target[None],
             command_age=t - command.made,
             valid_for=float(command.valid_for),
             lag=lag,
-            held=held,
+            dead_man=dead_man,
         )
 
 

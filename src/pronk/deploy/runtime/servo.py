@@ -178,9 +178,9 @@ class Servo:
         gone = now - float(record["time"]) > timeout
         return bool(record["held"]) and not gone, gone
 
-    def _report(self, kind: str, text: str, *, reason: int = 0, level: int = 0) -> None:
+    def _report(self, event_kind: str, text: str, *, reason: int = 0, level: int = 0) -> None:
         """Send an event to logger and operator."""
-        record = event_record(time.monotonic(), kind, text, reason=reason, level=level)
+        record = event_record(time.monotonic(), event_kind, text, reason=reason, level=level)
         self.shared.events.put(record)
         self.shared.events_seen.put(record)
 
@@ -311,7 +311,7 @@ class Servo:
         self.age.add(max(0.0, begun - state.time))
         mode = self.modes.mode
         level = self.safety.level
-        held, gone = self._operator(begun)
+        dead_man, gone = self._operator(begun)
         fresh = self._read_action()
         # An action may be younger than the begin of a tick that was interrupted.
         now = time.monotonic()
@@ -349,7 +349,7 @@ class Servo:
                 self._new_states or [state],
                 desired.command,
                 now,
-                held=held or self.modes.mode is not Mode.POLICY,
+                dead_man=dead_man or self.modes.mode is not Mode.POLICY,
                 limits=limits,
             )
         send_error = self._send(machine, sent)

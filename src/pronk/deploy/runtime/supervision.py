@@ -333,13 +333,13 @@ def constant_while_others_moved(history: SensorHistory, limits: Limits) -> str:
     """Find a joint that is constant to the last bit while the other joints move.
 
     Rule: position and velocity have been constant for more than `repeat_s`, 40 ms, and the
-    displacements of the other joints since then are more than `others`, 0.05 rad, in sum. Only of a
-    robot that is free to move. Largest: 0.003 rad. False alarms: none in 10.02 h.
+    displacements of the other joints since then are more than `others_moved`, 0.05 rad, in sum.
+    Only of a robot that is free to move. Largest: 0.003 rad. False alarms: none in 10.02 h.
     """
     if not limits.trunk_is_free:
         return ""
     position_constant, velocity_constant = _constant(history, limits)
-    stopped = position_constant & velocity_constant & (history.others > limits.sensors.others)
+    stopped = position_constant & velocity_constant & (history.others > limits.sensors.others_moved)
     if stopped.any():
         i = int(np.argmax(stopped))
         name = limits.joints.names[i]

@@ -275,11 +275,13 @@ class SweepController:
             self._put(SampleKind.END, text=reason)
         self._logging = False
 
-    def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
+    def _put(
+        self, sample_kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = ""
+    ) -> None:
         """Put a record that is not a sample."""
         record = np.zeros(1, dtype=self._dtype)
         record["virtual"] = self.machine.virtual
-        record["kind"] = kind
+        record["kind"] = sample_kind
         record["number"] = number
         record["time"] = time
         record["text"] = text.encode("ascii", "replace")[:TEXT_SIZE]

@@ -30,18 +30,18 @@ class SweepLogs:
 
     def write(self, record: Record) -> None:
         """Write one record."""
-        kind = int(record["kind"])
+        sample_kind = int(record["kind"])
         number = int(record["number"])
         time = float(record["time"])
         text = bytes(record["text"]).decode("ascii")
         writer = self._writer
-        if kind == SampleKind.OPEN:
+        if sample_kind == SampleKind.OPEN:
             self._open(number, virtual=bool(record["virtual"]), torque_kind=text)
         elif writer is None:
             return
-        elif kind == SampleKind.SEGMENT:
+        elif sample_kind == SampleKind.SEGMENT:
             writer.segment(self._segment(number, time))
-        elif kind == SampleKind.END:
+        elif sample_kind == SampleKind.END:
             self.end(text)
         else:
             columns = self._columns

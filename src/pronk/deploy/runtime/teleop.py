@@ -31,7 +31,7 @@ class OperatorCommand:
     """Velocity command: forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
     jump: bool = False
     """Jump input."""
-    held: bool = False
+    dead_man: bool = False
     """Whether the dead-man button is held; without it the robot is damped while the policy runs."""
     request: OperatorRequest = OperatorRequest.NONE
     """A new request."""
@@ -44,7 +44,7 @@ class Operator:
         """Return the input now (CLOCK_MONOTONIC [s]), in a mode of the servo."""
         raise NotImplementedError
 
-    def notified(self, kind: str, text: str) -> None:
+    def notified(self, event_kind: str, text: str) -> None:
         """Receive an event of the servo."""
 
     def leave(self) -> None:
@@ -73,9 +73,11 @@ class ScriptedOperator(Operator):
         self._requested_in = Mode.ENDED
         self._over = False
 
-    def notified(self, kind: str, text: str) -> None:
+    def notified(self, event_kind: str, text: str) -> None:
         """End at a fault or refusal."""
-        if kind in ("fault", "refused") or (kind == "notice" and self._began is None):
+        if event_kind in ("fault", "refused"):
+            self._over = True
+        if event_kind == "notice" and self._began is None:
             self._over = True
 
     def leave(self) -> None:
@@ -89,7 +91,7 @@ class ScriptedOperator(Operator):
         if mode is Mode.DAMP:
             return OperatorCommand(request=self._once(OperatorRequest.STAND, mode))
         if mode is Mode.STAND:
-            return OperatorCommand(held=True, request=self._once(OperatorRequest.WALK, mode))
+            return OperatorCommand(dead_man=True, request=self._once(OperatorRequest.WALK, mode))
         if mode is Mode.POLICY:
             if self._began is None:
                 self._began = now
@@ -97,9 +99,9 @@ class ScriptedOperator(Operator):
             for script in self.scripts:
                 if 0.0 <= t < script.seconds:
                     command, jump = script.commanded(t)
-                    return OperatorCommand(command=command, jump=jump, held=True)
+                    return OperatorCommand(command=command, jump=jump, dead_man=True)
                 t -= script.seconds + _PAUSE_S
-        return OperatorCommand(held=True)
+        return OperatorCommand(dead_man=True)
 
     def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
         """Return a request, once in each mode."""
@@ -120,9 +122,9 @@ class BenchOperator(Operator):
         self.error: PronkError | None = None
         """Error for which joints could not be clamped; None if there was none."""
 
-    def notified(self, kind: str, text: str) -> None:
+    def notified(self, event_kind: str, text: str) -> None:
         """Have joints clamped."""
-        if kind == "clamp":
+        if event_kind == "clamp":
             joints = tuple(name for name in text.split(", ") if name)
             threading.Thread(target=self._clamp, args=(joints,), daemon=True).start()
 
@@ -130,7 +132,7 @@ class BenchOperator(Operator):
         """Return a held dead-man button; a request once joints are clamped, or cannot be."""
         request = self._request
         self._request = OperatorRequest.NONE
-        return OperatorCommand(held=True, request=request)
+        return OperatorCommand(dead_man=True, request=request)
 
     def _clamp(self, joints: tuple[str, ...]) -> None:
         """Have joints clamped, and request that the sweep goes on or ends; runs in a thread."""
@@ -153,9 +155,9 @@ class TimeLimit(Operator):
         self._began: float | None = None
         self._sat = False
 
-    def notified(self, kind: str, text: str) -> None:
+    def notified(self, event_kind: str, text: str) -> None:
         """Pass an event of the servo on."""
-        self._operator.notified(kind, text)
+        self._operator.notified(event_kind, text)
 
     def leave(self) -> None:
         """End, because the program was interrupted."""
@@ -176,9 +178,9 @@ class TimeLimit(Operator):
         if mode is Mode.DAMP:
             return OperatorCommand(request=OperatorRequest.QUIT)
         if mode is not Mode.POLICY or self._sat:
-            return OperatorCommand(held=command.held)
+            return OperatorCommand(dead_man=command.dead_man)
         self._sat = True
-        return OperatorCommand(held=command.held, request=OperatorRequest.SIT)
+        return OperatorCommand(dead_man=command.dead_man, request=OperatorRequest.SIT)
 
 
 HELP = """\
@@ -243,9 +245,9 @@ class Keyboard(Operator):
         with suppress(termios.error):
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._attributes)
 
-    def notified(self, kind: str, text: str) -> None:
+    def notified(self, event_kind: str, text: str) -> None:
         """Reset the velocity command when the mode changes."""
-        if kind == "mode":
+        if event_kind == "mode":
             self._command = [0.0, 0.0, 0.0]
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
@@ -267,11 +269,11 @@ class Keyboard(Operator):
                 self._jump_pressed = now
             elif key in _REQUESTS:
                 request = _REQUESTS[key]
-        forward, left, yaw = self._command
+        forward, sideways, yaw_rate = self._command
         return OperatorCommand(
-            command=(forward, left, yaw),
+            command=(forward, sideways, yaw_rate),
             jump=now - self._jump_pressed < JUMP_S,
-            held=now - self._dead_man_pressed < _REPEAT_S,
+            dead_man=now - self._dead_man_pressed < _REPEAT_S,
             request=request,
         )
 
@@ -324,5 +326,5 @@ class Gamepad(Operator):
         for button in pad.pressed:
             request = _PAD_REQUESTS.get(button, request)
         return OperatorCommand(
-            command=pad.velocity, jump=pad.jump, held=pad.dead_man, request=request
+            command=pad.velocity, jump=pad.jump, dead_man=pad.dead_man, request=request
         )
