@@ -149,8 +149,8 @@ def joint_prediction() -> JointPrediction:
         time=time,
         command=command,
         measured=command,
-        naive=np.where((time > 4.0) & (time < 5.0), 1.3, 1.0) * command,
-        naive_delayed=1.1 * command,
+        nominal=np.where((time > 4.0) & (time < 5.0), 1.3, 1.0) * command,
+        nominal_delayed=1.1 * command,
         matched=1.01 * command,
         signal="log_chirp",
     )

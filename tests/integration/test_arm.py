@@ -181,8 +181,8 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
     found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains, drive_gains="default")
     assert tuple(one.joint for one in found.joints) == JOINTS
     for one in found.joints:
-        assert one.rmse_matched < 0.7 * one.rmse_naive
-        assert one.r2_matched > one.r2_naive
+        assert one.rmse_matched < 0.7 * one.rmse_nominal
+        assert one.r2_matched > one.r2_nominal
     # The jaw moved too, on a scale that is not radians: left out, with the way out.
     assert "give the reader its travel in radians" in found.excluded["gripper"]
 

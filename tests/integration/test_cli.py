@@ -146,7 +146,7 @@ def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path
     accepted("predict", fresh, *gains, "--json", figures)
     prediction = json.loads(figures.read_text())
     (row,) = prediction["predictions"]
-    assert row["rmse_matched"] < 0.5 * row["rmse_naive"]
+    assert row["rmse_matched"] < 0.5 * row["rmse_nominal"]
     assert prediction["fitted_on"] == []
     accepted("report", matched)
     assert "FR_knee" in (matched / "report.html").read_text(encoding="utf-8")

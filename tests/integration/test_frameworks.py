@@ -52,7 +52,7 @@ def test_gains_of_a_framework_are_replayed_and_not_trained_with(tmp_path: Path) 
     assert load_gains(tmp_path / "gains.yaml").simulator == gains.simulator
     [joint] = predict(log, ROBOT, gains).joints
     assert joint.rmse_matched < 3e-4
-    assert joint.rmse_matched < 0.05 * joint.rmse_naive
+    assert joint.rmse_matched < 0.05 * joint.rmse_nominal
     with pytest.raises(ArtefactError, match="pronk translate"):
         training_gains(tmp_path / "gains.yaml", ROBOT)
 

@@ -58,6 +58,6 @@ def test_all_legs_at_once_are_matched_leg_by_leg(tmp_path: Path) -> None:
     for one in found.joints:
         errors = [
             rmse(simulated[later], one.measured[later])
-            for simulated in (one.naive, one.naive_delayed, one.matched)
+            for simulated in (one.nominal, one.nominal_delayed, one.matched)
         ]
         assert errors[2] < 0.8 * min(errors[:2])

@@ -37,7 +37,7 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert knee.stiffness.value == pytest.approx(21.8, abs=2 * 14 / 49)
     assert knee.damping.value == pytest.approx(0.541, abs=2 * 0.6 / 49)
     (replay,) = names["replay"].joints
-    assert replay.rmse_matched < 0.5 * replay.rmse_naive
+    assert replay.rmse_matched < 0.5 * replay.rmse_nominal
 
 
 def test_every_command_of_the_documentation_exists() -> None:

@@ -62,9 +62,9 @@ def test_gains_that_made_the_log_replay_it_and_naive_ones_do_not() -> None:
     for one in found.joints:
         assert one.signal == "chirp"
         assert one.rmse_matched < 1e-5
-        assert one.rmse_naive > 20 * one.rmse_matched
-        assert one.r2_matched > 0.9999 > one.r2_naive
-        assert len(one.time) == len(one.command) == len(one.measured) == len(one.naive)
+        assert one.rmse_nominal > 20 * one.rmse_matched
+        assert one.r2_matched > 0.9999 > one.r2_nominal
+        assert len(one.time) == len(one.command) == len(one.measured) == len(one.nominal)
 
 
 def test_matched_delay_is_applied_to_the_command() -> None:
@@ -74,15 +74,15 @@ def test_matched_delay_is_applied_to_the_command() -> None:
     for delayed, prompt in zip(late.joints, without.joints, strict=True):
         assert delayed.rmse_matched < 1e-5 < 0.05 * prompt.rmse_matched
         # The delay alone helps the naive gains too, and the table says by how much.
-        assert delayed.rmse_matched < delayed.rmse_naive_delayed < delayed.rmse_naive
-        assert prompt.rmse_naive_delayed == prompt.rmse_naive
+        assert delayed.rmse_matched < delayed.rmse_nominal_delayed < delayed.rmse_nominal
+        assert prompt.rmse_nominal_delayed == prompt.rmse_nominal
 
 
 def test_friction_of_the_gains_is_used() -> None:
     more = predict(two_joints(), ROBOT, gains("HR_knee", frictionloss=1.5)).joints[0]
     same = predict(two_joints(), ROBOT, gains("HR_knee")).joints[0]
     assert more.rmse_matched > 10 * same.rmse_matched
-    assert more.rmse_naive == same.rmse_naive
+    assert more.rmse_nominal == same.rmse_nominal
 
 
 def test_joint_without_gains_is_left_out_with_a_reason() -> None:

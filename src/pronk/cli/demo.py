@@ -206,7 +206,7 @@ def show_match(
         k_cell, d_cell = (axis[1] - axis[0] for axis in (one.grid_stiffness, one.grid_damping))
         cells[name] = abs(one.stiffness - k) / k_cell, abs(one.damping - d) / d_cell
         gains = (f"{one.stiffness:.2f} / {one.damping:.3f}", f"{k:g} / {d:g}")
-        errors = (one.naive_error_db, one.error_db, fresh.rmse_naive, fresh.rmse_matched)
+        errors = (one.naive_error_db, one.error_db, fresh.rmse_nominal, fresh.rmse_matched)
         apart = "{:.1f} / {:.1f}".format(*cells[name])
         row, column = np.unravel_index(int(np.nanargmin(one.grid_error)), one.grid_error.shape)
         magnitude = f"{one.grid_stiffness[row]:.2f} / {one.grid_damping[column]:.3f}"

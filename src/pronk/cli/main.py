@@ -31,10 +31,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "response": ("pronk.cli.response:response", "Estimate frequency responses; Bode plots."),
     "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
-    "predict": ("pronk.cli.predict:predict", "Replay logs that the fit has not used."),
+    "predict": ("pronk.cli.predict:predict_logs", "Replay logs that the fit has not used."),
     "export": ("pronk.cli.export:export_gains", "Write gains as configuration of a simulator."),
     "translate": (
-        "pronk.cli.translate:translate",
+        "pronk.cli.translate:translate_gains",
         "Translate gains for a framework of another drive law.",
     ),
     "probe": ("pronk.cli.probe:probe", "Name what a simulator makes of a joint's settings."),

@@ -12,12 +12,14 @@ import tyro
 from pronk.cli import console, options
 from pronk.cli.options import Reading
 from pronk.names import file_name
+from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
-    from pronk.identify.match.predict import JointPrediction
+    from pronk.identify.logs.joint_log import JointLog
+    from pronk.identify.match.predict import JointPrediction, Prediction
 
 
-def predict(
+def predict_logs(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str,
     gains: Path,
@@ -39,62 +41,114 @@ def predict(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         reading: How logs are read.
     """
-    from pronk.identify.match import gains as gains_file
-    from pronk.identify.match.predict import predict as predict_log
-    from pronk.identify.match.predict import save_prediction
-    from pronk.report import figures, style
+    from pronk.identify.match.gains import load_gains
+    from pronk.identify.match.predict import predict, save_prediction
     from pronk.robots import load_robot
 
-    known, matched = load_robot(robot), gains_file.load_gains(gains)
-    given, logs = options.drive_gains(drive_gains), reading.read(paths, known)
-    fitted = [
-        log.source
-        for log in logs
-        if log.origin.sha256 and log.origin.sha256 in matched.logs.values()
-    ]
+    robot_spec = load_robot(robot)
+    matched_gains = load_gains(gains)
+    stated_gains = options.drive_gains(drive_gains)
+    logs = reading.read(paths, robot_spec)
     folder = out if out is not None else gains.parent
     rows: list[dict[str, Any]] = []
-    written: list[Path] = []
+    fitted_logs: list[str] = []
+    wrote: list[Path] = []
     excluded: dict[str, str] = {}
     with console.progress() as report:
         done = report.bar("predict")
-        for i, log in enumerate(logs):
-            found = predict_log(
-                *(log, known, matched),
-                drive_gains=given,
+        for index, log in enumerate(logs):
+            prediction = predict(
+                log,
+                robot_spec,
+                matched_gains,
+                drive_gains=stated_gains,
                 simulator=simulator,
                 simulator_python=simulator_python,
             )
-            excluded |= found.excluded
-            stem = Path(log.source or "log").stem
-            path = folder / f"{stem}.prediction.npz"
-            save_prediction(path, replace(found, source=Path(log.source).name))
-            written.append(path)
-            for one in found.joints:
-                own = file_name(one.joint)
-                name = stem if stem == own else f"{stem}.{own}"
-                figure = figures.prediction(one, virtual=log.virtual)
-                written.append(style.save(figure, folder / f"{name}.prediction.svg"))
-            rows += [row | {"log": log.source} for row in prediction_rows(found.joints)]
-            done((i + 1) / len(logs))
+            excluded |= prediction.excluded
+            path = folder / f"{_stem(log)}.prediction.npz"
+            save_prediction(path, replace(prediction, source=Path(log.source).name))
+            wrote.append(path)
+            wrote.extend(_save_figures(prediction, log, folder))
+            for row in prediction_rows(prediction.joints):
+                rows.append({**row, "log": log.source})
+            if log.origin.sha256 and log.origin.sha256 in matched_gains.logs.values():
+                fitted_logs.append(log.source)
+            done((index + 1) / len(logs))
+
     virtual = any(log.virtual for log in logs)
-    columns = "joint | signal | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
-    cells = [list(row.values())[:-1] for row in rows]
-    title = "Replayed logs of the virtual robot" if virtual else "Replayed logs"
-    console.show_table(f"{columns} | R2 nominal | R2 matched", cells, title=title)
-    for source in fitted:
+    console.show(prediction_table(rows, virtual=virtual))
+    for source in fitted_logs:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for reason in excluded.values():
         console.say(f"left out: {reason}")
-    shown = f"pronk report {folder}   # puts these replays on the page"
+    following = []
+    if (folder / "match.npz").exists():
+        following.append(f"pronk report {folder}   # puts these replays on the page")
     return console.Outcome(
-        figures={"predictions": rows, "fitted_on": fitted, "excluded": excluded},
-        wrote=written,
-        following=[shown] if (folder / "match.npz").exists() else [],
+        figures={"predictions": rows, "fitted_on": fitted_logs, "excluded": excluded},
+        wrote=wrote,
+        following=following,
     )
 
 
-def prediction_rows(found: Iterable[JointPrediction]) -> list[dict[str, Any]]:
-    """Figures of replays, for the table and for JSON."""
-    names = ("joint", "signal", "unit", "rmse_naive", "rmse_naive_delayed", "rmse_matched")
-    return [{n: getattr(one, n) for n in (*names, "r2_naive", "r2_matched")} for one in found]
+def prediction_rows(joints: Iterable[JointPrediction]) -> list[dict[str, Any]]:
+    """Return the figures of some predicted joints, for the table and for JSON."""
+    rows = []
+    for joint in joints:
+        row = {
+            "joint": joint.joint,
+            "signal": joint.signal,
+            "unit": joint.unit,
+            "rmse_nominal": joint.rmse_nominal,
+            "rmse_nominal_delayed": joint.rmse_nominal_delayed,
+            "rmse_matched": joint.rmse_matched,
+            "r2_nominal": joint.r2_nominal,
+            "r2_matched": joint.r2_matched,
+        }
+        rows.append(row)
+    return rows
+
+
+PREDICTION_COLUMNS = {
+    "joint": Column(heading="joint"),
+    "signal": Column(heading="signal"),
+    "unit": Column(heading="unit"),
+    "rmse_nominal": Column(heading="RMSE nominal", digits=4),
+    "rmse_nominal_delayed": Column(heading="nominal with the delay", digits=4),
+    "rmse_matched": Column(heading="RMSE matched", digits=4),
+    "r2_nominal": Column(heading="R2 nominal"),
+    "r2_matched": Column(heading="R2 matched"),
+}
+"""Columns of the table, by the figures of `prediction_rows`."""
+
+
+def prediction_table(rows: Iterable[dict[str, Any]], *, virtual: bool) -> Table:
+    """Return the table of predicted joints."""
+    cells = []
+    for row in rows:
+        cells.append(tuple(row[name] for name in PREDICTION_COLUMNS))
+    return Table(
+        title="Replayed logs of the virtual robot" if virtual else "Replayed logs",
+        columns=tuple(PREDICTION_COLUMNS.values()),
+        rows=tuple(cells),
+    )
+
+
+def _stem(log: JointLog) -> str:
+    """Return the beginning of the names of a log's files."""
+    return Path(log.source or "log").stem
+
+
+def _save_figures(prediction: Prediction, log: JointLog, folder: Path) -> list[Path]:
+    """Draw each predicted joint of a log; return the files."""
+    from pronk.report import figures, style
+
+    stem = _stem(log)
+    wrote = []
+    for joint in prediction.joints:
+        joint_name = file_name(joint.joint)
+        name = stem if stem == joint_name else f"{stem}.{joint_name}"
+        figure = figures.prediction(joint, virtual=log.virtual)
+        wrote.append(style.save(figure, folder / f"{name}.prediction.svg"))
+    return wrote

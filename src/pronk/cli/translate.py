@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
 from pronk.cli import console, options
 from pronk.errors import PronkError
+from pronk.tables import Cell, Column, Table
+
+if TYPE_CHECKING:
+    from pronk.identify.match.gains import MatchedGains
+    from pronk.identify.match.translate import JointTranslation
+    from pronk.identify.simulators.profiles import Profile
+    from pronk.robots.robot import RobotSpec
+
+COLUMNS = (
+    Column(heading="framework"),
+    Column(heading="law"),
+    Column(heading="step", unit="ms", digits=1),
+    Column(heading="group"),
+    Column(heading="stiffness", unit="N m/rad"),
+    Column(heading="damping", unit="N m s/rad"),
+    Column(heading="untranslated", unit="dB"),
+    Column(heading="translated", unit="dB"),
+    Column(heading="responds earlier", unit="ms", digits=2),
+    Column(heading="left early", unit="ms", digits=2),
+)
 
 
-def translate(
+def translate_gains(
     to: tuple[str, ...],
     gains: tyro.conf.Positional[Path | None] = None,
     begin: Annotated[str | None, tyro.conf.arg(name="from")] = None,
@@ -33,69 +54,134 @@ def translate(
             GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         out: The gains file to write.
     """
-    from pronk.identify.match import gains as gains_file
-    from pronk.identify.match import translate as translation
-    from pronk.identify.match.export.actuators import profile_held, robot_of
-    from pronk.identify.match.measured_joint import gains_by_joint
-    from pronk.identify.simulators.profiles import load_profiles, profile
-    from pronk.robots import load_robot
+    from pronk.identify.match.export.actuators import profile_held
+    from pronk.identify.match.gains import save_gains
+    from pronk.identify.match.translate import translate
+    from pronk.identify.simulators.profiles import profile
 
-    stated = options.drive_gains(drive_gains)
     if gains is None:
-        if not (robot and begin and stated):
-            raise PronkError(
-                "there are no gains to translate; give a gains.yaml, or --robot, --from and "
-                "--drive-gains NAME=STIFFNESS,DAMPING."
-            )
-        known = load_robot(robot)
-        first = translation.stated_gains(known, gains_by_joint(known, stated), profile(begin))
+        first, robot_spec = _stated_gains(robot, begin, drive_gains)
     else:
-        if stated:
-            raise PronkError("give a gains file or --drive-gains, not both.")
-        first = gains_file.load_gains(gains)
-        known = load_robot(robot) if robot else robot_of(first)
-        if begin and profile(begin) != (held := profile_held(first)):
-            raise PronkError(
-                f"{gains} holds for {held.name} at "
-                f"{1000.0 * first.simulator.timestep_s:g} ms, not for {begin}; leave --from out."
-            )
-    origin = profile_held(first)
-    names = [name for one in to for name in (load_profiles() if one == "all" else [one])]
-    rows: list[list[Any]] = []
-    wrote, figures = [], {}
-    for name in dict.fromkeys(names):
-        target = profile(name)
-        found, changes = translation.translate(first, known, target)
+        first, robot_spec = _gains_of_file(gains, robot, begin, drive_gains)
+    first_profile = profile_held(first)
+    names = _framework_names(to)
+    rows: list[tuple[Cell, ...]] = []
+    wrote = []
+    figures: dict[str, dict[str, Any]] = {}
+    for name in names:
+        target_profile = profile(name)
+        translated, translations = translate(first, robot_spec, target_profile)
         path = out if len(names) == 1 else out.parent / name / out.name
-        gains_file.save_gains(path, found)
+        save_gains(path, translated)
         wrote.append(path)
-        figures[name] = {joint: asdict(one) for joint, one in changes.items()}
-        for group in found.groups:
-            members = [one for joint, one in changes.items() if known.joint(joint).group == group]
-            kp, kd = np.mean([one.after for one in members], axis=0).tolist()
-            fields = ("before_db", "after_db", "lead_s", "rest_s")
-            values = [float(np.mean([getattr(one, field) for one in members])) for field in fields]
-            law, step = target.drive_law.label, 1000.0 * target.timestep_s
-            ms = (1000.0 * value for value in values[2:])
-            rows.append([name, law, step, group, kp, kd, *values[:2], *ms])
-        for joint, one in found.joints.items():
-            for flag in one.flags:
+        figures[name] = {}
+        for joint, translation in translations.items():
+            figures[name][joint] = asdict(translation)
+        for group in translated.groups:
+            members = []
+            for joint, translation in translations.items():
+                if robot_spec.joint(joint).group == group:
+                    members.append(translation)
+            rows.append(_group_row(name, target_profile, group, members))
+        for joint, joint_gains in translated.joints.items():
+            for flag in joint_gains.flags:
                 console.warn(f"{name}, {joint}: {flag}.")
-        if origin.friction == "N m" != target.friction:
-            console.warn(f"{name} has no dry friction in N m: the joints lose theirs.")
-        elif target.friction == "N m" != origin.friction:
-            console.warn(f"the gains hold without dry friction: set none in {name}.")
-    console.show_table(
-        "framework | law | step [ms];1 | group | stiffness [N m/rad] | damping [N m s/rad] | "
-        "untranslated [dB] | translated [dB] | responds earlier [ms];2 | left early [ms];2",
-        rows,
-        "Means of each group. dB: RMS of the magnitude in the band over that of "
-        f"{origin.name}, law {origin.drive_law.label} at {1000.0 * origin.timestep_s:g} ms.",
-        "What responds earlier is added to the delay of the gains file.",
+        _warn_of_friction(name, first_profile, target_profile)
+
+    law = f"law {first_profile.drive_law.label} at {1000.0 * first_profile.timestep_s:g} ms"
+    table = Table(
         title="The same joint in other frameworks",
+        columns=COLUMNS,
+        rows=tuple(rows),
+        notes=(
+            "Means of each group. dB: RMS of the magnitude in the band over that of "
+            f"{first_profile.name}, {law}.",
+            "What responds earlier is added to the delay of the gains file.",
+        ),
     )
+    console.show(table)
     return console.Outcome(
         figures={"translated": figures},
         wrote=wrote,
         following=[f"pronk export {wrote[0]} --to mjcf --out robot.xml"],
     )
+
+
+def _stated_gains(
+    robot: str | None, begin: str | None, drive_gains: Sequence[str]
+) -> tuple[MatchedGains, RobotSpec]:
+    """Return the gains that the options state, and the robot."""
+    from pronk.identify.match.measured_joint import gains_by_joint
+    from pronk.identify.match.translate import stated_gains
+    from pronk.identify.simulators.profiles import profile
+    from pronk.robots import load_robot
+
+    pairs = options.drive_gains(tuple(drive_gains))
+    if not (robot and begin and pairs):
+        raise PronkError(
+            "there are no gains to translate; give a gains.yaml, or --robot, --from and "
+            "--drive-gains NAME=STIFFNESS,DAMPING."
+        )
+    robot_spec = load_robot(robot)
+    by_joint = gains_by_joint(robot_spec, pairs)
+    return stated_gains(robot_spec, by_joint, profile(begin)), robot_spec
+
+
+def _gains_of_file(
+    path: Path, robot: str | None, begin: str | None, drive_gains: Sequence[str]
+) -> tuple[MatchedGains, RobotSpec]:
+    """Return the gains of a file and the robot; refuse options that contradict the file."""
+    from pronk.identify.match.export.actuators import profile_held, robot_of
+    from pronk.identify.match.gains import load_gains
+    from pronk.identify.simulators.profiles import profile
+    from pronk.robots import load_robot
+
+    if drive_gains:
+        raise PronkError("give a gains file or --drive-gains, not both.")
+    gains = load_gains(path)
+    robot_spec = load_robot(robot) if robot else robot_of(gains)
+    if begin:
+        held_profile = profile_held(gains)
+        if profile(begin) != held_profile:
+            raise PronkError(
+                f"{path} holds for {held_profile.name} at "
+                f"{1000.0 * gains.simulator.timestep_s:g} ms, not for {begin}; leave --from out."
+            )
+    return gains, robot_spec
+
+
+def _framework_names(to: Sequence[str]) -> list[str]:
+    """Return each named framework once; `all` names every profile."""
+    from pronk.identify.simulators.profiles import load_profiles
+
+    names: list[str] = []
+    for name in to:
+        names.extend(load_profiles() if name == "all" else [name])
+    return list(dict.fromkeys(names))
+
+
+def _group_row(
+    name: str, profile: Profile, group: str, members: Sequence[JointTranslation]
+) -> tuple[Cell, ...]:
+    """Return the row of a joint group, with the means of its joints."""
+    stiffness, damping = np.mean([member.after for member in members], axis=0).tolist()
+    return (
+        name,
+        profile.drive_law.label,
+        1000.0 * profile.timestep_s,
+        group,
+        stiffness,
+        damping,
+        float(np.mean([member.before_db for member in members])),
+        float(np.mean([member.after_db for member in members])),
+        1000.0 * float(np.mean([member.lead_s for member in members])),
+        1000.0 * float(np.mean([member.rest_s for member in members])),
+    )
+
+
+def _warn_of_friction(name: str, first: Profile, target: Profile) -> None:
+    """Warn where one of two frameworks has no dry friction as a torque."""
+    if first.friction == "N m" and target.friction != "N m":
+        console.warn(f"{name} has no dry friction in N m: the joints lose theirs.")
+    elif first.friction != "N m" and target.friction == "N m":
+        console.warn(f"the gains hold without dry friction: set none in {name}.")

@@ -311,7 +311,7 @@ def busiest_window(prediction: JointPrediction, seconds: float) -> slice:
     """Return the window of this length in which the nominal simulation's error varies most."""
     rate = (len(prediction.time) - 1) / float(prediction.time[-1] - prediction.time[0])
     width = min(max(2, round(seconds * rate)), len(prediction.time))
-    error = prediction.naive - prediction.measured
+    error = prediction.nominal - prediction.measured
     total, power = (np.concatenate(([0.0], np.cumsum(error**n))) for n in (1, 2))
     mean, square = ((one[width:] - one[:-width]) / width for one in (total, power))
     start = int(np.argmax(square - mean**2))
@@ -328,8 +328,11 @@ def prediction(found: JointPrediction, *, virtual: bool) -> Figure:
         top.step(time, found.command[window], where="post", **command)
         top.plot(time, measured, **style.MEASURED_LINE)
         bottom.axhline(0.0, color="#666666", linewidth=0.8)
-        for name, look in (("naive", style.NAIVE_LINE), ("matched", style.MATCHED_LINE)):
-            values = getattr(found, name)[window]
+        for simulated, look in (
+            (found.nominal, style.NAIVE_LINE),
+            (found.matched, style.MATCHED_LINE),
+        ):
+            values = simulated[window]
             top.plot(time, values, **look)
             bottom.plot(time, values - measured, **look)
         top.set_ylabel(f"position [{found.unit}]")
@@ -337,7 +340,7 @@ def prediction(found: JointPrediction, *, virtual: bool) -> Figure:
         top.set_title(f"{style.joint_words(found.joint)}: prediction of a {signal}")
         bottom.set(ylabel=f"error [{found.unit}]", xlabel="time [s]", xlim=(time[0], time[-1]))
         keys = [key("command", **command), key(measured_words(virtual), **style.MEASURED_LINE)]
-        keys.append(key(f"nominal: RMSE {found.rmse_naive:.4f}", **style.NAIVE_LINE))
+        keys.append(key(f"nominal: RMSE {found.rmse_nominal:.4f}", **style.NAIVE_LINE))
         keys.append(key(f"matched: RMSE {found.rmse_matched:.4f}", **style.MATCHED_LINE))
         legend(figure, keys, 4)
     return figure

@@ -291,9 +291,9 @@ def _prediction_section(found: Prediction) -> dict[str, Any]:
     by_joint, rows = {one.joint: one for one in found.joints}, []
     first = figures.knees_first(list(by_joint))[0]
     for one in found.joints:
-        errors = (one.rmse_naive, one.rmse_naive_delayed, one.rmse_matched)
-        ratio = one.rmse_matched / one.rmse_naive if one.rmse_naive > 0.0 else None
-        fits = (one.r2_naive, one.r2_matched)
+        errors = (one.rmse_nominal, one.rmse_nominal_delayed, one.rmse_matched)
+        ratio = one.rmse_matched / one.rmse_nominal if one.rmse_nominal > 0.0 else None
+        fits = (one.r2_nominal, one.r2_matched)
         rows.append((joint_words(one.joint), one.unit, *errors, ratio, *fits))
     columns = "joint | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
     columns += " | matched / nominal;2 | R² nominal | R² matched"

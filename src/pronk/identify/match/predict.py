@@ -1,10 +1,10 @@
-"""Replay a log that the fit never saw, with naive and with matched gains.
+"""Prediction of a log that no fit has used, with nominal and with matched gains.
 
-The commands of the log go to the training simulator, held from each measured timestamp to the
-next, and the simulated position is read at the measured timestamps. The naive column is the very
-same simulation with the gains on the real drive (the log's, or else the robot's published
-figures) put into the simulator, with no delay; a third column gives it the delay of the matched
-gains. No column gets a zero offset: an encoder that is off costs all the same.
+The commands of the log go to the simulator, held from each measured timestamp to the next, and the
+simulated position is read at the measured timestamps. The nominal gains are those on the real
+drive (the log's, or else the robot's published figures), put into the simulator with no delay; a
+third simulation gives them the delay of the matched gains. No simulation gets a zero offset: an
+encoder that is off is an error of all three.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,7 +22,6 @@ from pronk.files import load_artefact, save_artefact
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains
 from pronk.identify.match.measured_joint import DriveGains, gains_on_drive, rms, with_drive_gains
-from pronk.identify.match.parameters import GAINS
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.chain import (
     ChainSimulation,
@@ -38,61 +36,97 @@ from pronk.identify.simulators.profiles import profile_of
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
 
-SCHEMA = "pronk/prediction/2"
-_WITHOUT_GAINS = (
+SCHEMA = "pronk/prediction/3"
+WITHOUT_GAINS = (
     "{} is left out: the gains have no entry for it; match a log in which it is excited."
 )
+"""Reason for which a joint is not predicted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointPrediction:
-    """One joint's response to a log, measured and simulated, at the log's timestamps."""
+    """Measured and simulated response of one joint, at the timestamps of the log."""
 
     joint: str
+    """Name of the joint."""
     time: Array
-    """Instants at which the joint was excited, all segments in a row [s], shape (n,)."""
+    """Instants at which the joint was excited, one excitation after another [s], shape (n,)."""
     command: Array
     """Position command in force [rad], shape (n,)."""
     measured: Array
-    """[rad], shape (n,)."""
-    naive: Array
-    """Simulated with the gains of the real drive [rad], shape (n,)."""
-    naive_delayed: Array
-    """The same with the delay that goes with the matched gains [rad], shape (n,): what the gains
-    alone are worth."""
+    """Measured position [rad], shape (n,)."""
+    nominal: Array
+    """Position simulated with the gains of the real drive [rad], shape (n,)."""
+    nominal_delayed: Array
+    """Position simulated with the gains of the real drive and the delay of the matched gains
+    [rad], shape (n,). Its error beside that with the matched gains shows what the gains alone are
+    worth."""
     matched: Array
-    """Simulated with the matched gains and their delay [rad], shape (n,)."""
+    """Position simulated with the matched gains and their delay [rad], shape (n,)."""
     signal: str = "unknown"
-    """Kind of the signal that was replayed."""
+    """Kind of the signal that was replayed, as of `Segment.kind`."""
     unit: str = "rad"
+    """Unit of the positions."""
 
-    rmse_naive = property(lambda self: rmse(self.naive, self.measured))
-    rmse_naive_delayed = property(lambda self: rmse(self.naive_delayed, self.measured))
-    rmse_matched = property(lambda self: rmse(self.matched, self.measured))
-    r2_naive = property(lambda self: r2(self.naive, self.measured))
-    r2_matched = property(lambda self: r2(self.matched, self.measured))
+    @property
+    def rmse_nominal(self) -> float:
+        """Root mean square error with the nominal gains [rad]."""
+        return rmse(self.nominal, self.measured)
+
+    @property
+    def rmse_nominal_delayed(self) -> float:
+        """Root mean square error with the nominal gains and the matched delay [rad]."""
+        return rmse(self.nominal_delayed, self.measured)
+
+    @property
+    def rmse_matched(self) -> float:
+        """Root mean square error with the matched gains [rad]."""
+        return rmse(self.matched, self.measured)
+
+    @property
+    def r2_nominal(self) -> float:
+        """Coefficient of determination with the nominal gains."""
+        return r2(self.nominal, self.measured)
+
+    @property
+    def r2_matched(self) -> float:
+        """Coefficient of determination with the matched gains."""
+        return r2(self.matched, self.measured)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """All joints of one log."""
+    """Predictions of all joints of one log."""
 
     joints: tuple[JointPrediction, ...]
+    """Predicted joints, in the robot's order."""
     source: str
+    """File or link that the log came from."""
     virtual: bool
+    """True if the log came from pronk's virtual robot."""
     excluded: Mapping[str, str] = field(default_factory=dict)
-    """Joints that moved and were not predicted, and why."""
+    """Joints that moved and were not predicted, with the reason for each."""
+
+    def __repr__(self) -> str:
+        """Name the log and the errors of its joints."""
+        errors = [f"{joint.joint} {joint.rmse_matched:.4g} {joint.unit}" for joint in self.joints]
+        return f"<Prediction of {self.source or 'log'}: RMSE matched {', '.join(errors)}>"
 
 
 def rmse(simulated: Array, measured: Array) -> float:
-    """Root mean square difference."""
+    """Return the root mean square difference of two arrays of one shape."""
     return rms(simulated - measured)
 
 
 def r2(simulated: Array, measured: Array) -> float:
-    """One less the share of the measured variance that is left over; NaN for a still joint."""
-    spread = float(np.var(measured))
-    return float(1.0 - np.mean((simulated - measured) ** 2) / spread) if spread else float("nan")
+    """Return the coefficient of determination, `1 - mean((simulated - measured)^2) / var`.
+
+    NaN for a measured position that does not move.
+    """
+    variance = float(np.var(measured))
+    if variance == 0.0:
+        return float("nan")
+    return float(1.0 - np.mean((simulated - measured) ** 2) / variance)
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
@@ -101,7 +135,7 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_prediction(path: Path) -> Prediction:
-    """Read what `save_prediction` wrote; ArtefactError for another file."""
+    """Read what `save_prediction` wrote; an ArtefactError says why another file is not one."""
     return load_artefact(path, Prediction, SCHEMA, what="a prediction", writer="pronk predict LOG")
 
 
@@ -111,18 +145,39 @@ def predict(
     gains: MatchedGains,
     *,
     drive_gains: DriveGains | None = None,
-    threads: int = 2,
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
+    threads: int = 2,
 ) -> Prediction:
-    """Simulate a log with naive and with matched gains.
+    """Simulate a log with nominal and with matched gains.
 
-    Where several joints move at once each chain of them is simulated; otherwise each segment
-    of each joint by itself, the rest held as on the rig.
+    Where several joints move at once each chain of them is simulated; otherwise each excitation of
+    each joint by itself, with the other joints held as on the rig.
+
+    Args:
+        log: A log that the gains were not matched with.
+        robot: The robot.
+        gains: Matched gains.
+        drive_gains: Stiffness and damping on the real drives by joint or joint group, where the
+            log does not have them; or `default`, those of the robot's file.
+        simulator: `mujoco`, `FILE.py:NAME`, or the name of an installed simulator. MuJoCo computes
+            the drive law of the framework that the gains hold for.
+        simulator_python: Python that the simulator runs in, if it is another.
+        threads: Simulations at once.
+
+    Returns:
+        Measured and simulated position of every excited joint that has matched gains.
 
     Raises:
-        LogError: The log excites no joint that has matched gains, or the robots differ.
+        LogError: The log excites no joint that has matched gains, or is of another robot.
         PronkError: The simulator is unknown, or cannot replay joints that move together.
+
+    Example:
+        >>> import pronk
+        >>> robot = pronk.load_robot("mini_cheetah")
+        >>> result = pronk.match([pronk.read_log("logs/FR_knee.mcap", robot=robot)], robot)
+        >>> fresh = pronk.read_log("fresh/FR_knee.mcap", robot=robot)
+        >>> pronk.predict(fresh, robot, result.gains).joints[0].rmse_matched
     """
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
@@ -135,10 +190,10 @@ def predict(
                 f"{log.source or 'log'}: several joints move at once, which only simulator mujoco "
                 f"replays, not {simulator}."
             )
-        joints, excluded = _together(log, robot, drives_of(robot, gains), threads)
+        joints, excluded = _predict_chains(log, robot, drives_of(robot, gains), threads)
     else:
         with joint_rigs(simulator, robot, threads=threads, python=simulator_python) as rigs:
-            joints, excluded = _joint_by_joint(log, rigs, drives_of(rigs.robot, gains))
+            joints, excluded = _predict_joints(log, rigs, drives_of(rigs.robot, gains))
     if not joints:
         reasons = " ".join(excluded.values()) or "no joint is excited in it."
         raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
@@ -166,87 +221,134 @@ def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, dict[str, floa
     return drives
 
 
-def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:
-    """The published drive, with the gains that were on it."""
-    pair = gains_on_drive(log, name, robot)
-    return published(robot, name) | dict(zip(GAINS, pair, strict=True))
+def _nominal_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:
+    """Return the published drive of a joint, with the gains that were on it in a log."""
+    drive = published(robot, name)
+    drive["stiffness"], drive["damping"] = gains_on_drive(log, name, robot)
+    return drive
 
 
-def _together(
+def _predict_chains(
     log: JointLog, robot: RobotSpec, matched: DriveValues, threads: int
 ) -> tuple[list[JointPrediction], dict[str, str]]:
-    """Chain by chain; joints, and why others are left out."""
-    joints: list[JointPrediction] = []
-    left_out: dict[str, str] = {}
-    kinds = {name: s.kind for s in log.segments for name in s.joints}
+    """Predict joints that move together, chain by chain.
+
+    Returns:
+        Predictions, and the reason for each joint that is left out.
+    """
+    predictions: list[JointPrediction] = []
+    excluded: dict[str, str] = {}
+    signals = {}
+    for segment in log.segments:
+        for name in segment.joints:
+            signals[name] = segment.kind
     for branch in branches([log], robot):
-        with ChainSimulation(robot, [log], joints=branch, threads=threads) as arm:
-            naive = {name: _on_drive(log, robot, name) for name in arm.joints}
-            late = {
-                name: drive | {"delay": matched[name]["delay"]} if name in matched else drive
-                for name, drive in naive.items()
-            }
-            simulated = [positions for (positions,) in arm.run([naive, late, matched])]
-        left_out |= arm.excluded
-        for i, name in enumerate(arm.joints):
+        with ChainSimulation(robot, [log], joints=branch, threads=threads) as chain:
+            nominal = {name: _nominal_drive(log, robot, name) for name in chain.joints}
+            nominal_delayed = {}
+            for name, drive in nominal.items():
+                delay = matched[name]["delay"] if name in matched else drive["delay"]
+                nominal_delayed[name] = drive | {"delay": delay}
+            runs = chain.run([nominal, nominal_delayed, matched])
+        # One log was simulated, with three sets of drives.
+        nominal_position, delayed_position, matched_position = (run[0] for run in runs)
+        excluded |= chain.excluded
+        for index, name in enumerate(chain.joints):
             if name not in matched:
-                left_out[name] = _WITHOUT_GAINS.format(name)
+                excluded[name] = WITHOUT_GAINS.format(name)
                 continue
-            joints.append(
-                JointPrediction(
-                    joint=name,
-                    time=log.time,
-                    command=log.command[:, log.column(name)],
-                    measured=log.position[:, log.column(name)],
-                    naive=simulated[0][:, i],
-                    naive_delayed=simulated[1][:, i],
-                    matched=simulated[2][:, i],
-                    signal=kinds.get(name, "unknown"),
-                )
+            column = log.column(name)
+            prediction = JointPrediction(
+                joint=name,
+                time=log.time,
+                command=log.command[:, column],
+                measured=log.position[:, column],
+                nominal=nominal_position[:, index],
+                nominal_delayed=delayed_position[:, index],
+                matched=matched_position[:, index],
+                signal=signals.get(name, "unknown"),
             )
-    return joints, left_out
+            predictions.append(prediction)
+    return predictions, excluded
 
 
-def _joint_by_joint(
+def _predict_joints(
     log: JointLog, rigs: JointRigs, matched: DriveValues
 ) -> tuple[list[JointPrediction], dict[str, str]]:
-    """One joint after the other, segment by segment; returns as `_together`."""
-    joints, left_out = [], {}
+    """Predict joints that move one after another, excitation by excitation.
+
+    Returns:
+        Predictions, and the reason for each joint that is left out.
+    """
+    predictions = []
+    excluded = {}
     for name in rigs.robot.joint_names:
-        mine = []
-        if name in log.excited_joints:
-            mine = sorted(log.excitations(name), key=lambda excitation: excitation.segment.start)
-        if mine and name not in matched:
-            left_out[name] = _WITHOUT_GAINS.format(name)
-        elif mine:
-            parts = [_replay(excitation, rigs, matched[name]) for excitation in mine]
-            rows: dict[str, Any] = {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
-            joints.append(JointPrediction(joint=name, signal=mine[0].segment.kind, **rows))
-    return joints, left_out
+        if name not in log.excited_joints:
+            continue
+        if name not in matched:
+            excluded[name] = WITHOUT_GAINS.format(name)
+            continue
+        excitations = sorted(log.excitations(name), key=lambda excitation: excitation.segment.start)
+        parts = [_predict_excitation(excitation, rigs, matched[name]) for excitation in excitations]
+        predictions.append(_joined(parts))
+    return predictions, excluded
 
 
-def _replay(part: Excitation, rigs: JointRigs, best: Mapping[str, float]) -> dict[str, Array]:
-    """The arrays of `JointPrediction` for an excitation."""
-    trace, late = command_trace(part, rigs.robot), best["delay"]
-    delayed = trace
-    if late:
-        edges = np.append(trace.time, trace.time[-1] + trace.timestep) - late
-        delayed = replace(trace, command=held_mean(trace.time, trace.command, edges))
-    real = _on_drive(part.log, rigs.robot, part.joint)
-    own = [n for n in ("armature", "frictionloss") if n in rigs.parameters]
+def _predict_excitation(
+    excitation: Excitation, rigs: JointRigs, matched: Mapping[str, float]
+) -> JointPrediction:
+    """Predict one excitation of one joint."""
+    trace = command_trace(excitation, rigs.robot)
+    delayed_trace = trace
+    if matched["delay"]:
+        edges = np.append(trace.time, trace.time[-1] + trace.timestep)
+        delayed_command = held_mean(trace.time, trace.command, edges - matched["delay"])
+        delayed_trace = replace(trace, command=delayed_command)
+
+    nominal = _nominal_drive(excitation.log, rigs.robot, excitation.joint)
+    gain_names = ["stiffness", "damping"]
+    drive_names = [*gain_names]
+    for name in ("armature", "frictionloss"):
+        if name in rigs.parameters:
+            drive_names.append(name)
+
     # The last state is that at the start of the last step: no sample may lie beyond it.
-    inside = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
-    time = part.time[inside]
+    inside = (excitation.time >= trace.time[0]) & (excitation.time <= trace.time[-1])
+    time = excitation.time[inside]
+    return JointPrediction(
+        joint=excitation.joint,
+        time=time,
+        command=excitation.command[inside],
+        measured=excitation.position[inside],
+        nominal=_played(rigs, trace, nominal, gain_names, time),
+        nominal_delayed=_played(rigs, delayed_trace, nominal, gain_names, time),
+        matched=_played(rigs, delayed_trace, matched, drive_names, time),
+        signal=excitation.segment.kind,
+    )
 
-    def played(command: CommandTrace, values: Mapping[str, float], names: Sequence[str]) -> Array:
-        position = rigs.play(command, {n: np.array([values[n]]) for n in names})[0]
-        return np.asarray(CubicSpline(trace.time, position)(time))
 
-    return {
-        "time": time,
-        "command": part.command[inside],
-        "measured": part.position[inside],
-        "naive": played(trace, real, GAINS),
-        "naive_delayed": played(delayed, real, GAINS),
-        "matched": played(delayed, best, [*GAINS, *own]),
-    }
+def _played(
+    rigs: JointRigs,
+    trace: CommandTrace,
+    drive: Mapping[str, float],
+    names: Sequence[str],
+    time: Array,
+) -> Array:
+    """Simulate a command with some parameters of a drive; return the position at some instants."""
+    values = {name: np.array([drive[name]]) for name in names}
+    position = rigs.play(trace, values)[0]
+    return np.asarray(CubicSpline(trace.time, position)(time))
+
+
+def _joined(parts: Sequence[JointPrediction]) -> JointPrediction:
+    """Return the predictions of several excitations of one joint, one after another."""
+    return JointPrediction(
+        joint=parts[0].joint,
+        time=np.concatenate([part.time for part in parts]),
+        command=np.concatenate([part.command for part in parts]),
+        measured=np.concatenate([part.measured for part in parts]),
+        nominal=np.concatenate([part.nominal for part in parts]),
+        nominal_delayed=np.concatenate([part.nominal_delayed for part in parts]),
+        matched=np.concatenate([part.matched for part in parts]),
+        signal=parts[0].signal,
+    )
