@@ -175,7 +175,7 @@ def _write(folder: Path) -> None:
     (folder / "contract.json").write_text(to_json(load_policy(folder / "policy.onnx").contract))
     walks = {"walks": [{"name": "a", "figures": {"speed_error": {"mean": 0.1}}}]}
     results.save_json(folder / "evaluation.json", EVALUATION, walks)
-    capture.save(folder / "capture.npz", cases.jump_capture(400, 1.0))
+    capture.save_capture(folder / "capture.npz", cases.jump_capture(400, 1.0))
 
 
 def _kinds() -> dict[str, _Kind]:
@@ -231,7 +231,7 @@ def _kinds() -> dict[str, _Kind]:
         "match": _Kind(("tree/match.npz",), match, True),
         "prediction": _Kind(("page/fresh.prediction.npz",), load_prediction, True),
         "response": _Kind(("tree/a.response.npz",), response_file.load, True),
-        "capture": _Kind(("capture.npz",), capture.load, True),
+        "capture": _Kind(("capture.npz",), capture.load_capture, True),
         "trial": trial(results.JUMPS),
         "walk": trial(WALK),
         "crossing": trial(CROSSING),

@@ -171,7 +171,7 @@ def _torn(folder: Path) -> list[str]:
             elif path.name == "match.npz":
                 match_file.load(path, gains_file.load_gains(path.with_name("gains.yaml")))
             elif path.suffix == ".npz":
-                capture.load(path)
+                capture.load_capture(path)
             elif path.suffix == ".yaml":
                 read_yaml(path)
             elif path.name == results.SUMMARY:

@@ -142,9 +142,12 @@ def draw_params(number: int) -> SimParams:
         velocity_noise=times(shipped.velocity_noise, 1.0, 4.0),
         position_noise=times(shipped.position_noise, 0.5, 2.0),
         torque_noise=times(shipped.torque_noise, 0.5, 2.0),
-        gyro_noise=times(shipped.gyro_noise, 2.5, 10.0),
+    )
+    imu = replace(
+        base.imu,
+        gyro_noise=times(base.imu.gyro_noise, 2.5, 10.0),
         gyro_bias=vector(0.02),
-        accelerometer_noise=times(shipped.accelerometer_noise, 2.5, 10.0),
+        accelerometer_noise=times(base.imu.accelerometer_noise, 2.5, 10.0),
         accelerometer_bias=vector(0.3),
     )
     trunk = replace(base.trunk, mass_offset=float(rng.uniform(-0.3, 1.2)), com_offset=vector(0.01))
@@ -155,7 +158,7 @@ def draw_params(number: int) -> SimParams:
         noise_corner_hz=times(base.attitude.noise_corner_hz, 0.5, 1.5),
     )
     ground = replace(base.ground, friction=float(rng.uniform(0.5, 1.2)))
-    return replace(base, machine=machine, trunk=trunk, attitude=attitude, ground=ground)
+    return replace(base, machine=machine, imu=imu, trunk=trunk, attitude=attitude, ground=ground)
 
 
 def in_steps(state: State) -> State:

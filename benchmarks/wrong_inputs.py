@@ -31,7 +31,7 @@ from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.readers import read_logs
 from pronk.identify.match.pipeline import match_logs
 from pronk.identify.match.settings import MatchSettings
-from pronk.jump.virtual.plant import leg_of
+from pronk.jump.virtual.plant import limb_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
@@ -95,7 +95,7 @@ def recorded(robot: RobotSpec, seed: int, number: int, cache: Path) -> Case:
     if not done.exists():
         plan = make_plan(robot, [joint], amplitudes=(0.25, 0.125), repeats=(2, 1))
         task = SweepTask(plan=plan, out_dir=folder, overwrite=True)
-        legs = (leg_of(robot, joint),)
+        legs = (limb_of(robot, joint),)
         record_sweep(VirtualRobot(robot, params, seed=1000 * seed + number, legs=legs), task)
         done.touch()
     return Case(log=read_logs([path], robot=robot)[0], joint=joint, robot=robot)

@@ -52,6 +52,7 @@ CENTRES = {
 }
 
 MACHINE = """\
+machine:
   command_delay_s: 0.002          # one 500 Hz cycle of the computer that feeds the drives
   measurement_delay_s: 0.001      # half such a cycle, on average
   sampling_jitter_s: 50.0e-6      # a Linux loop without a real-time kernel
@@ -65,10 +66,12 @@ MACHINE = """\
   position_noise: 2.0e-4          # 3 quanta of the hips: magnet runout, mount vibration
   position_noise_corner_hz: 40.0  # ... which is a matter of structure, hence slow
   torque_noise: 0.05              # 0.1 A of current noise through the hip's 6 x 0.075 N m/A
+imu:
   gyro_noise: 0.001               # 0.0035 deg/s per root Hz (a good MEMS unit) over 250 Hz
   gyro_bias: [0.004, -0.002, 0.003]
   accelerometer_noise: 0.02       # 0.14 mg per root Hz over 250 Hz
   accelerometer_bias: [0.04, -0.06, 0.05]
+fixture:
   clamp_stiffness: 5000.0         # a screw clamp on the thigh, 0.1 m from the hip, 0.5 N/um
   clamp_damping: 5.0              # a third of critical for a thigh
   stand_stiffness: .inf           # rigid: "fixed to a stable platform" (paper F5)
@@ -142,7 +145,7 @@ def designed() -> SimParams:
         {
             "schema": SCHEMA,
             "robot": "mini_cheetah",
-            "machine": yaml.safe_load("machine:\n" + MACHINE)["machine"],
+            **yaml.safe_load(MACHINE),
             **yaml.safe_load(BODY),
             "joints": joints,
         },
@@ -200,7 +203,7 @@ def calibrated(sim_params: SimParams, name: str) -> JointParams:
 
 def text(sim_params: SimParams) -> str:
     """The sim_params file, laid out for reading."""
-    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {sim_params.robot}", "machine:"]
+    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {sim_params.robot}"]
     lines.append(MACHINE + BODY + "joints:")
     for name, joint in sim_params.joints.items():
         entries = [f"{key}: {_decimal(value)}" for key, value in vars(joint).items()]

@@ -244,7 +244,7 @@ def write_trial(
                 path = ""
                 if keep:
                     path = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
-                    captures.save(folder / path, capture)
+                    captures.save_capture(folder / path, capture)
                 figures = measure_jump(capture, script, ROBOT, began=0.0, rules=rules)
                 rows.append(row(name, case, number, figures, path))
     trial = of_kind(

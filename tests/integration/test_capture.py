@@ -13,7 +13,7 @@ import pytest
 
 from pronk.errors import ArtefactError, HardwareError
 from pronk.files import save_arrays
-from pronk.jump.virtual.capture import SCHEMA, Capture, load, save
+from pronk.jump.virtual.capture import SCHEMA, Capture, load_capture, save_capture
 from pronk.jump.virtual.ground import Ground, Start
 from pronk.jump.virtual.plant import Plant, legs_of
 from pronk.jump.virtual.robot import VirtualRobot
@@ -161,8 +161,8 @@ def test_capture_outlives_the_connection_and_is_stored(seen: Capture, tmp_path: 
     assert len(other.capture().time) == 0
     assert np.isnan(other.capture().dt)
     path = tmp_path / "hop.capture.npz"
-    save(path, seen)
-    back = load(path)
+    save_capture(path, seen)
+    back = load_capture(path)
     for part in fields(Capture):
         got, wanted = getattr(back, part.name), getattr(seen, part.name)
         assert got.dtype == wanted.dtype
@@ -180,7 +180,7 @@ def test_files_that_are_no_capture(seen: Capture, tmp_path: Path) -> None:
     ):
         save_arrays(path, {"schema": schema}, stored)
         with pytest.raises(ArtefactError, match=named):
-            load(path)
+            load_capture(path)
     with pytest.raises(ArtefactError, match="contact"):
         replace(seen, contact=seen.contact[:5])
 

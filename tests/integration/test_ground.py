@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from pronk.arrays import Array
 from pronk.errors import HardwareError, RobotError
 from pronk.jump.virtual.ground import Box, Ground, Start
-from pronk.jump.virtual.physics import Physics, Transport
+from pronk.jump.virtual.physics import CommandQueue, Physics
 from pronk.jump.virtual.plant import Plant, legs_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sensors import about_z, moving_force, of_vector, product, turned_back
@@ -32,48 +32,62 @@ STEP = 0.25e-3
 
 
 def frictionless() -> SimParams:
-    """Nothing that takes energy away."""
-    nothing = dict.fromkeys(("presliding_damping", "viscous", "belt_damping"), 0.0)
-    nothing |= dict.fromkeys(("coulomb", "breakaway"), 1e-9) | {"presliding_stiffness": 1e-3}
-    return with_joints(quiet(), **nothing)
+    """Return parameters with nothing that takes energy away."""
+    return with_joints(
+        quiet(),
+        presliding_stiffness=1e-3,
+        presliding_damping=0.0,
+        viscous=0.0,
+        belt_damping=0.0,
+        coulomb=1e-9,
+        breakaway=1e-9,
+    )
 
 
 def aligned(sim_params: SimParams) -> SimParams:
-    """Encoders without offset: in free fall the drives have nothing to correct."""
+    """Remove the encoders' offsets, so that in free fall the drives have nothing to correct."""
     return with_joints(sim_params, encoder_offset=0.0)
 
 
 def standing(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
+    """Return a connected robot on the ground."""
     return connected(sim_params, base="ground", **options)
 
 
 def hold(position: Array = POSE, **options: Any) -> Command:
+    """Return a command of a pose."""
     return Command(position=position, **gains(), **options)
 
 
 def falling(sim_params: SimParams, **options: Any) -> VirtualRobot:
+    """Return a connected robot 2 m over the ground."""
     return standing(sim_params, start=Start(drop=2.0, settle_s=0.0), **options)
 
 
 def down(state: State) -> Array:
-    """Direction of gravity in the trunk's frame, as the machine reports."""
-    w = Rotation.from_quat(state.orientation, scalar_first=True)
-    return np.asarray(w.inv().apply([0.0, 0.0, -1.0]))
+    """Return the direction of gravity in the trunk's frame, as the machine reports it."""
+    attitude = Rotation.from_quat(state.orientation, scalar_first=True)
+    return np.asarray(attitude.inv().apply([0.0, 0.0, -1.0]))
 
 
 # --- Contact of one foot, by itself -------------------------------------------------------------
 
 
 def ball(ground: Ground, mass: float = 2.0) -> tuple[Any, Any]:
-    """A point mass with a foot that can only shift, let down on the ground."""
+    """Let a point mass with a foot, which can only shift, down on the ground."""
     spec = mujoco.MjSpec()
     spec.option.timestep = STEP
     ground.add_to(spec)
     body = spec.worldbody.add_body(name="ball", mass=mass, inertia=(1, 1, 1), explicitinertial=True)
     for axis in np.eye(3):
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    size = (0.02, 0.0, 0.0)
-    body.add_geom(name="foot", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, priority=1, mass=0.0)
+    body.add_geom(
+        name="foot",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=(0.02, 0.0, 0.0),
+        priority=1,
+        mass=0.0,
+    )
     model = spec.compile()
     ground.set_contact(model, np.array([model.geom("foot").id]))
     data = mujoco.MjData(model)
@@ -97,8 +111,8 @@ def test_a_pressed_foot_swings_with_its_own_mass_added() -> None:
         mujoco.mj_step(model, data)
         height.append(data.qpos[2])
     swing = np.array(height) - np.mean(height)
-    ups = np.flatnonzero((swing[1:] > 0.0) & (swing[:-1] <= 0.0))
-    period = STEP * np.diff(ups).mean()
+    upward_crossings = np.flatnonzero((swing[1:] > 0.0) & (swing[:-1] <= 0.0))
+    period = STEP * np.diff(upward_crossings).mean()
     # The added mass at an impedance of one half is 1 / A, the mass of the body.
     assert 2.0 * math.pi / period == pytest.approx(math.sqrt(20e3 / 4.0), rel=0.02)
 
@@ -112,13 +126,13 @@ def test_a_sliding_foot_slows_down_by_friction_and_a_sticking_one_stays() -> Non
     assert data.qfrc_constraint[0] == pytest.approx(-0.6 * data.qfrc_constraint[2], rel=1e-4)
     assert data.qvel[0] == pytest.approx(2.0 - 0.6 * GRAVITY * 0.1, rel=0.03)
     mujoco.mj_step(model, data, 2000)
-    rest = data.qpos[0]
+    start = data.qpos[0]
     data.qfrc_applied[0] = 0.9 * 0.6 * 2.0 * GRAVITY
     mujoco.mj_step(model, data, 4000)
-    assert abs(data.qpos[0] - rest) < 1e-3
+    assert abs(data.qpos[0] - start) < 1e-3
     data.qfrc_applied[0] = 1.2 * 0.6 * 2.0 * GRAVITY
     mujoco.mj_step(model, data, 4000)
-    assert data.qpos[0] - rest == pytest.approx(0.5 * 0.2 * 0.6 * GRAVITY, rel=0.03)
+    assert data.qpos[0] - start == pytest.approx(0.5 * 0.2 * 0.6 * GRAVITY, rel=0.03)
 
 
 # --- Standing -----------------------------------------------------------------------------------
@@ -194,13 +208,14 @@ def test_energy_is_conserved_without_drives_and_contacts(step: float) -> None:
         mujoco.mj_forward(model, data)
         return float(data.energy.sum())
 
-    before, swing = energy(), []
+    start_energy = energy()
+    changes = []
     for _ in range(40):
         mujoco.mj_step(model, data, round(0.004 / step))
-        swing.append(energy() - before)
+        changes.append(energy() - start_energy)
     kinetic = float(data.energy[1])
     # First order in the step, as MuJoCo's Euler is.
-    assert np.abs(swing).max() < 0.02 * kinetic * step / STEP
+    assert np.abs(changes).max() < 0.02 * kinetic * step / STEP
     assert kinetic > 20.0
 
 
@@ -223,12 +238,12 @@ def test_in_free_fall_the_accelerometer_reads_zero() -> None:
 
 
 def test_bias_and_noise_are_as_large_as_their_parameters() -> None:
-    sim_params = replace(SIM_PARAMS, machine=replace(SIM_PARAMS.machine, gyro_bias=(0.1, 0.2, 0.3)))
+    sim_params = replace(SIM_PARAMS, imu=replace(SIM_PARAMS.imu, gyro_bias=(0.1, 0.2, 0.3)))
     states = falling(aligned(sim_params)).wait(0.6)
     gyro = np.array([state.gyro for state in states])
     force = np.array([state.accelerometer for state in states[1:]])  # before, it was at rest
     np.testing.assert_allclose(gyro.mean(axis=0), [0.1, 0.2, 0.3], atol=3e-4)
-    np.testing.assert_allclose(force.mean(axis=0), SIM_PARAMS.machine.accelerometer_bias, atol=4e-3)
+    np.testing.assert_allclose(force.mean(axis=0), SIM_PARAMS.imu.accelerometer_bias, atol=4e-3)
     assert gyro.std() == pytest.approx(math.hypot(0.001, np.std([0.1, 0.2, 0.3])), rel=0.1)
     assert force.std(axis=0).mean() == pytest.approx(0.02, rel=0.1)
 
@@ -240,17 +255,20 @@ def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() ->
     for seed in range(3):
         machine = standing(replace(sim_params, attitude=attitude), seed=seed)
         states = machine.wait(1.5)
-        true = standing(sim_params, seed=seed).wait(1.5)
+        true_states = standing(sim_params, seed=seed).wait(1.5)
         # To first order, a small rotation e turns gravity (0, 0, -1) by e x (0, 0, 1).
-        off = np.array([down(a) - down(b) for a, b in zip(states, true, strict=True)])
-        np.testing.assert_allclose(off.mean(axis=0), [-0.03, -0.05, 0.0], atol=0.006)
-        assert off[:, :2].std(axis=0).mean() == pytest.approx(0.01, rel=0.3)
-        turned = Rotation.from_quat(states[0].orientation, scalar_first=True)
-        headings.append(turned.as_euler("ZYX")[0])
+        gravity = np.array([down(state) for state in states])
+        true_gravity = np.array([down(state) for state in true_states])
+        error = gravity - true_gravity
+        np.testing.assert_allclose(error.mean(axis=0), [-0.03, -0.05, 0.0], atol=0.006)
+        assert error[:, :2].std(axis=0).mean() == pytest.approx(0.01, rel=0.3)
+        first_attitude = Rotation.from_quat(states[0].orientation, scalar_first=True)
+        headings.append(first_attitude.as_euler("ZYX")[0])
     assert np.ptp(headings) > 0.3
     states = falling(replace(aligned(quiet()), attitude=AttitudeParams(yaw_drift=0.2))).wait(0.5)
-    turn = Rotation.from_quat([s.orientation for s in (states[0], states[-1])], scalar_first=True)
-    drift = (turn[1] * turn[0].inv()).as_rotvec()
+    start_attitude = Rotation.from_quat(states[0].orientation, scalar_first=True)
+    end_attitude = Rotation.from_quat(states[-1].orientation, scalar_first=True)
+    drift = (end_attitude * start_attitude.inv()).as_rotvec()
     np.testing.assert_allclose(drift, [0.0, 0.0, 0.2 * 0.498], atol=1e-6)
 
 
@@ -269,22 +287,24 @@ def test_accelerometer_of_a_constant_acceleration(turn: list[float], pull: list[
 
 @given(VECTOR, VECTOR)
 def test_quaternions_agree_with_scipy(first: list[float], second: list[float]) -> None:
-    a, b = Rotation.from_rotvec(first), Rotation.from_rotvec(second)
-    qa, qb = (of_vector(np.array([v])) for v in (first, second))
-    both = Rotation.from_quat(product(qa, qb), scalar_first=True)
-    np.testing.assert_allclose(both.as_matrix()[0], (a * b).as_matrix(), atol=1e-12)
-    back = turned_back(qa, np.array([second]))[0]
-    np.testing.assert_allclose(back, a.inv().apply(second), atol=1e-9)
+    a = Rotation.from_rotvec(first)
+    b = Rotation.from_rotvec(second)
+    a_quaternion = of_vector(np.array([first]))
+    b_quaternion = of_vector(np.array([second]))
+    composed = Rotation.from_quat(product(a_quaternion, b_quaternion), scalar_first=True)
+    np.testing.assert_allclose(composed.as_matrix()[0], (a * b).as_matrix(), atol=1e-12)
+    vector = turned_back(a_quaternion, np.array([second]))[0]
+    np.testing.assert_allclose(vector, a.inv().apply(second), atol=1e-9)
     heading = Rotation.from_quat(about_z(np.array(first)), scalar_first=True).as_matrix()
-    turned = Rotation.from_euler("z", np.array(first)[:, None]).as_matrix()
-    np.testing.assert_allclose(heading, turned, atol=1e-12)
+    expected = Rotation.from_euler("z", np.array(first)[:, None]).as_matrix()
+    np.testing.assert_allclose(heading, expected, atol=1e-12)
 
 
 # --- Repeatability ------------------------------------------------------------------------------
 
 
 def shaken(seed: int, cuts: int) -> tuple[Array, Array]:
-    """States and capture of a robot that is commanded to bob, time cut into pieces."""
+    """Return states and capture of a robot that is commanded to bob, time cut into pieces."""
     machine = standing(seed=seed, start=Start(settle_s=0.2))
     states = []
     for k in range(10):
@@ -292,8 +312,12 @@ def shaken(seed: int, cuts: int) -> tuple[Array, Array]:
         for cut in range(cuts):
             states += machine.wait(0.02 * k + 0.02 * (cut + 1) / cuts)
     seen = machine.capture()
-    rows = [[s.time, *s.position, *s.gyro, *s.accelerometer, *s.orientation] for s in states]
-    return np.array(rows), np.hstack([seen.position, seen.torque, seen.bus_voltage[:, None]])
+    rows = []
+    for state in states:
+        vectors = (state.position, state.gyro, state.accelerometer, state.orientation)
+        rows.append(np.concatenate([[state.time], *vectors]))
+    columns = np.hstack([seen.position, seen.torque, seen.bus_voltage[:, None]])
+    return np.array(rows), columns
 
 
 def test_results_depend_on_the_seed_and_not_on_the_steps_of_wait() -> None:
@@ -308,44 +332,55 @@ def test_results_depend_on_the_seed_and_not_on_the_steps_of_wait() -> None:
 
 
 def test_repeated_gains_are_applied_after_others() -> None:
-    heights = []
-    for stiffness in (17.0, 3.4):
-        machine = standing(quiet(), start=Start(settle_s=0.2))
-        for k, each in enumerate((17.0, stiffness, 17.0, 17.0)):
-            machine.send(Command(position=POSE, **gains(each)))
-            machine.wait(0.05 * (k + 1))
-        machine.wait(2.0)
-        heights.append(machine.snapshot().position[0, 2])
     # It stands again as it would have; with the weak gains still in force it would lie.
-    assert heights[1] == pytest.approx(heights[0], abs=0.01)
+    height = height_after((17.0, 17.0, 17.0, 17.0))
+    assert height_after((17.0, 3.4, 17.0, 17.0)) == pytest.approx(height, abs=0.01)
+
+
+def height_after(stiffnesses: tuple[float, ...]) -> float:
+    """Return the height of a trunk some time after commands of these gains [m]."""
+    machine = standing(quiet(), start=Start(settle_s=0.2))
+    for k, stiffness in enumerate(stiffnesses):
+        machine.send(Command(position=POSE, **gains(stiffness)))
+        machine.wait(0.05 * (k + 1))
+    machine.wait(2.0)
+    return float(machine.snapshot().position[0, 2])
 
 
 # --- Commands that expire -----------------------------------------------------------------------
 
 
-def taken(way: Transport) -> list[tuple[int, bool]]:
-    """Steps at which commands take effect, and whether they are damping alone."""
-    found = iter(lambda: way.take(10**6), None)
-    return [(step, not command.stiffness.any()) for step, command in found]
+def taken(queue: CommandQueue) -> list[tuple[int, bool]]:
+    """Return the steps at which commands take effect, and whether they are damping alone."""
+    effects = []
+    arrival = queue.take(10**6)
+    while arrival is not None:
+        step, command = arrival
+        effects.append((step, not command.stiffness.any()))
+        arrival = queue.take(10**6)
+    return effects
 
 
 def test_commands_arrive_late_and_damping_follows_when_nothing_new_comes() -> None:
-    way = Transport(12, 0.002, 0.001)
-    way.put(hold(made=0.0, valid_for=0.010), 0.0)
-    way.put(hold(made=0.005, valid_for=0.010), 0.005)
-    assert way.soonest == 2
-    assert way.take(2) is None
+    queue = CommandQueue(12, 0.002, 0.001)
+    queue.put(hold(made=0.0, valid_for=0.010), 0.0)
+    queue.put(hold(made=0.005, valid_for=0.010), 0.005)
+    assert queue.soonest == 2
+    assert queue.take(2) is None
     # At last made + valid_for + delay.
-    assert taken(way) == [(2, False), (7, False), (17, True)]
-    assert way.soonest == math.inf
+    assert taken(queue) == [(2, False), (7, False), (17, True)]
+    assert queue.soonest == math.inf
     # One that is stale on arrival is followed by damping at once.
-    way.put(hold(made=0.0, valid_for=0.005), 0.020)
-    assert taken(way)[-1][1]
-    # A command at the expiry of the last is applied, and never expires itself.
-    way = Transport(12, 0.0, 0.001)
-    way.put(hold(made=0.0, valid_for=0.010), 0.0)
-    way.put(hold(made=0.010), 0.010)
-    assert taken(way) == [(0, False), (10, True), (10, False)]
+    queue.put(hold(made=0.0, valid_for=0.005), 0.020)
+    assert taken(queue)[-1][1]
+
+
+def test_a_command_at_the_expiry_of_the_one_before_is_applied() -> None:
+    """It never expires itself."""
+    queue = CommandQueue(12, 0.0, 0.001)
+    queue.put(hold(made=0.0, valid_for=0.010), 0.0)
+    queue.put(hold(made=0.010), 0.010)
+    assert taken(queue) == [(0, False), (10, True), (10, False)]
 
 
 # --- Other bodies -------------------------------------------------------------------------------
@@ -358,43 +393,45 @@ def test_a_trunk_with_other_mass_centre_and_inertia() -> None:
     sim_params = replace(SIM_PARAMS, trunk=trunk)
     model = Plant(ROBOT, sim_params, legs_of(ROBOT), STEP, Ground()).model
     nominal = ROBOT.build_spec().compile()
-    was, now = nominal.body("trunk"), model.body("trunk")
-    mass = float(was.mass[0])
-    assert now.mass[0] == pytest.approx(mass + 1.5)
-    np.testing.assert_allclose(now.ipos - was.ipos, trunk.com_offset, atol=1e-12)
+    nominal_body = nominal.body("trunk")
+    body = model.body("trunk")
+    mass = float(nominal_body.mass[0])
+    assert body.mass[0] == pytest.approx(mass + 1.5)
+    np.testing.assert_allclose(body.ipos - nominal_body.ipos, trunk.com_offset, atol=1e-12)
 
     def tensor(body: Any) -> Array:
         axes = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
         return np.asarray(axes @ np.diag(body.inertia) @ axes.T)
 
-    expected = np.diag(tensor(was)) * trunk.inertia_scale * (1.0 + 1.5 / mass)
-    np.testing.assert_allclose(tensor(now), np.diag(expected), atol=1e-9)
+    moments = np.diag(tensor(nominal_body)) * trunk.inertia_scale * (1.0 + 1.5 / mass)
+    np.testing.assert_allclose(tensor(body), np.diag(moments), atol=1e-9)
 
 
 # --- Refusals -----------------------------------------------------------------------------------
 
 
-def over(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
-    return VirtualRobot(ROBOT, sim_params, **{"base": "ground", **options})
+def built(sim_params: SimParams = SIM_PARAMS, base: Any = "ground", **options: Any) -> VirtualRobot:
+    """Return a robot that is not connected; options are those of `VirtualRobot`."""
+    return VirtualRobot(ROBOT, sim_params, base=base, **options)
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: over(replace(SIM_PARAMS, trunk=TrunkParams(mass_offset=-20.0))), "mass_offset"),
+        (lambda: built(replace(SIM_PARAMS, trunk=TrunkParams(mass_offset=-20.0))), "mass_offset"),
         (
-            lambda: over(replace(SIM_PARAMS, trunk=TrunkParams(inertia_scale=(1.0, 1.0, 3.0)))),
+            lambda: built(replace(SIM_PARAMS, trunk=TrunkParams(inertia_scale=(1.0, 1.0, 3.0)))),
             "inertia_scale",
         ),
-        (lambda: over(replace(SIM_PARAMS, ground=Ground(stiffness=5e6))), "stiffness"),
-        (lambda: over(base="sky"), "sky"),
-        (lambda: over(base="bench", ground=Ground()), "bench"),
-        (lambda: over(base="bench", start=Start()), "bench"),
-        (lambda: over(legs=("FR",)), "ground"),
-        (lambda: over(capture_rate_hz=1e5), "capture_rate_hz"),
-        (lambda: over(base="bench", log_rate_hz=5e4), "log_rate_hz"),
-        (lambda: over(base="bench", legs=("XL",)), "XL"),
-        (lambda: over(base="bench", legs=()), "legs"),
+        (lambda: built(replace(SIM_PARAMS, ground=Ground(stiffness=5e6))), "stiffness"),
+        (lambda: built(base="sky"), "sky"),
+        (lambda: built(base="bench", ground=Ground()), "bench"),
+        (lambda: built(base="bench", start=Start()), "bench"),
+        (lambda: built(legs=("FR",)), "ground"),
+        (lambda: built(capture_rate_hz=1e5), "capture_rate_hz"),
+        (lambda: built(base="bench", log_rate_hz=5e4), "log_rate_hz"),
+        (lambda: built(base="bench", legs=("XL",)), "XL"),
+        (lambda: built(base="bench", legs=()), "legs"),
         (lambda: VirtualRobot(ARM, SIM_PARAMS), "so101"),
         (lambda: standing(start=Start(joint_offset=(0.0, 0.0, 0.0))), "joint_offset"),
         (lambda: Start(drop=-1.0), "drop"),

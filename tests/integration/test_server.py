@@ -23,7 +23,7 @@ from pronk.deploy.links.lcm.codec import (
     decode_command,
     encode_command,
 )
-from pronk.jump.virtual.capture import load
+from pronk.jump.virtual.capture import load_capture
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.robots.machine import Command, RefusedError, State
 from virtual_robot import ROBOT, connected
@@ -258,4 +258,4 @@ def test_simulate_ends_after_its_duration_and_writes_its_figures(tmp_path: Path)
     assert written["virtual"] is True
     # Its own controller commands over the wire itself.
     assert written["wire"]["commands"] > 0
-    assert load(capture).time[-1] == pytest.approx(written["duration_s"], abs=0.01)
+    assert load_capture(capture).time[-1] == pytest.approx(written["duration_s"], abs=0.01)

@@ -145,7 +145,7 @@ def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
     kept = sorted(path.name for path in (tried / "captures").iterdir())
     assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
     for row in made.rows:
-        seen = capture.load(tried / row.capture)
+        seen = capture.load_capture(tried / row.capture)
         again = measure_jump(seen, row.script, ROBOT, began=row.began)
         assert repr(again) == repr(row.figures)
     jump = made.rows[0].figures

@@ -14,7 +14,16 @@ from pronk.errors import HardwareError, RobotError
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.robots.machine import Command, State
-from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet, with_joints
+from virtual_robot import (
+    POSE,
+    ROBOT,
+    SIM_PARAMS,
+    connected,
+    gains,
+    quiet,
+    with_fixture,
+    with_joints,
+)
 
 NAMES = ROBOT.joint_names
 TICK = 0.02
@@ -22,17 +31,22 @@ TICK = 0.02
 IDEAL = {"bus_resistance": 0.0, "encoder_bits": 32}
 
 
-def bench(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
-    return connected(sim_params, **{"legs": ("FR",), **options})
+def bench(
+    sim_params: SimParams = SIM_PARAMS, legs: tuple[str, ...] | None = ("FR",), **options: Any
+) -> VirtualRobot:
+    """Return a connected robot on the bench, by default one leg of it."""
+    return connected(sim_params, legs=legs, **options)
 
 
 def offset(joint: str, value: float) -> Array:
+    """Return the default pose with one joint elsewhere [rad]."""
     position = POSE.copy()
     position[NAMES.index(joint)] += value
     return position
 
 
 def excite(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
+    """Command a joint offsets from the default pose, one a tick; return the states met."""
     states = [machine.latest()]
     start = machine.latest().time
     for k, value in enumerate(command):
@@ -42,6 +56,7 @@ def excite(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
 
 
 def column(states: list[State], joint: str) -> Array:
+    """Return the positions of a joint [rad]."""
     return np.array([state.position[NAMES.index(joint)] for state in states])
 
 
@@ -51,14 +66,17 @@ def chirp(seconds: float, amplitude: float = 0.25) -> Array:
 
 
 def gain_db(command: Array, position: Array, per_tick: int) -> tuple[Array, Array]:
-    """H1 of the held command and the position, and its frequencies up to 15 Hz."""
-    held = np.repeat(command, per_tick)
+    """Compute H1 of the stepped command and the position, with its frequencies up to 15 Hz."""
+    steps = np.repeat(command, per_tick)
     rate = per_tick / TICK
-    options = {"fs": rate, "nperseg": round(2.0 * rate), "noverlap": round(1.5 * rate)}
-    hz, cross = signal.csd(held, position[: len(held)], **options)
-    _, own = signal.welch(held, **options)
-    inside = (hz > 0.0) & (hz <= 15.0)
-    return hz[inside], 20.0 * np.log10(np.abs(cross / own)[inside])
+    segment = round(2.0 * rate)
+    overlap = round(1.5 * rate)
+    hz, cross_spectrum = signal.csd(
+        steps, position[: len(steps)], fs=rate, nperseg=segment, noverlap=overlap
+    )
+    _, spectrum = signal.welch(steps, fs=rate, nperseg=segment, noverlap=overlap)
+    in_band = (hz > 0.0) & (hz <= 15.0)
+    return hz[in_band], 20.0 * np.log10(np.abs(cross_spectrum / spectrum)[in_band])
 
 
 # --- Physics ------------------------------------------------------------------------------------
@@ -66,18 +84,20 @@ def gain_db(command: Array, position: Array, per_tick: int) -> tuple[Array, Arra
 
 @pytest.mark.parametrize("joint", ["FR_hip_roll", "FR_hip_pitch", "FR_knee"])
 def test_the_step_has_converged_to_40_khz(joint: str) -> None:
-    command, gain = chirp(6.0), []
-    for step in (0.25e-3, 0.025e-3):
-        states = excite(bench(quiet(**IDEAL), timestep_s=step), joint, command)
-        gain.append(gain_db(command, column(states, joint), 10)[1])
-    assert np.abs(gain[0] - gain[1]).max() < 0.05
+    command = chirp(6.0)
+    coarse = excite(bench(quiet(**IDEAL), timestep_s=0.25e-3), joint, command)
+    fine = excite(bench(quiet(**IDEAL), timestep_s=0.025e-3), joint, command)
+    _, coarse_gain = gain_db(command, column(coarse, joint), 10)
+    _, fine_gain = gain_db(command, column(fine, joint), 10)
+    assert np.abs(coarse_gain - fine_gain).max() < 0.05
 
 
 def test_response_of_an_ideal_joint_is_its_closed_form() -> None:
     joint = "FR_knee"
-    scale, drive = 1.2, ROBOT.joint(joint).drive
+    scale = 1.2
+    drive = ROBOT.joint(joint).drive
     sim_params = with_joints(
-        quiet(**IDEAL, drive_lag_s=1e-5, clamp_stiffness=9e4),
+        with_fixture(quiet(**IDEAL, drive_lag_s=1e-5), clamp_stiffness=9e4),
         joint,
         torque_scale=scale,
         coulomb=1e-6,
@@ -99,10 +119,11 @@ def test_response_of_an_ideal_joint_is_its_closed_form() -> None:
     body = model.jnt_bodyid[model.joint(joint).id]
     arm = np.hypot(model.body_ipos[body][0], model.body_ipos[body][2])
     shank = model.body_inertia[body].max() + model.body_mass[body] * arm**2
-    true = sim_params.joints[joint]
-    inertia = true.rotor_inertia * drive.gear_ratio**2 + shank * true.link_inertia_scale
+    params = sim_params.joints[joint]
+    inertia = params.rotor_inertia * drive.gear_ratio**2 + shank * params.link_inertia_scale
     s = 2j * np.pi * hz
-    stiffness, damping = scale * 17.0, scale * 0.4 + 0.05
+    stiffness = scale * 17.0
+    damping = scale * 0.4 + 0.05
     equation = stiffness / (inertia * s**2 + damping * s + stiffness)
     middle = (hz > 1.0) & (hz < 15.0)
     error = measured - 20.0 * np.log10(np.abs(equation))
@@ -131,7 +152,8 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
     machine = bench(sim_params, log_rate_hz=2000.0)
     machine.send(Command(position=offset("FR_knee", -2.0), **gains(300.0, 0.1)))
     states = machine.wait(0.2)
-    drive, scale = ROBOT.joint("FR_knee").drive, sim_params.joints["FR_knee"].torque_scale
+    drive = ROBOT.joint("FR_knee").drive
+    scale = sim_params.joints["FR_knee"].torque_scale
     torque = scale * np.array([state.torque[2] for state in states])
     speed = np.array([state.velocity[2] for state in states])
     believed, resistance = drive.motor
@@ -157,15 +179,19 @@ def test_reported_torque_is_what_the_drive_believes() -> None:
 
 
 def test_battery_sags_with_the_power_drawn_and_never_gives_more_than_it_can() -> None:
-    full, least = SIM_PARAMS.machine.bus_voltage, []
-    for resistance in (0.2, 5.0):
-        machine = bench(quiet(bus_resistance=resistance))
-        assert machine.latest().bus_voltage == pytest.approx(full, abs=0.5)
-        machine.send(Command(position=offset("FR_hip_roll", 1.0), **gains(100.0, 2.0)))
-        least.append(min(state.bus_voltage for state in machine.wait(0.1)))
-    assert least[0] < full - 1.0
+    full = SIM_PARAMS.machine.bus_voltage
+    assert lowest_voltage(resistance=0.2) < full - 1.0
     # A battery's power is largest at half its voltage.
-    assert least[1] == 0.5 * full
+    assert lowest_voltage(resistance=5.0) == 0.5 * full
+
+
+def lowest_voltage(resistance: float) -> float:
+    """Return the lowest bus voltage while a drive draws all the power that it can [V]."""
+    machine = bench(quiet(bus_resistance=resistance))
+    full = SIM_PARAMS.machine.bus_voltage
+    assert machine.latest().bus_voltage == pytest.approx(full, abs=0.5)
+    machine.send(Command(position=offset("FR_hip_roll", 1.0), **gains(100.0, 2.0)))
+    return min(state.bus_voltage for state in machine.wait(0.1))
 
 
 # --- Time ---------------------------------------------------------------------------------------
@@ -173,10 +199,9 @@ def test_battery_sags_with_the_power_drawn_and_never_gives_more_than_it_can() ->
 
 def test_delays_shift_the_response() -> None:
     command = chirp(1.0)
-    prompt, late = (
-        column(excite(bench(quiet(**IDEAL, **delays)), "FR_knee", command), "FR_knee")
-        for delays in ({}, {"command_delay_s": 0.004, "measurement_delay_s": 0.002})
-    )
+    delayed = quiet(**IDEAL, command_delay_s=0.004, measurement_delay_s=0.002)
+    prompt = column(excite(bench(quiet(**IDEAL)), "FR_knee", command), "FR_knee")
+    late = column(excite(bench(delayed), "FR_knee", command), "FR_knee")
     np.testing.assert_allclose(late[3:], prompt[:-3], atol=1e-6)
     assert np.abs(late - prompt).max() > 1e-3
 
@@ -227,12 +252,14 @@ def test_position_noise_has_its_size_and_corner() -> None:
 
 
 def test_inertial_unit_measures_gravity_and_its_bias() -> None:
-    bias = {"gyro_bias": (0.1, 0.2, 0.3), "accelerometer_bias": (0.4, 0.5, 0.6)}
-    state = bench(quiet(**IDEAL, **bias)).latest()
-    np.testing.assert_allclose(state.gyro, bias["gyro_bias"])
+    sim_params = quiet(**IDEAL)
+    imu = replace(sim_params.imu, gyro_bias=(0.1, 0.2, 0.3), accelerometer_bias=(0.4, 0.5, 0.6))
+    state = bench(replace(sim_params, imu=imu)).latest()
+    np.testing.assert_allclose(state.gyro, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(state.accelerometer, [0.4, 0.5, 0.6 + 9.81])
     # And the motion of a compliant stand.
-    machine = bench(quiet(**IDEAL, stand_stiffness=500.0, stand_damping=5.0), legs=None)
+    compliant = with_fixture(quiet(**IDEAL), stand_stiffness=500.0, stand_damping=5.0)
+    machine = bench(compliant, legs=None)
     states = excite(machine, "FR_hip_pitch", chirp(3.0))
     rate = np.array([state.gyro for state in states])
     assert np.abs(rate[:, 1]).max() > 0.05
@@ -246,23 +273,22 @@ def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
     joint = "FR_hip_pitch"
     machine = bench(quiet(**IDEAL))
     machine.clamp((joint,))
-    rest = machine.latest().position[1]
-    held = excite(machine, joint, np.full(25, 0.2))[-1].position[1] - rest
+    start = machine.latest().position[1]
+    clamped_motion = excite(machine, joint, np.full(25, 0.2))[-1].position[1] - start
     # Torque through belt and fixture in series, the drive's own stiffness beside them.
-    true = SIM_PARAMS.joints[joint]
-    torque = 17.0 * true.torque_scale * 0.2
-    give = torque / SIM_PARAMS.machine.clamp_stiffness + torque / true.belt_stiffness
-    assert 0.5 * give < held < 1.1 * give
+    params = SIM_PARAMS.joints[joint]
+    torque = 17.0 * params.torque_scale * 0.2
+    deflection = torque / SIM_PARAMS.fixture.clamp_stiffness + torque / params.belt_stiffness
+    assert 0.5 * deflection < clamped_motion < 1.1 * deflection
     machine.clamp(())
-    free = excite(machine, joint, np.full(50, 0.2))[-1].position[1] - rest
-    assert free > 0.15
+    free_motion = excite(machine, joint, np.full(50, 0.2))[-1].position[1] - start
+    assert free_motion > 0.15
 
 
 def test_legs_on_a_rigid_bench_are_independent() -> None:
     command = chirp(1.0)
-    alone, together = (
-        excite(bench(quiet(**IDEAL), legs=legs), "FR_knee", command) for legs in (("FR",), None)
-    )
+    alone = excite(bench(quiet(**IDEAL), legs=("FR",)), "FR_knee", command)
+    together = excite(bench(quiet(**IDEAL), legs=None), "FR_knee", command)
     np.testing.assert_allclose(
         column(alone, "FR_knee"), column(together, "FR_knee"), rtol=0.0, atol=1e-9
     )

@@ -27,7 +27,7 @@ from pronk.deploy.runtime.plan import RunPlan
 from pronk.deploy.runtime.reasons import Reason
 from pronk.deploy.runtime.run import Deployment
 from pronk.errors import ArtefactError, HardwareError
-from pronk.jump.virtual.capture import load as load_capture
+from pronk.jump.virtual.capture import load_capture
 
 pytest.importorskip("onnxruntime")
 

@@ -72,7 +72,7 @@ def simulate(
     from pronk.deploy.bench.server import RobotServer, Watchdog
     from pronk.deploy.links.address import Address
     from pronk.deploy.links.realtime import Interrupts, Wanted, enter
-    from pronk.jump.virtual.capture import save
+    from pronk.jump.virtual.capture import save_capture
     from pronk.jump.virtual.robot import VirtualRobot, hold_of
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
@@ -104,7 +104,7 @@ def simulate(
             server.run(lambda: interrupts.received or time.monotonic() >= end)
         figures = server.figures()
         if capture is not None:
-            save(capture, machine.capture())
+            save_capture(capture, machine.capture())
     finally:
         wire.close()
         machine.close()

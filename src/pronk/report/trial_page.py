@@ -89,7 +89,7 @@ def load_traces(trial: TrialResults, folder: Path) -> CapturedTraces | None:
     roll_rate: Runs = {name: {} for name in policy_names(trial)}
     pitch_rate: Runs = {name: {} for name in policy_names(trial)}
     for row in present:
-        capture = capture_file.load(folder / row.capture)
+        capture = capture_file.load_capture(folder / row.capture)
         since_jump = capture.time - row.began - row.script.on
         trace = _cut(since_jump, capture.position[:, 2], -BEFORE_S, AFTER_S)
         height[row.policy].setdefault(row.case, []).append(trace)

@@ -82,7 +82,7 @@ class PacedRobot:
             OSError: The file cannot be written.
             PronkError: Nothing was captured.
         """
-        capture.save(path, self.inner.capture())
+        capture.save_capture(path, self.inner.capture())
 
     def _shifted(self, state: State) -> State:
         """Return a state with its time on CLOCK_MONOTONIC."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from pronk.deploy.runtime.sweep import SweepTask
 from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.identify.excitation.plan import SweepPlan
-from pronk.jump.virtual.plant import leg_of, legs_of
+from pronk.jump.virtual.plant import legs_of, limb_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.names import file_name
@@ -33,7 +33,7 @@ def sweep_virtual(
     """
     robot, metadata, jobs = plan.robot, {"link": "virtual robot, in this program"}, []
     for index, limb in enumerate(legs_of(robot)):
-        joints = tuple(name for name in plan.joints if leg_of(robot, name) == limb)
+        joints = tuple(name for name in plan.joints if limb_of(robot, name) == limb)
         task = SweepTask(
             plan=plan, out_dir=out, joints=joints, overwrite=overwrite, metadata=metadata
         )

@@ -71,6 +71,8 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         "drive_lag_s": _absolute(0.0005, 0.0002, "filter of the speed, current loop [s]"),
         "bus_voltage": _absolute(24.1, 1.1, "a 6S battery from nearly flat to full [V]"),
         "bus_resistance": _relative(0.5, "age and cold of the cells"),
+    },
+    "imu": {
         "gyro_bias": _absolute(0.0, 0.006, "after some minutes of warming up [rad/s]"),
         "accelerometer_bias": _absolute(0.0, 0.08, "8 mg, a MEMS unit's data sheet [m/s^2]"),
     },
@@ -131,7 +133,7 @@ def draw_body(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> list[Dra
             drawn_numbers.append(
                 DrawnNumber(parameter=f"joints.{name}", joint=joint.name, value=value)
             )
-    for part in ("machine", "trunk", "attitude", "ground"):
+    for part in ("machine", "imu", "trunk", "attitude", "ground"):
         drawn = _draw_part(getattr(sim_params, part), TOLERANCES[part], rng)
         for name, value in drawn.items():
             drawn_numbers.append(DrawnNumber(parameter=f"{part}.{name}", value=value))

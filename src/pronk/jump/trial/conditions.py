@@ -29,6 +29,8 @@ from pronk.jump.trial.bodies import Number, draw_body
 from pronk.jump.virtual.ground import Ground
 from pronk.jump.virtual.sim_params import (
     AttitudeParams,
+    FixtureParams,
+    ImuParams,
     JointParams,
     MachineParams,
     SimParams,
@@ -49,6 +51,8 @@ BODY_COUNT = 3
 _PARTS: dict[str, Any] = {
     "joints": JointParams,
     "machine": MachineParams,
+    "imu": ImuParams,
+    "fixture": FixtureParams,
     "trunk": TrunkParams,
     "attitude": AttitudeParams,
     "ground": Ground,
@@ -204,6 +208,8 @@ def changed_params(condition: Condition, sim_params: SimParams, robot: RobotSpec
         for name, params in sim_params.joints.items():
             joints[name] = replace(params, **joint_numbers[name])  # type: ignore[arg-type]
         machine: Any = part_numbers["machine"]
+        imu: Any = part_numbers["imu"]
+        fixture: Any = part_numbers["fixture"]
         trunk: Any = part_numbers["trunk"]
         attitude: Any = part_numbers["attitude"]
         ground: Any = part_numbers["ground"]
@@ -211,6 +217,8 @@ def changed_params(condition: Condition, sim_params: SimParams, robot: RobotSpec
             sim_params,
             joints=joints,
             machine=replace(sim_params.machine, **machine),
+            imu=replace(sim_params.imu, **imu),
+            fixture=replace(sim_params.fixture, **fixture),
             trunk=replace(sim_params.trunk, **trunk),
             attitude=replace(sim_params.attitude, **attitude),
             ground=replace(sim_params.ground, **ground),

@@ -219,7 +219,7 @@ def run_job(job: TrialJob) -> TrialRun:
     capture = machine.capture()
     figures = job.kind.measure(capture, script, robot, began=began)
     if job.row.capture:
-        captures.save(job.setup.out / job.row.capture, capture)
+        captures.save_capture(job.setup.out / job.row.capture, capture)
     return replace(job.row, figures=figures, began=began)
 
 

@@ -29,26 +29,40 @@ SCHEMA = "pronk/capture/1"
 class Capture:
     """T samples at a constant rate. Annotations hold the shapes after T."""
 
-    time: Annotated[Array, ()]  # on the machine's clock [s]
-    position: Annotated[Array, (3,)]  # origin of the trunk's frame, in the world [m]
-    orientation: Annotated[Array, (4,)]  # trunk to world, unit quaternions w, x, y, z
-    velocity: Annotated[Array, (3,)]  # of the trunk's origin, in the world [m/s]
-    angular_velocity: Annotated[Array, (3,)]  # of the trunk, in its own frame [rad/s]
-    foot_position: Annotated[Array, (4, 3)]  # centres of the foot spheres, in the world [m]
-    contact: Annotated[Mask, (4,)]  # feet on the ground
-    other_contact: Annotated[Mask, ()]  # anything but a foot touches the ground
-    joint_position: Annotated[Array, (12,)]  # of the links, in file order [rad]
-    joint_velocity: Annotated[Array, (12,)]  # of the links [rad/s]
-    torque: Annotated[Array, (12,)]  # of the motors through their gears, without friction [N m]
-    electrical_power: Annotated[Array, ()]  # battery to motors, negative where returned [W]
-    bus_voltage: Annotated[Array, ()]  # [V]
+    time: Annotated[Array, ()]
+    """Times on the machine's clock [s]."""
+    position: Annotated[Array, (3,)]
+    """Origin of the trunk's frame, in the world [m]."""
+    orientation: Annotated[Array, (4,)]
+    """Rotation from the trunk to the world, unit quaternions w, x, y, z."""
+    velocity: Annotated[Array, (3,)]
+    """Velocity of the trunk's origin, in the world [m/s]."""
+    angular_velocity: Annotated[Array, (3,)]
+    """Angular velocity of the trunk, in its own frame [rad/s]."""
+    foot_position: Annotated[Array, (4, 3)]
+    """Centres of the foot spheres, in the world [m]."""
+    contact: Annotated[Mask, (4,)]
+    """Whether each foot is on the ground."""
+    other_contact: Annotated[Mask, ()]
+    """Whether anything but a foot touches the ground."""
+    joint_position: Annotated[Array, (12,)]
+    """Angles of the links, in file order [rad]."""
+    joint_velocity: Annotated[Array, (12,)]
+    """Speeds of the links [rad/s]."""
+    torque: Annotated[Array, (12,)]
+    """Torques of the motors through their gears, without friction [N m]."""
+    electrical_power: Annotated[Array, ()]
+    """Power from the battery to the motors, negative where it is returned [W]."""
+    bus_voltage: Annotated[Array, ()]
+    """Voltage of the bus [V]."""
 
     def __post_init__(self) -> None:
         """Refuse arrays of wrong shapes."""
-        for name, rest in _SHAPES.items():
-            found, expected = np.shape(getattr(self, name)), (len(self.time), *rest)
-            if found != expected:
-                raise ArtefactError(f"Capture.{name} has shape {found}; expected {expected}.")
+        for name, shape_of_sample in _SHAPES.items():
+            shape = np.shape(getattr(self, name))
+            expected = (len(self.time), *shape_of_sample)
+            if shape != expected:
+                raise ArtefactError(f"Capture.{name} has shape {shape}; expected {expected}.")
 
     @property
     def dt(self) -> float:
@@ -62,64 +76,87 @@ _SHAPES = {
     name: hint.__metadata__[0]
     for name, hint in get_type_hints(Capture, include_extras=True).items()
 }
+"""Shape of one sample of each field."""
 
 
-def save(path: Path, capture: Capture) -> None:
+def save_capture(path: Path, capture: Capture) -> None:
     """Write a capture to an `.npz`, whole or not at all."""
-    save_arrays(path, {"schema": SCHEMA}, {name: getattr(capture, name) for name in _SHAPES})
+    arrays = {name: getattr(capture, name) for name in _SHAPES}
+    save_arrays(path, {"schema": SCHEMA}, arrays)
 
 
-def load(path: Path) -> Capture:
-    """Read a capture; refuse a missing or damaged file and another schema."""
-    with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, stored):
-        return Capture(**{name: stored[name] for name in _SHAPES})
+def load_capture(path: Path) -> Capture:
+    """Read a capture.
+
+    Raises:
+        ArtefactError: The file is missing, damaged or of another schema.
+    """
+    with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, arrays):
+        return Capture(**{name: arrays[name] for name in _SHAPES})
 
 
 def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
-    """Make a capture of times [s] (T,) and raw states (T, state_size)."""
-    raw = plant.unpack(rows)
-    place, speed = raw.position, raw.velocity
-    orientation = place[:, 3:7]
-    feet, contact, other = _contacts(plant, place)
-    current = raw.torque / plant.constant
+    """Make a capture of raw states.
+
+    Args:
+        plant: The plant, on the ground.
+        time: Times of the samples [s], (T,).
+        rows: Raw states, (T, state_size).
+    """
+    states = plant.unpack(rows)
+    qpos = states.position
+    qvel = states.velocity
+    orientation = qpos[:, 3:7]
+    foot_position, foot_contact, other_contact = _contacts(plant, qpos)
+    current = states.torque / plant.constant
     heat = current * current * plant.resistance
     return Capture(
         time=time,
-        position=place[:, :3].copy(),
+        position=qpos[:, :3].copy(),
         orientation=orientation / np.sqrt((orientation * orientation).sum(axis=1, keepdims=True)),
-        velocity=speed[:, :3].copy(),
-        angular_velocity=speed[:, 3:6].copy(),
-        foot_position=feet,
-        contact=contact,
-        other_contact=other,
-        joint_position=place[:, plant.link_qpos],
-        joint_velocity=speed[:, plant.link],
-        torque=raw.torque,
-        electrical_power=(raw.torque * speed[:, plant.rotor] + heat).sum(axis=-1),
-        bus_voltage=raw.voltage.copy(),
+        velocity=qvel[:, :3].copy(),
+        angular_velocity=qvel[:, 3:6].copy(),
+        foot_position=foot_position,
+        contact=foot_contact,
+        other_contact=other_contact,
+        joint_position=qpos[:, plant.link_qpos],
+        joint_velocity=qvel[:, plant.link],
+        torque=states.torque,
+        electrical_power=(states.torque * qvel[:, plant.rotor] + heat).sum(axis=-1),
+        bus_voltage=states.voltage.copy(),
     )
 
 
-def _contacts(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
-    """Feet (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
+def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Mask]:
+    """Find the contacts of a plant on the ground.
 
-    Of a plant on the ground at positions (T, nq).
+    Args:
+        plant: The plant.
+        positions: Its qpos at T instants, (T, nq).
+
+    Returns:
+        Feet in the world [m], (T, 4, 3), whether they touch the ground, (T, 4), and whether
+        anything else does, (T,).
     """
-    model, data = plant.model, plant.aside
-    qpos, where, none = data.qpos, data.geom_xpos, len(plant.feet)
-    feet = np.empty((len(place), none, 3))
-    samples, pairs = [], [np.empty((0, 2), dtype=np.intp)]
-    for k, (row, there) in enumerate(zip(place, feet, strict=True)):
-        qpos[:] = row
+    model = plant.model
+    data = plant.scratch
+    qpos = data.qpos
+    geom_positions = data.geom_xpos
+    foot_count = len(plant.feet)
+    foot_position = np.empty((len(positions), foot_count, 3))
+    samples: list[int] = []  # number of the sample of each contact
+    geom_pairs = [np.empty((0, 2), dtype=np.intp)]  # the two geoms of each contact
+    for sample, position in enumerate(positions):
+        qpos[:] = position
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        where.take(plant.feet, axis=0, out=there, mode="clip")
+        geom_positions.take(plant.feet, axis=0, out=foot_position[sample], mode="clip")
         if data.ncon:
-            pairs.append(data.contact.geom.copy())
-            samples += [k] * data.ncon
-    # The ground is one geom of a pair; the other is a foot or not.
-    foot = np.full(model.ngeom, none)
-    foot[plant.feet] = np.arange(none)
-    touched = np.zeros((len(place), none + 1), dtype=bool)
-    touched[samples, foot[np.concatenate(pairs)].min(axis=1)] = True
-    return feet, touched[:, :none], touched[:, none]
+            geom_pairs.append(data.contact.geom.copy())
+            samples += [sample] * data.ncon
+    # The ground is one geom of a pair; the other is a foot or not, whose number is `foot_count`.
+    foot_of_geom = np.full(model.ngeom, foot_count)
+    foot_of_geom[plant.feet] = np.arange(foot_count)
+    touched = np.zeros((len(positions), foot_count + 1), dtype=bool)
+    touched[samples, foot_of_geom[np.concatenate(geom_pairs)].min(axis=1)] = True
+    return foot_position, touched[:, :foot_count], touched[:, foot_count]

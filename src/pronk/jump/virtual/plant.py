@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.jump.virtual.ground import Ground
-from pronk.jump.virtual.sim_params import JointParams, SimParams, TrunkParams
+from pronk.jump.virtual.sim_params import FixtureParams, JointParams, SimParams, TrunkParams
 from pronk.robots.robot import Drive, RobotSpec
 
 Indices = NDArray[np.intp]
@@ -59,10 +59,14 @@ _STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mj
 class RawStates(NamedTuple):
     """Views of raw states of a plant at n instants."""
 
-    position: Array  # qpos, (n, nq)
-    velocity: Array  # qvel, (n, nv)
-    torque: Array  # of the motors [N m], (n, joints of the plant)
-    voltage: Array  # of the bus [V], (n,)
+    position: Array
+    """Positions, MuJoCo's qpos. (n, nq)"""
+    velocity: Array
+    """Velocities, MuJoCo's qvel. (n, nv)"""
+    torque: Array
+    """Torques of the motors [N m]. (n, joints of the plant)"""
+    voltage: Array
+    """Voltages of the bus [V]. (n,)"""
 
 
 class Plant:
@@ -76,94 +80,110 @@ class Plant:
         timestep_s: float,
         ground: Ground | None = None,
     ) -> None:
-        """Build it with these of `legs_of(robot)`, on the bench (no contacts) or on `ground`."""
+        """Build the plant.
+
+        Args:
+            robot: Structure, masses, drives.
+            sim_params: How the machine differs from `robot`.
+            legs: Limbs that are simulated, of `legs_of(robot)`.
+            timestep_s: Physics step [s].
+            ground: The ground under a free trunk; None on the bench, without contacts.
+
+        Raises:
+            RobotError: Parameters of another robot, or a robot that cannot be simulated.
+        """
         if sim_params.robot != robot.name:
             raise RobotError(
                 f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a "
                 "file written for that robot."
             )
         sim_params.check_joints(robot.joint_names)
-        joints = [joint for joint in robot.joints if leg_of(robot, joint.name) in legs]
-        names, drives = [joint.name for joint in joints], [joint.drive for joint in joints]
-        true = [sim_params.joints[name] for name in names]
-        spec = robot.build_spec()
-        spec.option.timestep = timestep_s
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        for key in list(spec.keys):
-            spec.delete(key)
-        if ground is None:
-            _fix_base(spec, robot, sim_params)
-        else:
-            _free_base(spec, robot, ground)
-        _drop_legs(spec, robot, set(names))
-        for name, drive, params in zip(names, drives, true, strict=True):
-            _add_rotor(spec, name, drive, params, sim_params.machine.drive_lag_s)
-        self.model: Any = spec.compile()  # mujoco.MjModel
-        model = self.model
-        if model.nq != model.nv + (ground is not None):
-            raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
-        rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
-        # Mass and inertia by the same factor: a body that was possible stays possible.
-        for link, params in zip(links, true, strict=True):
-            body = int(model.jnt_bodyid[link.id])
-            model.body_mass[body] *= params.link_inertia_scale
-            model.body_inertia[body] *= params.link_inertia_scale
-        self.feet = _ids([])  # geoms; none on the bench
+        joints = [joint for joint in robot.joints if limb_of(robot, joint.name) in legs]
+        names = [joint.name for joint in joints]
+        drives = [joint.drive for joint in joints]
+        params = [sim_params.joints[name] for name in names]
+        model = _compiled_model(robot, sim_params, names, timestep_s, ground)
+        self.model: Any = model  # mujoco.MjModel
+        self.feet = _ids([])
+        """Geoms of the feet; none on the bench."""
         if ground is not None:
-            _change_trunk(model, model.body(robot.base_body).id, sim_params.trunk)
             self.feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-        if ground is not None:
             ground.set_contact(model, self.feet)
-        self.aside = mujoco.MjData(model)  # to compute in, beside the run's
-        self.joints = tuple(names)  # in the plant, in file order
-        self.columns = _ids([robot.joint_names.index(name) for name in names])  # among the robot's
-        self.rotor = _ids([joint.dofadr[0] for joint in rotors])  # in qvel
-        self.rotor_qpos = _ids([joint.qposadr[0] for joint in rotors])
-        self.link = _ids([joint.dofadr[0] for joint in links])  # in qvel
-        self.link_qpos = _ids([joint.qposadr[0] for joint in links])
-        self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])  # in ctrl
-        # Currents in act. LuGre's bristle comes first among a motor's states, its current last.
+        self.scratch = mujoco.MjData(model)
+        """Data to compute in, beside those of the run."""
+        self.joints = tuple(names)
+        """Joints in the plant, in file order."""
+        self.columns = _ids([robot.joint_names.index(name) for name in names])
+        """Places of the plant's joints among those of the robot."""
+        rotors = [model.joint(f"{name}/rotor") for name in names]
+        links = [model.joint(name) for name in names]
+        self.rotor = _ids([rotor.dofadr[0] for rotor in rotors])
+        """Places of the rotors in qvel."""
+        self.rotor_qpos = _ids([rotor.qposadr[0] for rotor in rotors])
+        """Places of the rotors in qpos."""
+        self.link = _ids([link.dofadr[0] for link in links])
+        """Places of the links in qvel."""
+        self.link_qpos = _ids([link.qposadr[0] for link in links])
+        """Places of the links in qpos."""
+        self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])
+        """Places of the motors in ctrl."""
+        # Places of the currents in act. LuGre's bristle comes first among a motor's states, its
+        # current last.
         states = model.actuator_actadr + model.actuator_actnum
         self._current = _ids(states[self.actuator] - 1)
-        rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
-        # Roll, pitch, yaw in qpos and qvel; none of a rigid stand, and on the ground.
-        self.stand = _ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES])
-        scale = np.array([params.torque_scale for params in true])
-        # Motor constants K0 that the drives assume and K [V s/rad], resistance [ohm].
-        self._believed, self.resistance = np.array([drive.motor for drive in drives]).T.copy()
-        self.constant = scale * self._believed
-        self._effort_limit = scale * np.array([drive.effort_limit for drive in drives])  # [N m]
-        self._least_torque = -self._effort_limit
-        gears = np.array([drive.gear_ratio for drive in drives])
+        self.stand = _ids([])
+        """Places of the stand's roll, pitch, yaw in qpos and qvel; none of a rigid stand, and on
+        the ground."""
+        if ground is None and math.isfinite(sim_params.fixture.stand_stiffness):
+            self.stand = _ids([model.joint(name).dofadr[0] for name in _STAND_AXES])
+        torque_scale = np.array([joint_params.torque_scale for joint_params in params])
+        # Motor constants K0 that the drives assume [V s/rad].
+        self._believed = np.array([drive.motor[0] for drive in drives])
+        self.resistance = np.array([drive.motor[1] for drive in drives])
+        """Resistance of each motor [ohm]."""
+        self.constant = torque_scale * self._believed
+        """Constant K of each motor [V s/rad]."""
+        self._effort_limit = torque_scale * np.array([drive.effort_limit for drive in drives])
+        self._lowest_torque = -self._effort_limit
+        gear_ratio = np.array([drive.gear_ratio for drive in drives])
+        rotor_inertia = np.array([joint_params.rotor_inertia for joint_params in params])
         # Reflected through the gear [kg m^2], and viscous friction [N m s/rad].
-        self._rotor_inertia = np.array([params.rotor_inertia for params in true]) * gears**2
-        self._viscous = np.array([params.viscous for params in true])
-        # Reading minus true angle [rad].
-        self.encoder_offset = np.array([params.encoder_offset for params in true])
-        # Voltages at which the inverters clip, a view; every actuator of the plant is a motor [V].
+        self._rotor_inertia = rotor_inertia * gear_ratio**2
+        self._viscous = np.array([joint_params.viscous for joint_params in params])
+        self.encoder_offset = np.array([joint_params.encoder_offset for joint_params in params])
+        """Reading of each encoder minus the true angle [rad]."""
         self.inverters = model.actuator_gainprm[:, _VMAX]
-        # Numbers in a raw state: positions, velocities, activations, bus voltage.
+        """Voltages at which the inverters clip, a view; every actuator of the plant is a motor
+        [V]."""
         self.state_size = int(model.nq + model.nv + model.na + 1)
-        self._check_springs(true)
+        """Numbers in a raw state: positions, velocities, activations, bus voltage."""
+        self._check_springs(params)
 
     def _check_springs(self, joints: list[JointParams]) -> None:
         """Refuse springs that the physics step cannot follow; name field and largest value."""
-        model, data = self.model, mujoco.MjData(self.model)
+        model = self.model
+        data = mujoco.MjData(model)
         inertia = np.zeros((model.nv, model.nv))
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, inertia)
         mobility = np.diag(np.linalg.inv(inertia))
-        rotors, links = mobility[self.rotor], mobility[self.link]
-        springs = {"belt_stiffness": rotors + links, "presliding_stiffness": rotors}
         for k, (name, joint) in enumerate(zip(self.joints, joints, strict=True)):
-            for field, mobile in springs.items():
-                most = (_STABLE / model.opt.timestep) ** 2 / mobile[k]
-                if (value := getattr(joint, field)) > most:
-                    raise RobotError(
-                        f"joints.{name}.{field} is {value:g}; at a physics step of "
-                        f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
-                    )
+            rotor_mobility = mobility[self.rotor[k]]
+            belt_mobility = rotor_mobility + mobility[self.link[k]]
+            self._check_spring(f"{name}.belt_stiffness", joint.belt_stiffness, belt_mobility)
+            self._check_spring(
+                f"{name}.presliding_stiffness", joint.presliding_stiffness, rotor_mobility
+            )
+
+    def _check_spring(self, field: str, stiffness: float, mobility: float) -> None:
+        """Refuse a spring [N m/rad] on a mobility [1 / (kg m^2)] that is too stiff for the step."""
+        timestep = self.model.opt.timestep
+        highest = (_STABLE / timestep) ** 2 / mobility
+        if stiffness > highest:
+            raise RobotError(
+                f"joints.{field} is {stiffness:g}; at a physics step of {timestep:g} s at most "
+                f"{highest:.3g} N m/rad can be simulated."
+            )
 
     def read(self, data: Any, voltage: float, row: Array) -> None:
         """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
@@ -172,9 +192,14 @@ class Plant:
 
     def unpack(self, rows: Array) -> RawStates:
         """Split raw states (n, state_size)."""
-        nq, nv = self.model.nq, self.model.nv
-        torque = self.motor_torque(rows[:, nq + nv : -1])
-        return RawStates(rows[:, :nq], rows[:, nq : nq + nv], torque, rows[:, -1])
+        nq = self.model.nq
+        nv = self.model.nv
+        return RawStates(
+            position=rows[:, :nq],
+            velocity=rows[:, nq : nq + nv],
+            torque=self.motor_torque(rows[:, nq + nv : -1]),
+            voltage=rows[:, -1],
+        )
 
     def set_gains(self, stiffness: Array, damping: Array) -> None:
         """Set the drives' gains [N m/rad, N m s/rad] from the next physics step."""
@@ -190,40 +215,98 @@ class Plant:
         self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
 
     def motor_torque(self, act: Array) -> Array:
-        """Motor torque without friction [N m], (..., joints), from activations (..., na)."""
+        """Compute motor torques without friction.
+
+        Args:
+            act: Activations, (..., na).
+
+        Returns:
+            Torques [N m], (..., joints).
+        """
         torque = self.constant * act.take(self._current, axis=-1)
-        np.maximum(torque, self._least_torque, out=torque)
+        np.maximum(torque, self._lowest_torque, out=torque)
         limited: Array = np.minimum(torque, self._effort_limit, out=torque)
         return limited
 
     def set_clamps(
         self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
     ) -> None:
-        """Hold the links of `joints` where they are in `q`; release all others.
+        """Hold some links where they are; release all others.
 
-        A spring and damper [N m/rad, N m s/rad] between link and body cost no solver iterations.
+        A spring and damper between link and body cost no solver iterations.
+
+        Args:
+            joints: Joints whose links are held.
+            q: Positions, MuJoCo's qpos.
+            stiffness: Stiffness of the spring [N m/rad].
+            damping: Damping of the damper [N m s/rad].
         """
         for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
-            held = name in joints
-            self.model.jnt_stiffness[self.model.dof_jntid[dof]] = stiffness if held else 0.0
-            self.model.dof_damping[dof] = damping if held else 0.0
-            self.model.qpos_spring[index] = q[index] if held else 0.0
+            is_clamped = name in joints
+            self.model.jnt_stiffness[self.model.dof_jntid[dof]] = stiffness if is_clamped else 0.0
+            self.model.dof_damping[dof] = damping if is_clamped else 0.0
+            self.model.qpos_spring[index] = q[index] if is_clamped else 0.0
 
 
 def legs_of(robot: RobotSpec) -> tuple[str, ...]:
-    """Names of the robot's limbs in file order; see `leg_of`."""
-    return tuple(dict.fromkeys(leg_of(robot, joint.name) for joint in robot.joints))
+    """Return the names of the robot's limbs in file order; see `limb_of`."""
+    legs: list[str] = []
+    for joint in robot.joints:
+        leg = limb_of(robot, joint.name)
+        if leg not in legs:
+            legs.append(leg)
+    return tuple(legs)
 
 
-def leg_of(robot: RobotSpec, name: str) -> str:
-    """The limb of a joint: the first part that its joints' names share, or its first joint."""
+def limb_of(robot: RobotSpec, name: str) -> str:
+    """Return the limb of a joint: what its joints' names begin with, or its first joint."""
     joint = robot.joint(name)
-    limb = [n for n in robot.joint_names if n in (name, *joint.chain, *joint.clamped)]
-    first = {each.split("_")[0] for each in limb}
-    return first.pop() if len(first) == 1 else limb[0]
+    limb_joints = (name, *joint.chain, *joint.clamped)
+    limb = [joint_name for joint_name in robot.joint_names if joint_name in limb_joints]
+    prefixes = {joint_name.split("_")[0] for joint_name in limb}
+    if len(prefixes) == 1:
+        return prefixes.pop()
+    return limb[0]
 
 
-def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
+def _compiled_model(
+    robot: RobotSpec,
+    sim_params: SimParams,
+    names: list[str],
+    timestep_s: float,
+    ground: Ground | None,
+) -> Any:
+    """Compile the model of a plant with the joints `names`; arguments are those of `Plant`."""
+    spec = robot.build_spec()
+    spec.option.timestep = timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    for key in list(spec.keys):
+        spec.delete(key)
+    if ground is None:
+        _fix_base(spec, robot, sim_params.fixture)
+    else:
+        _free_base(spec, robot, ground)
+    _drop_legs(spec, robot, names)
+    for name in names:
+        drive = robot.joint(name).drive
+        _add_rotor(spec, name, drive, sim_params.joints[name], sim_params.machine.drive_lag_s)
+    model = spec.compile()
+    free_joints = 0 if ground is None else 1
+    if model.nq != model.nv + free_joints:
+        raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
+    # Mass and inertia by the same factor: a body that was possible stays possible.
+    for name in names:
+        scale = sim_params.joints[name].link_inertia_scale
+        body = int(model.jnt_bodyid[model.joint(name).id])
+        model.body_mass[body] *= scale
+        model.body_inertia[body] *= scale
+    if ground is not None:
+        _change_trunk(model, model.body(robot.base_body).id, sim_params.trunk)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: float) -> None:
     """Give a joint its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
     link = spec.joint(name)
     if link is None:
@@ -242,19 +325,21 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: flo
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=link.axis,
         pos=link.pos,
-        armature=true.rotor_inertia * drive.gear_ratio**2,
-        damping=[true.viscous, 0, 0],
+        armature=params.rotor_inertia * drive.gear_ratio**2,
+        damping=[params.viscous, 0, 0],
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
     )
     # Nothing of the training model's joint remains but its axis and its stops.
-    link.armature = link.frictionloss = 0.0
-    link.damping = link.stiffness = [0.0, 0.0, 0.0]
+    link.armature = 0.0
+    link.frictionloss = 0.0
+    link.damping = [0.0, 0.0, 0.0]
+    link.stiffness = [0.0, 0.0, 0.0]
     # A mechanical stop is hard: the model's gives way by 0.4 rad under the weight of the trunk.
     link.solref_limit = [_STOP_S, 1.0]
     belt = spec.add_tendon(
         name=f"{name}/belt",
-        stiffness=[true.belt_stiffness, 0, 0],
-        damping=[true.belt_damping, 0, 0],
+        stiffness=[params.belt_stiffness, 0, 0],
+        damping=[params.belt_damping, 0, 0],
         springlength=[0.0, 0.0],
     )
     belt.wrap_joint(f"{name}/rotor", 1.0)
@@ -263,21 +348,22 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: flo
     # MuJoCo integrates the current exactly over a step h with time constant t, and applies it in
     # that very step: late by h / (exp(h / t) - 1) at low frequency. Solved for t.
     lag = spec.option.timestep / math.log1p(spec.option.timestep / lag_s)
-    spec.add_actuator(
+    motor = spec.add_actuator(
         name=f"{name}/motor", target=f"{name}/rotor", trntype=mujoco.mjtTrn.mjTRN_JOINT
-    ).set_to_dcmotor(
+    )
+    motor.set_to_dcmotor(
         # A second constant other than zero would silently become their geometric mean.
-        motorconst=[true.torque_scale * believed, 0.0],
+        motorconst=[params.torque_scale * believed, 0.0],
         resistance=resistance,
-        saturation=[true.torque_scale * drive.effort_limit, 0.0, 0.0],
+        saturation=[params.torque_scale * drive.effort_limit, 0.0, 0.0],
         # kp, ki, kd, slew limit, integral limit, voltage limit; gains are set by set_gains().
         controller=[0.0, 0.0, 0.0, 0.0, 0.0, drive.bus_voltage],
         lugre=[
-            true.presliding_stiffness,
-            true.presliding_damping,
-            true.coulomb,
-            true.breakaway,
-            true.stribeck_speed,
+            params.presliding_stiffness,
+            params.presliding_damping,
+            params.coulomb,
+            params.breakaway,
+            params.stribeck_speed,
         ],
         # Inductance over resistance stands for all that delays torque inside the drive.
         inductance=[0.0, lag],
@@ -285,11 +371,12 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: flo
     )
 
 
-def _drop_legs(spec: Any, robot: RobotSpec, kept: set[str]) -> None:
-    """Delete every subtree under the base that holds no kept joint."""
+def _drop_legs(spec: Any, robot: RobotSpec, names: list[str]) -> None:
+    """Delete every subtree under the base that has joints, but none of those named."""
     for child in list(spec.body(robot.base_body).bodies):
-        names = [joint.name for joint in (*child.find_all("joint"), *child.joints)]
-        if names and not any(name in kept for name in names):
+        child_joints = [*child.find_all("joint"), *child.joints]
+        child_names = {joint.name for joint in child_joints}
+        if child_names and child_names.isdisjoint(names):
             spec.delete(child)
 
 
@@ -301,25 +388,26 @@ def _free_base(spec: Any, robot: RobotSpec, ground: Ground) -> None:
             f"{robot.name} has no legs to stand on; it can be simulated on the bench only."
         )
     # Visual geoms cost time in every step.
-    for geom in [geom for geom in spec.geoms if not geom.contype and not geom.conaffinity]:
-        spec.delete(geom)
+    for geom in list(spec.geoms):
+        if not geom.contype and not geom.conaffinity:
+            spec.delete(geom)
     ground.add_to(spec)
 
 
-def _fix_base(spec: Any, robot: RobotSpec, sim_params: SimParams) -> None:
+def _fix_base(spec: Any, robot: RobotSpec, fixture: FixtureParams) -> None:
     """Fix a model's trunk to its stand, without contacts."""
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     base = spec.body(robot.base_body)
     for joint in list(base.joints):
         spec.delete(joint)
-    if math.isfinite(sim_params.machine.stand_stiffness):
+    if math.isfinite(fixture.stand_stiffness):
         for name, axis in _STAND_AXES.items():
             base.add_joint(
                 name=name,
                 type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=axis,
-                stiffness=[sim_params.machine.stand_stiffness, 0, 0],
-                damping=[sim_params.machine.stand_damping, 0, 0],
+                stiffness=[fixture.stand_stiffness, 0, 0],
+                damping=[fixture.stand_damping, 0, 0],
                 limited=mujoco.mjtLimited.mjLIMITED_FALSE,
             )
 
@@ -335,12 +423,13 @@ def _change_trunk(model: Any, body: int, trunk: TrunkParams) -> None:
     # MuJoCo's principal moments are sorted; those of the parameters are about x, y, z.
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, model.body_iquat[body])
-    nearest = np.abs(axes.reshape(3, 3)).argmax(axis=0)
-    moments = model.body_inertia[body] * np.array(trunk.inertia_scale)[nearest]
+    nearest_axes = np.abs(axes.reshape(3, 3)).argmax(axis=0)
+    moments = model.body_inertia[body] * np.array(trunk.inertia_scale)[nearest_axes]
     if 2.0 * moments.max() > moments.sum():
+        moments_text = ", ".join(f"{moment:.4g}" for moment in moments)
         raise RobotError(
             f"trunk.inertia_scale is {list(trunk.inertia_scale)}; the principal moments would be "
-            f"{', '.join(f'{m:.4g}' for m in moments)} kg m^2, of which the largest exceeds the "
+            f"{moments_text} kg m^2, of which the largest exceeds the "
             "sum of the others, as no body's does."
         )
     model.body_inertia[body] = moments * (1.0 + trunk.mass_offset / mass)
@@ -349,4 +438,5 @@ def _change_trunk(model: Any, body: int, trunk: TrunkParams) -> None:
 
 
 def _ids(values: Any) -> Indices:
+    """Return indices as an array."""
     return np.array(values, dtype=np.intp)

@@ -29,12 +29,14 @@ from pronk.jump.virtual.sim_params import SimParams
 from pronk.robots.machine import Command, State, TorqueKind, check_command, damping_command
 from pronk.robots.robot import RobotSpec
 
-TIMESTEP_S = 0.25e-3  # of physics; see the module's docstring for why it suffices
-_SETTLE_S = 2.0  # before the clock starts, on the bench: the legs settle into their drives' hold
+TIMESTEP_S = 0.25e-3
+"""Physics step [s]; the module's docstring says why it suffices."""
+_SETTLE_S = 2.0
+"""Time before the clock starts on the bench, in which the legs settle into their hold [s]."""
 
 
 def hold_of(robot: RobotSpec) -> Command:
-    """The default pose at the drives' own gains."""
+    """Return the command of the default pose at the drives' own gains."""
     return Command(
         position=np.array([joint.default_position for joint in robot.joints]),
         stiffness=np.array([joint.stiffness for joint in robot.joints]),
@@ -71,75 +73,89 @@ class VirtualRobot:
         Args:
             robot: Structure, masses, drives.
             sim_params: How the machine differs from `robot`.
-            seed: Of all noise.
+            seed: Seed of all noise.
             base: `bench`: the body is fixed to its stand; `ground`: it moves freely.
-            ground: By default the parameters' own floor.
-            start: By default in the default pose at the origin.
-            log_rate_hz: Of states.
-            capture_rate_hz: Of `capture`, on the ground; None keeps none (a second takes 0.7 MB at
-                1 kHz).
-            legs: To simulate on the bench; None for all. Joints of absent legs report their
-                default position and no speed.
-            timestep_s: Of physics.
+            ground: The ground; None for the parameters' own floor.
+            start: How it is set down; None for the default pose at the origin.
+            log_rate_hz: Rate of the states [Hz].
+            capture_rate_hz: Rate of `capture`, on the ground [Hz]; None keeps none (a second takes
+                0.7 MB at 1 kHz).
+            legs: Legs that are simulated on the bench; None for all. Joints of absent legs report
+                their default position and no speed.
+            timestep_s: Physics step [s].
+
+        Raises:
+            HardwareError: Options that do not go together, or an impossible rate.
+            RobotError: Parameters of another robot, or a robot that cannot be simulated.
         """
-        known = legs_of(robot)
+        all_legs = legs_of(robot)
         if base not in ("bench", "ground"):
             raise HardwareError(f"base {base!r}; expected 'bench' or 'ground'.")
         if base == "bench" and (ground is not None or start is not None):
             raise HardwareError("ground or start given on the bench; take base='ground' for them.")
         if base == "ground" and legs is not None:
             raise HardwareError(f"legs {legs} on the ground, where all are needed; leave legs out.")
-        if legs is not None and (not legs or not set(legs) <= set(known)):
+        if legs is not None and (not legs or not set(legs) <= set(all_legs)):
             raise HardwareError(
-                f"legs {legs}; expected some of {', '.join(known)}, the legs of {robot.name}, or "
-                "None for all."
+                f"legs {legs}; expected some of {', '.join(all_legs)}, the legs of {robot.name}, "
+                "or None for all."
             )
-        for name, rate in (("log_rate_hz", log_rate_hz), ("capture_rate_hz", capture_rate_hz)):
-            if rate is not None and not 0.0 < timestep_s * rate <= 1.0:
-                raise HardwareError(
-                    f"{name} is {rate:g}; expected above 0 and at most one per physics step "
-                    f"({1.0 / timestep_s:g} Hz)."
-                )
-        self.robot, self._robot = robot.name, robot
-        self._sim_params, self._seed = sim_params, seed
-        self._ground = (ground or sim_params.ground) if base == "ground" else None
+        _check_rate("log_rate_hz", log_rate_hz, timestep_s)
+        if capture_rate_hz is not None:
+            _check_rate("capture_rate_hz", capture_rate_hz, timestep_s)
+        self.robot = robot.name
+        self.state_rate_hz = log_rate_hz
+        self.capture_rate_hz = capture_rate_hz
+        """Rate of the capture [Hz]; a change has an effect until the robot is connected."""
+        self._robot = robot
+        self._sim_params = sim_params
+        self._seed = seed
+        self._ground: Ground | None = None
+        if base == "ground":
+            self._ground = ground or sim_params.ground
         self._start = start or Start()
-        self.state_rate_hz, self._dt = log_rate_hz, timestep_s
-        self.capture_rate_hz = capture_rate_hz  # has an effect until connected
-        self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
+        self._dt = timestep_s
+        self._plant = Plant(robot, sim_params, legs or all_legs, timestep_s, self._ground)
         self._physics: Physics | None = None
         self._open = False
 
     def connect(self) -> None:
         """Set the robot down, let it settle, start the clock; the drives hold its pose."""
-        robot, plant, machine = self._robot, self._plant, self._sim_params.machine
-        pose = np.asarray(hold_of(robot).position)
-        settle = _SETTLE_S
+        plant = self._plant
+        hold = hold_of(self._robot)
+        pose = np.asarray(hold.position)
+        settle_s = _SETTLE_S
+        capture_rate_hz = None
         if self._ground is not None:
-            pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
+            pose = pose + self._start.offset(len(pose))
+            settle_s = self._start.settle_s
+            capture_rate_hz = self.capture_rate_hz
         self._sensors = Sensors(
-            robot, self._sim_params, plant, rate_hz=self.state_rate_hz, seed=self._seed
+            self._robot, self._sim_params, plant, rate_hz=self.state_rate_hz, seed=self._seed
         )
         # Steps are counted from the clock's zero; settling happens before it.
-        first_step = -round(settle / self._dt)
-        rate = None if self._ground is None else self.capture_rate_hz
-        self._physics = physics = Physics(
-            plant, machine, pose=pose, first_step=first_step, capture_rate_hz=rate
+        physics = Physics(
+            plant,
+            self._sim_params.machine,
+            pose=pose,
+            first_step=-round(settle_s / self._dt),
+            capture_rate_hz=capture_rate_hz,
         )
         if self._ground is not None:
             self._ground.set_down(plant.model, physics.data, plant.feet, self._start)
-        physics.apply(replace(hold_of(robot), position=pose))
+        physics.apply(replace(hold, position=pose))
+        self._physics = physics
         self._now = 0.0
         self._open = True
         self._latest = self._run(1)[0]
 
     def now(self) -> float:
-        """The machine's clock [s]."""
+        """Return the time of the machine's clock [s]."""
         self._running()
         return self._now
 
     def latest(self) -> State:
-        """The newest state."""
+        """Return the newest state."""
         self._running()
         return self._latest
 
@@ -162,7 +178,7 @@ class VirtualRobot:
         """Put a command into force, after the transport delay and until it expires."""
         physics = self._running()
         check_command(command, len(self._robot.joints))
-        physics.transport.put(command, self._now)
+        physics.commands.put(command, self._now)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
         """Fix links where they are, on the bench; () frees all."""
@@ -174,15 +190,17 @@ class VirtualRobot:
             )
         for name in joints:
             self._robot.joint(name)
-        machine, q = self._sim_params.machine, physics.data.qpos
-        self._plant.set_clamps(joints, q, machine.clamp_stiffness, machine.clamp_damping)
+        fixture = self._sim_params.fixture
+        self._plant.set_clamps(
+            joints, physics.data.qpos, fixture.clamp_stiffness, fixture.clamp_damping
+        )
 
     def damp(self) -> None:
         """Damp the joints without stiffness."""
-        self._running().transport.put(damping_command(len(self._robot.joints)), self._now)
+        self._running().commands.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self) -> Capture:
-        """Motion capture up to the step reached, `now` less the delay; also after `close`."""
+        """Return the capture up to the step reached, `now` less the delay; also after `close`."""
         if self._physics is None or self._physics.capture_rate_hz is None:
             raise HardwareError(
                 "nothing was captured; connect a virtual robot with base='ground' and a "
@@ -191,7 +209,7 @@ class VirtualRobot:
         return self._physics.capture()
 
     def snapshot(self) -> Capture:
-        """One sample of the capture, at the physics step reached."""
+        """Return one sample of the capture, at the physics step reached."""
         physics = self._running()
         if self._ground is None:
             raise HardwareError("nothing is captured on the bench; use base='ground'.")
@@ -204,11 +222,13 @@ class VirtualRobot:
             self._open = False
 
     def _running(self) -> Physics:
+        """Return the physics of a connected robot."""
         if self._physics is None or not self._open:
             raise HardwareError("the virtual robot is not connected; call connect() first.")
         return self._physics
 
     def _run(self, count: int) -> list[State]:
+        """Simulate until the next `count` states are measured."""
         first = self._sensors.sequence
         ticks = np.arange(first, first + count) / self.state_rate_hz
         # A state was measured some time before its timestamp.
@@ -216,3 +236,12 @@ class VirtualRobot:
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         rows = self._running().run(steps.tolist())
         return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
+
+
+def _check_rate(name: str, rate_hz: float, timestep_s: float) -> None:
+    """Refuse a rate that is not above 0 or more than one per physics step."""
+    if not 0.0 < timestep_s * rate_hz <= 1.0:
+        raise HardwareError(
+            f"{name} is {rate_hz:g}; expected above 0 and at most one per physics step "
+            f"({1.0 / timestep_s:g} Hz)."
+        )

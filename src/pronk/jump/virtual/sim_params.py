@@ -7,8 +7,8 @@ the trunk's frame: x forward, y left, z up.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,14 +19,16 @@ from msgspec import Meta
 
 from pronk.errors import RobotError
 from pronk.files import read_yaml
-from pronk.jump.virtual.bounds import Bounded, read
+from pronk.jump.virtual.bounds import Bounded, read_bounded
 from pronk.jump.virtual.ground import Ground
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Joint, RobotSpec
 
-SCHEMA = "pronk/sim_params/1"
+SCHEMA = "pronk/sim_params/2"
 SHIPPED_ROBOT = "mini_cheetah"
+"""Robot whose parameters are shipped."""
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
+"""File of the shipped parameters."""
 
 # Bounds exclude errors by a factor of ten or more in a file.
 _Share = Annotated[float, Meta(ge=0.1, le=10.0)]
@@ -53,9 +55,9 @@ class JointParams(Bounded):
     rotor_inertia: Annotated[float, Meta(ge=1e-9, le=1.0)]
     """Inertia of the rotor about its own axis, motor side [kg m^2]."""
     belt_stiffness: _Spring
-    """Between rotor (reflected) and link [N m/rad]."""
+    """Stiffness of the belt between rotor (reflected) and link [N m/rad]."""
     belt_damping: _UpTo100
-    """Between rotor (reflected) and link [N m s/rad]."""
+    """Damping of the belt between rotor (reflected) and link [N m s/rad]."""
     coulomb: _UpTo100
     """Dry friction of the rotor while it slips [N m]."""
     breakaway: _UpTo100
@@ -63,9 +65,9 @@ class JointParams(Bounded):
     stribeck_speed: Annotated[float, Meta(ge=1e-6, le=100.0)]
     """Speed at which the peak has fallen to 1/e of its height over `coulomb` [rad/s]."""
     presliding_stiffness: Annotated[float, Meta(ge=1e-3, le=1e6)]
-    """Of the bristles before slip, LuGre sigma_0 [N m/rad]."""
+    """Stiffness of the bristles before slip, LuGre sigma_0 [N m/rad]."""
     presliding_damping: _UpTo100
-    """Of the bristles, LuGre sigma_1 [N m s/rad]."""
+    """Damping of the bristles, LuGre sigma_1 [N m s/rad]."""
     viscous: _UpTo100
     """Viscous friction of the rotor [N m s/rad]."""
     encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
@@ -83,12 +85,12 @@ class JointParams(Bounded):
 
 @dataclass(frozen=True, kw_only=True)
 class MachineParams(Bounded):
-    """What the joints share: timing, supply, sensors, the stand."""
+    """What the joints share: timing, supply and the sensors of the drives."""
 
     command_delay_s: _Delay
-    """From sending a command to the drives acting on it [s]."""
+    """Time from sending a command to the drives acting on it [s]."""
     measurement_delay_s: _Delay
-    """From the instant a state was measured to its timestamp [s]."""
+    """Time from the instant a state was measured to its timestamp [s]."""
     sampling_jitter_s: _Jitter
     """Standard deviation of the sampling instant about its tick, contained in timestamps [s]."""
     timestamp_error_s: _Jitter
@@ -99,35 +101,47 @@ class MachineParams(Bounded):
     bus_voltage: Annotated[float, Meta(ge=1.0, le=1e3)]
     """Open-circuit voltage of the battery [V]."""
     bus_resistance: _UpTo10
-    """Of battery and wiring [ohm]."""
+    """Resistance of battery and wiring [ohm]."""
     encoder_bits: Annotated[int, Meta(ge=4, le=32)]
-    """Of the absolute encoder on each rotor, motor side [bit per revolution]."""
+    """Resolution of the absolute encoder on each rotor, motor side [bit per revolution]."""
     velocity_window_s: _Span
     """Span over which a drive differentiates its encoder [s]."""
     velocity_noise: _UpTo10
-    """White, standard deviation [rad/s]."""
+    """Standard deviation of the drives' speed, white [rad/s]."""
     position_noise: Annotated[float, Meta(ge=0.0, le=0.1)]
-    """Coloured (vibration of the encoder mount), standard deviation [rad]."""
+    """Standard deviation of the angle, coloured (vibration of the encoder mount) [rad]."""
     position_noise_corner_hz: Annotated[float, Meta(ge=0.1, le=1e5)]
     """Corner of the first-order low-pass that colours it [Hz]."""
     torque_noise: _UpTo10
-    """White, of the current measurement as torque, standard deviation [N m]."""
+    """Standard deviation of the current measurement as torque, white [N m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuParams(Bounded):
+    """Errors of the gyroscope and the accelerometer."""
+
     gyro_noise: _UpTo10
-    """White, standard deviation per sample [rad/s]."""
+    """Standard deviation of a sample of the gyroscope, white [rad/s]."""
     gyro_bias: tuple[_Rate, _Rate, _Rate]
-    """[rad/s]"""
+    """Constant error of the gyroscope [rad/s]."""
     accelerometer_noise: _UpTo10
-    """White, standard deviation per sample [m/s^2]."""
+    """Standard deviation of a sample of the accelerometer, white [m/s^2]."""
     accelerometer_bias: tuple[_Force, _Force, _Force]
-    """[m/s^2]"""
+    """Constant error of the accelerometer [m/s^2]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixtureParams(Bounded):
+    """What holds the robot on the bench."""
+
     clamp_stiffness: _Spring
-    """Of the fixture that holds a clamped link [N m/rad]."""
+    """Stiffness of the fixture that holds a clamped link [N m/rad]."""
     clamp_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
-    """[N m s/rad]"""
+    """Damping of that fixture [N m s/rad]."""
     stand_stiffness: Annotated[float, Meta(ge=100.0)]
-    """Of the stand under the body, about each axis; .inf is rigid [N m/rad]."""
+    """Stiffness of the stand under the body, about each axis; .inf is rigid [N m/rad]."""
     stand_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
-    """[N m s/rad]; of no effect with a rigid stand."""
+    """Damping of the stand, without effect if it is rigid [N m s/rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,45 +176,46 @@ class SimParams:
     """All hidden parameters of a virtual robot."""
 
     robot: str
+    """Name of the robot."""
     machine: MachineParams
+    """What the joints share."""
+    imu: ImuParams
+    """Errors of gyroscope and accelerometer."""
+    fixture: FixtureParams
+    """What holds the robot on the bench."""
     joints: Mapping[str, JointParams]
+    """Each joint by name."""
     trunk: TrunkParams = field(default_factory=TrunkParams)
+    """How the trunk differs from the model's."""
     attitude: AttitudeParams = field(default_factory=AttitudeParams)
+    """Errors of the attitude filter."""
     ground: Ground = field(default_factory=Ground)
+    """The ground that it stands on."""
 
-    def check_joints(self, names: Iterable[str], source: str = "sim_params") -> None:
+    def check_joints(self, names: Sequence[str], source: str = "sim_params") -> None:
         """Refuse parameters that do not hold exactly these joints."""
-        wanted = tuple(names)
-        for name in (*wanted, *self.joints):
-            if (name in wanted) != (name in self.joints):
-                wrong = "is missing" if name in wanted else "is unknown"
+        for name in names:
+            if name not in self.joints:
                 raise RobotError(
-                    f"{source}: joints.{name} {wrong}; the joints of {self.robot} are "
-                    f"{', '.join(wanted)}."
+                    f"{source}: joints.{name} is missing; the joints of {self.robot} are "
+                    f"{', '.join(names)}."
+                )
+        for name in self.joints:
+            if name not in names:
+                raise RobotError(
+                    f"{source}: joints.{name} is unknown; the joints of {self.robot} are "
+                    f"{', '.join(names)}."
                 )
 
 
-def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
-    """Copy parameters with other numbers; refuse an unknown name or an impossible value.
-
-    `changes` are `trunk_mass_offset` [kg], `friction` (of the ground), or of `MachineParams`.
-    """
-    places = {"trunk_mass_offset": ("trunk", "mass_offset"), "friction": ("ground", "friction")}
-    numbers = [f.name for f in fields(MachineParams) if not f.name.endswith("_bias")]
-    places |= {name: ("machine", name) for name in numbers}
-    for name, value in changes.items():
-        if name not in places:
-            raise RobotError(f"no parameter {name!r} to change; there are {', '.join(places)}.")
-        part, entry = places[name]
-        changed: Any = replace(getattr(sim_params, part), **{entry: value})
-        sim_params = replace(sim_params, **{part: changed})
-    return sim_params
-
-
 class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Content of a parameter file."""
+
     schema: Annotated[str, Meta(pattern=f"^{SCHEMA}$")]
     robot: str
     machine: Any
+    imu: Any
+    fixture: Any
     joints: Annotated[dict[str, Any], Meta(min_length=1)]
     trunk: Any = {}
     attitude: Any = {}
@@ -208,30 +223,52 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 def parse_sim_params(body: Any, source: str) -> SimParams:
-    """Read parameters from the content of a YAML file, which errors call `source`."""
+    """Read parameters from the content of a YAML file.
+
+    Args:
+        body: The content.
+        source: Name of the file, for errors.
+
+    Raises:
+        RobotError: Content that is not a valid file of parameters.
+    """
+    if isinstance(body, Mapping) and body.get("schema") == "pronk/sim_params/1":
+        raise RobotError(
+            f"{source}: schema pronk/sim_params/1; this pronk reads {SCHEMA}, in which gyro_* and "
+            "accelerometer_* have left `machine` for a section `imu`, and clamp_* and stand_* for "
+            "a section `fixture`."
+        )
     try:
         file = msgspec.convert(body, _File)
     except msgspec.ValidationError as error:
-        known = ", ".join(_File.__struct_fields__)
-        raise RobotError(f"{source}: {error}; the entries are {known}.") from None
+        entries = ", ".join(_File.__struct_fields__)
+        raise RobotError(f"{source}: {error}; the entries are {entries}.") from None
+    joints = {}
+    for name, entry in file.joints.items():
+        joints[name] = read_bounded(JointParams, f"{source}: joints.{name}", entry)
+    # Terrain belongs to a scene, not to a machine.
+    ground = read_bounded(Ground, f"{source}: ground", file.ground, excluded=("terrain", "floor"))
     return SimParams(
         robot=file.robot,
-        machine=read(MachineParams, f"{source}: machine", file.machine),
-        joints={
-            name: read(JointParams, f"{source}: joints.{name}", entry)
-            for name, entry in file.joints.items()
-        },
-        trunk=read(TrunkParams, f"{source}: trunk", file.trunk),
-        attitude=read(AttitudeParams, f"{source}: attitude", file.attitude),
-        # Terrain belongs to a scene, not to a machine.
-        ground=read(Ground, f"{source}: ground", file.ground, without=("terrain", "floor")),
+        machine=read_bounded(MachineParams, f"{source}: machine", file.machine),
+        imu=read_bounded(ImuParams, f"{source}: imu", file.imu),
+        fixture=read_bounded(FixtureParams, f"{source}: fixture", file.fixture),
+        joints=joints,
+        trunk=read_bounded(TrunkParams, f"{source}: trunk", file.trunk),
+        attitude=read_bounded(AttitudeParams, f"{source}: attitude", file.attitude),
+        ground=ground,
     )
 
 
 def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = None) -> SimParams:
-    """Read a parameter file, by default the shipped one, whose match is the paper's Table I.
+    """Read a parameter file.
 
-    Without a file, those of another `robot` are `default_sim_params`.
+    Args:
+        path: The file; None for the shipped one, whose match is the paper's Table I.
+        robot: The robot, of which `default_sim_params` are returned where there is no file.
+
+    Raises:
+        RobotError: The file is missing or not a valid file of parameters.
     """
     if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
         return default_sim_params(robot)
@@ -250,31 +287,42 @@ def default_sim_params(robot: RobotSpec) -> SimParams:
     Tolerances are of the size that the virtual Mini Cheetah has. Timing and noise are those of the
     shipped file, the encoders as fine at the joint as its hips'.
     """
-    shipped = load_sim_params(SHIPPED).machine
+    shipped = load_sim_params(SHIPPED)
     drives = [joint.drive for joint in robot.joints]
-    gear = min(drive.gear_ratio for drive in drives)
+    smallest_gear_ratio = min(drive.gear_ratio for drive in drives)
+    smallest_effort_limit = min(drive.effort_limit for drive in drives)
+    extra_bits = max(0, math.ceil(math.log2(6.0 / smallest_gear_ratio)))
     machine = replace(
-        shipped,
+        shipped.machine,
         bus_voltage=max(drive.bus_voltage for drive in drives),
         bus_resistance=0.0,
-        encoder_bits=min(24, 14 + max(0, math.ceil(math.log2(6.0 / gear)))),
-        torque_noise=min(shipped.torque_noise, 0.003 * min(d.effort_limit for d in drives)),
+        encoder_bits=min(24, 14 + extra_bits),
+        torque_noise=min(shipped.machine.torque_noise, 0.003 * smallest_effort_limit),
     )
-    joints = {joint.name: _default_joint(robot, joint) for joint in robot.joints}
-    return SimParams(robot=robot.name, machine=machine, joints=joints)
+    return SimParams(
+        robot=robot.name,
+        machine=machine,
+        imu=shipped.imu,
+        fixture=shipped.fixture,
+        joints={joint.name: _default_joint(robot, joint) for joint in robot.joints},
+    )
 
 
 def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
+    """Derive the hidden parameters of a joint."""
     model = bench_spec(robot, joint.name).compile()
-    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data = mujoco.MjData(model)
+    inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
     mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, full)
+    mujoco.mj_fullM(model, data, inertia)
     dof = int(model.joint(joint.name).dofadr[0])
     # Inertia of the link at the belt, the others of its chain free to move.
-    link = 1.0 / float(np.linalg.inv(full)[dof, dof]) - float(model.dof_armature[dof])
-    link = max(link, 0.1 * float(full[dof, dof] - model.dof_armature[dof]))
-    rotor = 0.9 * joint.drive.armature or 0.1 * link  # where the model has none
+    link = 1.0 / float(np.linalg.inv(inertia)[dof, dof]) - float(model.dof_armature[dof])
+    link = max(link, 0.1 * float(inertia[dof, dof] - model.dof_armature[dof]))
+    rotor = 0.9 * joint.drive.armature
+    if rotor == 0.0:  # the model has none
+        rotor = 0.1 * link
     reduced = rotor * link / (rotor + link)
     belt = (2.0 * math.pi * _RING_HZ) ** 2 * reduced
     coulomb = max(0.8 * joint.drive.frictionloss, 0.002 * joint.drive.effort_limit)

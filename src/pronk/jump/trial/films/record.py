@@ -198,7 +198,7 @@ def _plan_run(row: TrialRun, folder: Path, robot: RobotSpec, slow: float) -> Fil
         span = (on - _BEFORE_S, on + _AFTER_S)
         note += ", no jump"
     return plan_film(
-        captures.load(folder / row.capture),
+        captures.load_capture(folder / row.capture),
         robot=robot.source,
         title=row.case if "," in row.case else f"{row.case} m/s",
         note=note,
