@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
-from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 from pronk.identify.logs.segment import Segment
+from pronk.identify.logs.sweep_writer import LogHeader, McapLogWriter
 
 LEG = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
 

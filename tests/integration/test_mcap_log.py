@@ -17,12 +17,12 @@ from mcap.reader import make_reader
 
 from log_files import example, write_mcap
 from pronk.errors import LogError
-from pronk.identify.logs import mcap_log
+from pronk.identify.logs import sweep_writer
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
+from pronk.identify.logs.sweep_writer import LogHeader, McapLogWriter
 
 LOG = example()
 NAMES = ("robot", "joints", "segments", "units")
@@ -68,18 +68,18 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        assert {c.topic for c in summary.channels.values()} == set(mcap_log.TOPICS)
+        assert {c.topic for c in summary.channels.values()} == set(sweep_writer.TOPICS)
         assert all(c.message_encoding == "json" for c in summary.channels.values())
         for schema in summary.schemas.values():
             assert schema.encoding == "jsonschema"
             assert json.loads(schema.data)["type"] == "object"
         messages = [(c.topic, json.loads(m.data)) for _, c, m in reader.iter_messages()]
-    samples = [body for topic, body in messages if topic == mcap_log.SAMPLE]
+    samples = [body for topic, body in messages if topic == sweep_writer.SAMPLE]
     assert len(samples) == 2000
     assert samples[0]["frequency"] is None
     # In time order the excitation is announced before its first sample.
     order = [(topic, body.get("segment")) for topic, body in messages]
-    assert order.index((mcap_log.SEGMENT, None)) < order.index((mcap_log.SAMPLE, 0))
+    assert order.index((sweep_writer.SEGMENT, None)) < order.index((sweep_writer.SAMPLE, 0))
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ KILLED = """
 import time
 from pathlib import Path
 from pronk.identify.logs.segment import Segment
-from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
+from pronk.identify.logs.sweep_writer import LogHeader, McapLogWriter
 writer = McapLogWriter(Path({path!r}), LogHeader(robot="mini_cheetah", joints=("knee",)))
 writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))
 for k in range(1, 1000):

@@ -19,10 +19,10 @@ from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.files import SIZE_LIMIT, read_yaml, write_text
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import McapWriter
-from pronk.identify.logs.mcap_log import HEADER, SAMPLE, SEGMENT, TOPICS
-from pronk.identify.logs.mcap_log import SCHEMA as SWEEP
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import find_logs, read_log
+from pronk.identify.logs.sweep_writer import HEADER, SAMPLE, SEGMENT, TOPICS
+from pronk.identify.logs.sweep_writer import SCHEMA as SWEEP
 from pronk.identify.match import gains
 from pronk.identify.response.response import FrequencyResponse
 from pronk.jump.trial import results

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.records import Record, SampleKind
 from pronk.deploy.runtime.sweep import SweepTask
-from pronk.identify.logs.mcap_log import LogHeader, McapLogWriter
 from pronk.identify.logs.segment import Segment
+from pronk.identify.logs.sweep_writer import LogHeader, McapLogWriter
 
 
 class SweepLogs:

@@ -11,7 +11,7 @@ from pronk.deploy.runtime.safety import SafetyFilter
 from pronk.deploy.runtime.sweep import SweepController, SweepTask
 from pronk.deploy.runtime.sweep_logs import SweepLogs
 from pronk.errors import HardwareError
-from pronk.identify.logs.mcap_log import reason_of
+from pronk.identify.logs.sweep_writer import reason_of
 from pronk.robots.machine import Machine
 
 

@@ -15,8 +15,8 @@ from pronk.files import sha256
 from pronk.identify.logs.columns import command_index, ordered_joints
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record, read_records
-from pronk.identify.logs.mcap_log import read_sweep
 from pronk.identify.logs.options import ReadOptions
+from pronk.identify.logs.sweep_reader import read_sweep
 from pronk.robots.robot import RobotSpec
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
