@@ -1,6 +1,6 @@
 """Draw docs/wings.svg: the three wings of pronk, and the files in which they meet.
 
-    python scripts/wings_figure.py
+python scripts/wings_figure.py
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from rich.text import Text
 
 from pronk.errors import HardwareError
 from pronk.files import write_text
-from pronk.tables import Table
+from pronk.tables import Column, Table
 
 _PIPED_WIDTH = 200
 """Characters of a line where standard output is not a terminal."""
@@ -143,7 +143,7 @@ def table(
 
 
 def show_sheet(sheet: Any, title: str = "") -> None:
-    """Print a sheet of a trial; to be replaced by `show`."""
+    """Print a sheet of text; to be replaced by `show`."""
     if sheet is not None:
         show(table(sheet.title or title, sheet.columns, sheet.rows))
         for sentence in sheet.notes:
@@ -152,9 +152,12 @@ def show_sheet(sheet: Any, title: str = "") -> None:
 
 def show_table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str) -> None:
     """Print a table; to be replaced by `show`."""
-    from pronk.jump.trial.tables import table as make_sheet
-
-    show_sheet(make_sheet(columns, rows, *notes, title=title))
+    parsed = []
+    for head in columns.split(" | "):
+        heading, _, digits = head.partition(";")
+        parsed.append(Column(heading=heading, digits=int(digits or 3)))
+    cells = tuple(tuple(row) for row in rows)
+    show(Table(title=title, columns=tuple(parsed), rows=cells, notes=notes))
 
 
 def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:

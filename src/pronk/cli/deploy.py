@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from pronk.cli import console
-from pronk.cli.options import Base, LinkOptions
+from pronk.cli.link_options import Base, LinkOptions
 from pronk.deploy.runtime.poses import RunTiming
 from pronk.errors import HardwareError, PronkError
 from pronk.tables import Column, Table

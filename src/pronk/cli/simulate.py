@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from pronk.cli import console
-from pronk.cli.options import Base, Layout
+from pronk.cli.link_options import Base, Layout
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:

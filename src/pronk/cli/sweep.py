@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from pronk.cli import console
-from pronk.cli.options import LinkOptions
+from pronk.cli.link_options import LinkOptions
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
