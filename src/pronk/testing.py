@@ -101,16 +101,24 @@ def check_reader(
 
     The log has two samples or more, one command and one position a joint, finite and increasing
     timestamps in seconds, its source and hash; reading twice gives the same log; a missing
-    and an empty file are refused with a LogError. The reader gets the robot and the options.
+    and an empty file are refused with a LogError.
+
+    Args:
+        reader: The reader.
+        path: The file.
+        robot: The robot, which the reader gets.
+        options: How the file is read; the defaults if None.
+
+    Raises:
+        PronkError: A rule of the protocol is broken; the message names it.
     """
     stated = ReadOptions() if options is None else options
     log = reader.read(path, robot, stated)
     _require(isinstance(log, JointLog), "read: a JointLog is returned")
     shape = (len(log.time), len(log.joints))
     _require(shape[0] >= 2 and shape[1] >= 1, "read: two samples and one joint or more")
-    for name in ("command", "position"):
-        values = np.asarray(getattr(log, name))
-        _require(values.shape == shape, f"read: {name} has the shape (samples, joints)")
+    for name, values in (("command", log.command), ("position", log.position)):
+        _require(np.shape(values) == shape, f"read: {name} has the shape (samples, joints)")
         _require(bool(np.isfinite(values).all()), f"read: {name} is finite")
     _require(bool((np.diff(log.time) > 0.0).all()), "read: timestamps increase")
     _require(log.source == str(path), "read: source is the path")
@@ -118,11 +126,12 @@ def check_reader(
     again = reader.read(path, robot, stated)
     _require(np.array_equal(again.position, log.position), "read: repeatable")
     with TemporaryDirectory() as folder:
-        missing, empty = Path(folder, f"missing{path.suffix}"), Path(folder, f"empty{path.suffix}")
+        missing = Path(folder, f"missing{path.suffix}")
+        empty = Path(folder, f"empty{path.suffix}")
         empty.touch()
-        for wrong in (missing, empty):
-            rule = f"read: a file that is {wrong.stem} is refused with a LogError"
-            _require_refused(LogError, rule, partial(reader.read, wrong, robot, stated))
+        for file in (missing, empty):
+            rule = f"read: a file that is {file.stem} is refused with a LogError"
+            _require_refused(LogError, rule, partial(reader.read, file, robot, stated))
 
 
 def check_link(

@@ -204,11 +204,11 @@ class ChainSimulation(Closing):
             start, command = self._commanded(log)
             steps = int(np.ceil((log.time[-1] - log.time[0]) / timestep)) + 1
             edges = log.time[0] + timestep * np.arange(steps + 1)
-            held = np.empty((len(sets), steps, len(names)))
+            delayed_command = np.empty((len(sets), steps, len(names)))
             for run, column in np.ndindex(delay.shape):
                 track = held_mean(log.time, command[:, column], edges - delay[run, column])
-                held[run, :, column] = track - offset[run, column]
-            positions = self._chain.rollout(held, drive_values, start - offset)
+                delayed_command[run, :, column] = track - offset[run, column]
+            positions = self._chain.rollout(delayed_command, drive_values, start - offset)
             for run, response in enumerate(responses):
                 sampled = _sampled(positions[run], log.time, timestep) + offset[run]
                 response.append(sampled[:, columns])

@@ -185,8 +185,8 @@ def delayed(command: Array, steps: Array) -> Array:
     """
     whole_steps = np.floor(steps).astype(np.int64)
     share = (steps - whole_steps)[:, None]
-    last = command.shape[1] - 1
-    index = np.arange(last + 1)[None, :, None] - whole_steps[:, None]
-    arrived = np.take_along_axis(command, np.clip(index, 0, last), axis=1)
-    before = np.take_along_axis(command, np.clip(index - 1, 0, last), axis=1)
+    last_step = command.shape[1] - 1
+    index = np.arange(last_step + 1)[None, :, None] - whole_steps[:, None]
+    arrived = np.take_along_axis(command, np.clip(index, 0, last_step), axis=1)
+    before = np.take_along_axis(command, np.clip(index - 1, 0, last_step), axis=1)
     return np.asarray((1.0 - share) * arrived + share * before)

@@ -247,7 +247,7 @@ class JointTestRig(Chain):
         centre = np.empty(size)
         shared_trace = len(traces) == 1
         # Where gravity leaves the chain, by the stiffness of the excited joint.
-        rest: dict[float, Array] = {}
+        rest_by_stiffness: dict[float, Array] = {}
         for begin in range(0, total, size):
             count = min(size, total - begin)
             for row in range(count):
@@ -261,10 +261,10 @@ class JointTestRig(Chain):
                     centre[row] = pose[self.index]
                     control[row][:, self._columns] = pose
                     control[row][:, self.actuator] += np.repeat(offsets, iterations)
-                if not shared_trace or stiffness not in rest:
+                if not shared_trace or stiffness not in rest_by_stiffness:
                     target = control[row][0, self._columns]
-                    rest[stiffness] = self.equilibrium(target, stiffness)
-                initial[row, 1 : 1 + self.model.nq] = rest[stiffness]
+                    rest_by_stiffness[stiffness] = self.equilibrium(target, stiffness)
+                initial[row, 1 : 1 + self.model.nq] = rest_by_stiffness[stiffness]
             self._pool.rollout(
                 self._models[:count],
                 self._data,

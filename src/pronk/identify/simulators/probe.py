@@ -351,13 +351,13 @@ class _Bench:
         position = self._run(command, values)
         step = np.arange(command.shape[1])
         read_step = np.maximum((step - phase) // hold * hold + phase, 0)
-        held = command[0, np.minimum(read_step, step)] + self._joint.default_position
+        held_command = command[0, np.minimum(read_step, step)] + self._joint.default_position
         pose[index] = 0.0
         gravity_at_zero = float(links.gravity_torque(pose)[index])
         pose[index] = 0.5 * np.pi
         gravity_at_quarter = float(links.gravity_torque(pose)[index])
         return _Runs(
-            command=np.tile(held[:, None], (1, runs)),
+            command=np.tile(held_command[:, None], (1, runs)),
             position=position.T,
             stiffness=stiffness,
             damping=damping,
@@ -556,8 +556,8 @@ def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
                     rises += 1
                 else:
                     rises = 0
-                least = min(other.residual for other in fits)
-                if rises == 2 or (iterations >= 4 and fit.residual > _FAR * least):
+                least_residual = min(other.residual for other in fits)
+                if rises == 2 or (iterations >= 4 and fit.residual > _FAR * least_residual):
                     break
                 previous = fit
     return fits

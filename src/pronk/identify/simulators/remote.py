@@ -164,7 +164,7 @@ class RemoteSimulator(Closing):
 
     def _ask(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Send a message and return the answer."""
-        where = f"simulator {self._choice} in {self._python}"
+        origin = f"simulator {self._choice} in {self._python}"
         try:
             send(self._child.stdin, header, arrays)  # type: ignore[arg-type]
             answer_header, answer_arrays = receive(self._child.stdout)  # type: ignore[arg-type]
@@ -175,10 +175,11 @@ class RemoteSimulator(Closing):
             if last_line:
                 reason = f"{reason}: {last_line}"
             raise PronkError(
-                f"{where} ended with {reason}; it needs Python 3.11 or later, NumPy and the engine."
+                f"{origin} ended with {reason}; it needs Python 3.11 or later, NumPy and the "
+                "engine."
             ) from None
         if "error" in answer_header:
-            raise PronkError(f"{where}: {answer_header['error']}")
+            raise PronkError(f"{origin}: {answer_header['error']}")
         return answer_header, answer_arrays
 
     def _last_line(self) -> str:
