@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.deploy.runtime.limits import AgeLimits, Limits
-from pronk.deploy.runtime.reasons import Decision, FilterAction, Reason
+from pronk.deploy.runtime.reasons import REASONS, Decision, FilterAction, Reason
 from pronk.deploy.runtime.rules import SafetyInput, apply_rules, tilt
 from pronk.deploy.runtime.safety import LEAST_DAMPING_S, SafetyFilter
 from pronk.errors import RobotError
@@ -31,26 +31,52 @@ def operating(**changes: float) -> Limits:
 
 
 def command(**changes: Any) -> Command:
-    whole = {"position": POSE, "stiffness": KP, "damping": KD, "state_sequence": 100}
-    return Command(**(whole | {"valid_for": 0.05} | changes))
+    """A command to the default pose, with changes."""
+    fields: dict[str, Any] = {
+        "position": POSE,
+        "stiffness": KP,
+        "damping": KD,
+        "state_sequence": 100,
+        "valid_for": 0.05,
+    }
+    fields.update(changes)
+    return Command(**fields)
 
 
 def judged(
-    s: State, c: Command, t: float = 0.0, *, limits: Limits = LIMITS, **more: Any
+    measured: State,
+    desired: Command,
+    t: float = 0.0,
+    *,
+    limits: Limits = LIMITS,
+    sent_target: np.ndarray | None = None,
+    dead_man: bool = True,
+    earlier: tuple[State, ...] = (),
 ) -> tuple[Command | None, Decision, SafetyFilter]:
     """What a filter makes of a state and a command, and the filter."""
-    held, earlier = more.pop("held", True), more.pop("earlier", [])
     safety = SafetyFilter(limits=limits)
-    safety.sent_target = more.pop("last", None)
-    sent, decision = safety.judge([*earlier, s], c, t, dead_man=held)
+    safety.sent_target = sent_target
+    sent, decision = safety.judge([*earlier, measured], desired, t, dead_man=dead_man)
     return sent, decision, safety
 
 
-def found(s: State, c: Command, **more: Any) -> Reason:
-    return judged(s, c, **more)[1].reason
+def reason_of(
+    measured: State,
+    desired: Command,
+    *,
+    sent_target: np.ndarray | None = None,
+    dead_man: bool = True,
+    earlier: tuple[State, ...] = (),
+) -> Reason:
+    """Why a filter acts on a state and a command."""
+    _, decision, _ = judged(
+        measured, desired, sent_target=sent_target, dead_man=dead_man, earlier=earlier
+    )
+    return decision.reason
 
 
 def at(values: Any, value: float, index: int = -1) -> np.ndarray:
+    """An array with another value at an index."""
     array = np.array(values, dtype=float)
     array[index] = value
     return array
@@ -80,39 +106,39 @@ def test_a_command_within_all_limits_passes_unchanged() -> None:
     ],
 )
 def test_an_old_state_holds_then_damps_then_latches(age_s: float, reason: Reason) -> None:
-    last = POSE + 0.2
+    sent_target = POSE + 0.2
     desired = command(position=POSE + 0.4, made=age_s)
-    sent, decision, _ = judged(state(), desired, age_s, last=last)
+    sent, decision, _ = judged(state(), desired, age_s, sent_target=sent_target)
     assert decision.reason is reason
     if reason is Reason.OLD_STATE:
         assert sent is not None
-        np.testing.assert_array_equal(sent.position, last)
+        np.testing.assert_array_equal(sent.position, sent_target)
 
 
 def test_each_reason_has_its_level() -> None:
-    others = {
+    reasons_of_level = {
         FilterAction.PASS: {Reason.NONE},
         FilterAction.HOLD: {Reason.OLD_STATE},
         FilterAction.LIMIT: {Reason.POSITION, Reason.CHANGE, Reason.TORQUE, Reason.POWER},
         FilterAction.DAMP: {Reason.NO_STATE, Reason.DEAD_MAN, Reason.ENDED, Reason.HELD},
     }
-    for level, reasons in others.items():
+    for level, reasons in reasons_of_level.items():
         assert {reason for reason in Reason if reason.level is level} == reasons
 
 
-@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
-def test_what_is_not_a_number_latches(wrong: float) -> None:
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_what_is_not_a_number_latches(number: float) -> None:
     for name in ("position", "velocity", "gyro", "orientation"):
-        s = state(**{name: at(getattr(state(), name), wrong)})
-        assert found(s, command()) == Reason.STATE_NOT_FINITE
+        s = state(**{name: at(getattr(state(), name), number)})
+        assert reason_of(s, command()) == Reason.STATE_NOT_FINITE
     for name in ("position", "stiffness", "damping"):
-        c = command(**{name: at(getattr(command(), name), wrong)})
-        assert found(state(), c) == Reason.COMMAND_NOT_FINITE
+        c = command(**{name: at(getattr(command(), name), number)})
+        assert reason_of(state(), c) == Reason.COMMAND_NOT_FINITE
 
 
 @pytest.mark.parametrize("shape", [np.zeros(N + 1), np.zeros((2, N)), None, "legs"])
 def test_a_command_of_another_shape_latches(shape: Any) -> None:
-    assert found(state(), command(position=shape)) == Reason.COMMAND_NOT_FINITE
+    assert reason_of(state(), command(position=shape)) == Reason.COMMAND_NOT_FINITE
 
 
 @pytest.mark.parametrize(
@@ -145,7 +171,7 @@ def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) ->
     assert "\n" not in decision.text
     # In an earlier state of the tick it counts too.
     if s.sequence == 100 and s.time == 0.0:
-        assert found(state(), c, earlier=[s]) is reason
+        assert reason_of(state(), c, earlier=(s,)) is reason
 
 
 def test_just_within_the_limits_is_no_fault() -> None:
@@ -156,9 +182,9 @@ def test_just_within_the_limits_is_no_fault() -> None:
         temperature=at(np.full(N, np.nan), 79.0),
         sequence=130,
     )
-    last = np.minimum(s.position, 2.5)
-    assert found(s, command(position=last), last=last).level <= FilterAction.LIMIT
-    assert found(state(), command(), held=False) is Reason.DEAD_MAN
+    target = np.minimum(s.position, 2.5)
+    assert reason_of(s, command(position=target), sent_target=target).level <= FilterAction.LIMIT
+    assert reason_of(state(), command(), dead_man=False) is Reason.DEAD_MAN
 
 
 @pytest.mark.parametrize("reason", [Reason.NO_STATE, Reason.TILT])
@@ -185,10 +211,14 @@ def test_a_fault_can_only_become_worse() -> None:
 
 
 def moved(
-    s: State, target: np.ndarray, last: np.ndarray | None = None, limits: Limits = LIMITS
+    measured: State,
+    target: np.ndarray,
+    sent_target: np.ndarray | None = None,
+    limits: Limits = LIMITS,
 ) -> tuple[np.ndarray, Reason]:
     """The target that is sent, and why it was moved."""
-    sent, decision, _ = judged(s, command(position=target), limits=limits, last=last)
+    desired = command(position=target)
+    sent, decision, _ = judged(measured, desired, limits=limits, sent_target=sent_target)
     assert sent is not None
     assert decision.level is FilterAction.LIMIT
     return sent.position, decision.reason
@@ -250,45 +280,52 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
         size = 10.0 ** rng.uniform(-2.0, 0.7, (count, 1))
         return np.asarray(centre + scale * size * rng.standard_normal(shape))
 
-    many = (count, N)
+    of_joints = (count, N)
     orientation = np.array([1.0, 0.0, 0.0, 0.0]) + rng.uniform(0, 0.6, (count, 1)) * (
         rng.standard_normal((count, 4))
     )
     orientation /= np.linalg.norm(orientation, axis=-1, keepdims=True)
-    position = spread(many, POSE, 0.5)
-    given = SafetyInput(
+    position = spread(of_joints, POSE, 0.5)
+    temperature = rng.uniform(20.0, 82.0, of_joints)
+    temperature[rng.random(of_joints) < 0.5] = np.nan
+    drawn = SafetyInput(
         position=position,
-        velocity=spread(many, 0.0, 5.0),
+        velocity=spread(of_joints, 0.0, 5.0),
         orientation=orientation,
         torque=np.full((count, 12), np.nan),
         gyro=spread((count, 3), 0.0, 1.0),
-        temperature=np.where(rng.random(many) < 0.5, np.nan, rng.uniform(20.0, 82.0, many)),
+        temperature=np.where(
+            rng.random(of_joints) < 0.5, np.nan, rng.uniform(20.0, 82.0, of_joints)
+        ),
         state_age=rng.exponential(0.01, count),
-        target=position + spread(many, 0.0, 1.0),
-        stiffness=np.abs(spread(many, KP, 5.0)) * (rng.random((count, 1)) > 0.05),
-        damping=np.abs(spread(many, KD, 0.2)),
+        target=position + spread(of_joints, 0.0, 1.0),
+        stiffness=np.abs(spread(of_joints, KP, 5.0)) * (rng.random((count, 1)) > 0.05),
+        damping=np.abs(spread(of_joints, KD, 0.2)),
         command_age=rng.exponential(0.01, count),
         valid_for=rng.choice([0.01, 0.05, math.inf], count),
         lag=rng.integers(0, 35, count).astype(float),
-        previous=position + spread(many, 0.0, 0.3),
+        previous=position + spread(of_joints, 0.0, 0.3),
         dead_man=rng.random(count) < 0.95,
     )
-    for values in (given.position, given.velocity, given.gyro, given.target, given.previous):
+    for values in (drawn.position, drawn.velocity, drawn.gyro, drawn.target, drawn.previous):
         struck = rng.random(values.shape) < 0.001
         values[struck] = rng.choice([math.nan, math.inf, -math.inf, 1e300], struck.sum())
-    return given
+    return drawn
 
 
-def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
+def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
     """Which rows that were sent break which limit; written anew, not the filter's own code."""
     slack = 1e-6
-    q, v, kp, kd = given.position, given.velocity, given.stiffness, given.damping
+    q = drawn.position
+    v = drawn.velocity
+    kp = drawn.stiffness
+    kd = drawn.damping
     torque = kp * (target - q) - kd * v
     top = limits.joints.stall * (1.0 - v / limits.joints.no_load)
     bottom = -limits.joints.stall * (1.0 + v / limits.joints.no_load)
     applied = np.clip(torque, bottom, top)
     power = (np.maximum(applied * v, 0.0) + limits.joints.loss * applied**2).sum(axis=-1)
-    w, x, y, z = given.orientation.T
+    w, x, y, z = drawn.orientation.T
     upright = w * w - x * x - y * y + z * z
     ahead = q + limits.operating.horizon_s * v
     out = (ahead > limits.joints.high - limits.operating.margin) & (target > q + slack)
@@ -306,16 +343,16 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
             | (target > limits.joints.high - limits.operating.margin + slack)
             | (out & inside)
         ).any(axis=-1),
-        "change": (np.abs(target - given.previous) > limits.operating.change + slack).any(axis=-1),
+        "change": (np.abs(target - drawn.previous) > limits.operating.change + slack).any(axis=-1),
         "torque": (np.abs(torque) > limits.joints.torque + slack).any(axis=-1),
         "power": power > limits.operating.power_w * (1.0 + slack),
         "tilt": upright < math.cos(limits.operating.tilt) - slack,
         "speed": (np.abs(v) > limits.joints.speed).any(axis=-1),
-        "temperature": (given.temperature > limits.operating.temperature).any(axis=-1),
-        "age": given.state_age > limits.ages.damp_s,
-        "expiry": given.command_age > np.minimum(given.valid_for, limits.ages.expiry_s),
-        "lag": given.lag > limits.ages.lag,
-        "dead man": ~given.dead_man,
+        "temperature": (drawn.temperature > limits.operating.temperature).any(axis=-1),
+        "age": drawn.state_age > limits.ages.damp_s,
+        "expiry": drawn.command_age > np.minimum(drawn.valid_for, limits.ages.expiry_s),
+        "lag": drawn.lag > limits.ages.lag,
+        "dead man": ~drawn.dead_man,
         "gains": (
             (kp < 0)
             | (kp > limits.operating.stiffness)
@@ -327,30 +364,35 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
 
 def test_a_million_states_and_commands_break_no_limit() -> None:
     rng = np.random.default_rng(240415096)
-    chunk, met, passed = 5_000, np.zeros(len(Reason), dtype=int), np.zeros(5, dtype=int)
+    chunk = 5_000
+    times_met = np.zeros(len(Reason), dtype=int)
+    times_of_level = np.zeros(len(FilterAction), dtype=int)
     limits = operating(power_w=2000.0)
     for _ in range(200):
-        given = wild(rng, chunk)
-        result = apply_rules(given, limits)
-        met += np.bincount(result.reason, minlength=len(Reason))
-        passed += np.bincount(result.level, minlength=5)
+        drawn = wild(rng, chunk)
+        result = apply_rules(drawn, limits)
+        times_met += np.bincount(result.reason, minlength=len(Reason))
+        times_of_level += np.bincount(result.level, minlength=len(FilterAction))
         sent = result.level < FilterAction.DAMP
         with np.errstate(invalid="ignore", over="ignore"):
-            for name, wrong in broken(given, result.target, limits).items():
-                assert not (wrong & sent).any(), name
+            for name, breaks in broken(drawn, result.target, limits).items():
+                assert not (breaks & sent).any(), name
         # A command that is passed is the one that was requested, to the last bit.
-        same = result.level == FilterAction.PASS
-        np.testing.assert_array_equal(result.target[same], given.target[same])
-        held = result.level == FilterAction.HOLD
-        assert (given.state_age[held] > limits.ages.hold_s).all()
+        passed = result.level == FilterAction.PASS
+        np.testing.assert_array_equal(result.target[passed], drawn.target[passed])
+        holds = result.level == FilterAction.HOLD
+        assert (drawn.state_age[holds] > limits.ages.hold_s).all()
     # Every rule acted, and enough passed for the test to mean something.
-    silent = {Reason(i) for i in np.flatnonzero(met == 0)}
-    over_time = {reason for reason in Reason if reason >= Reason.REPEATED}
-    assert silent - over_time <= {
-        *(Reason.CLOCK, Reason.STATE_LOST, Reason.ENDED, Reason.LINK, Reason.OVERLOAD)
-    }
-    assert passed.min() > 1000
-    assert passed.sum() == 1_000_000
+    silent = {Reason(number) for number in np.flatnonzero(times_met == 0)}
+    rules_over_time = {reason for reason in Reason if reason >= Reason.REPEATED}
+    rare = {Reason.CLOCK, Reason.STATE_LOST, Reason.ENDED, Reason.LINK, Reason.OVERLOAD}
+    assert silent - rules_over_time <= rare
+    assert times_of_level.min() > 1000
+    assert times_of_level.sum() == 1_000_000
+
+
+def test_the_table_of_reasons_is_in_the_order_of_their_numbers() -> None:
+    assert [entry.reason for entry in REASONS] == list(Reason)
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -360,19 +402,28 @@ numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
     values=st.lists(numbers, min_size=3 * N + 7, max_size=3 * N + 7),
     ages=st.tuples(numbers, numbers, numbers),
     sequences=st.tuples(st.integers(-5, 200), st.integers(-5, 200)),
-    held=st.booleans(),
+    dead_man=st.booleans(),
 )
 def test_any_input_gives_a_command_within_the_limits_or_damping(
-    values: list[float], ages: tuple[float, ...], sequences: tuple[int, int], held: bool
+    values: list[float], ages: tuple[float, ...], sequences: tuple[int, int], dead_man: bool
 ) -> None:
-    q, v, target, gyro, orientation = np.split(np.array(values), (N, 2 * N, 3 * N, 3 * N + 3))
-    s = state(time=-ages[0], sequence=sequences[0], position=q, velocity=v)
-    s = replace(s, gyro=gyro, orientation=orientation)
-    c = command(position=target, made=-ages[1], valid_for=ages[2], state_sequence=sequences[1])
-    sent, decision, safety = judged(s, c, held=held)
+    parts = np.split(np.array(values), (N, 2 * N, 3 * N, 3 * N + 3))
+    position, velocity, target, gyro, orientation = parts
+    measured = state(
+        time=-ages[0],
+        sequence=sequences[0],
+        position=position,
+        velocity=velocity,
+        gyro=gyro,
+        orientation=orientation,
+    )
+    desired = command(
+        position=target, made=-ages[1], valid_for=ages[2], state_sequence=sequences[1]
+    )
+    sent, decision, safety = judged(measured, desired, dead_man=dead_man)
     assert (sent is None) == (decision.level >= FilterAction.DAMP) == safety.faulted
     if sent is not None:
         assert np.isfinite(sent.position).all()
         assert (sent.position >= LIMITS.joints.low).all()
         assert (sent.position <= LIMITS.joints.high).all()
-        assert held
+        assert dead_man
