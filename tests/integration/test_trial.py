@@ -193,7 +193,7 @@ def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> N
     [
         ({"joint_names": tuple(reversed(ROBOT.joint_names))}, "joint_names"),
         ({"jump": False}, "walk only"),
-        (None, "not an ONNX network"),
+        (None, "not a network"),
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(

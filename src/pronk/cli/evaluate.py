@@ -57,8 +57,13 @@ def evaluate(
     errors = {} if before is None else load_speed_errors(before)
     subject = adapter.load_subject(policy, where)
     robot = load_task(subject.robot).robot
-    walks, jumps = () if what == "jump" else WALKS, () if what == "walk" else JUMPS
-    plan = Plan(robot=robot, robots=robots, seed=seed, walks=walks, jumps=jumps)
+    plan = Plan(
+        robot=robot,
+        robots=robots,
+        seed=seed,
+        walks=() if what == "jump" else WALKS,
+        jumps=() if what == "walk" else JUMPS,
+    )
     if plan.jumps and not subject.jump:
         raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
     drives = training_gains(gains, robot, like=like)

@@ -35,5 +35,11 @@ RANGES = (2.0, 0.05)
 def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and deviation of `height`, `distance` or `gap` [m] by policy and command."""
     if figure == "gap":
-        return {"matched": {command: (gap, math.nan) for command, gap in PAPER_GAPS.items()}}
-    return {gains: dict(TABLE_III[figure, gains]) for gains in ("naive", "matched")}
+        gaps = {}
+        for command, gap in PAPER_GAPS.items():
+            gaps[command] = (gap, math.nan)
+        return {"matched": gaps}
+    return {
+        "naive": dict(TABLE_III[figure, "naive"]),
+        "matched": dict(TABLE_III[figure, "matched"]),
+    }

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from pronk.arrays import Array
 from pronk.jump.trial.condition_trial import ConditionCell, ConditionResults
+from pronk.jump.trial.conditions import Condition
 from pronk.jump.trial.results import Spread
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
@@ -175,37 +176,33 @@ def draw_conditions(results: ConditionResults) -> MplFigure:
 
     Each series of conditions is a column of panels; conditions by themselves are one more.
     """
-    series = [condition.series for condition in results.conditions]
-    columns = sorted(set(series), key=series.index)
-    policies = [subject.name for subject in results.subjects]
-    look_by_policy = looks(policies)
+    look_by_policy = looks(results.policy_names)
+    columns: dict[str, list[Condition]] = {}
+    for condition in results.conditions:
+        columns.setdefault(condition.series, []).append(condition)
     with drawing(4, len(columns), height=9.0, sharex="col", sharey="row") as (figure, grid):
-        for column, name in enumerate(columns):
-            conditions = [each for each in results.conditions if each.series == name]
-            if name:
-                places = np.array([condition.place for condition in conditions], dtype=float)
+        for column, (series, conditions) in enumerate(columns.items()):
+            if series:
+                conditions = sorted(conditions, key=lambda condition: condition.place or 0.0)
+                places = np.array([condition.place for condition in conditions])
+                grid[-1, column].set_xlabel(series)
             else:
-                places = np.arange(len(conditions), dtype=float)
-            order = np.argsort(places, kind="stable")
-            for policy in policies:
-                cells = []
-                for index in order:
-                    cells.append(results.cell(policy, conditions[index].name))
-                for row, outcome in enumerate(_outcomes(cells)):
-                    axes = grid[row, column]
-                    look = look_by_policy[policy]
-                    line = "-" if name else "none"
-                    axes.plot(places[order], outcome.value, linestyle=line, **look)
-                    axes.vlines(places[order], outcome.low, outcome.high, color=look["color"])
-                    if column == 0:
-                        axes.set_ylabel(outcome.label)
-            if name:
-                grid[-1, column].set_xlabel(name)
-            else:
+                places = np.arange(len(conditions))
                 labels = [condition.name for condition in conditions]
                 grid[-1, column].set_xticks(places, labels, rotation=30, ha="right")
+            for policy, look in look_by_policy.items():
+                cells = []
+                for condition in conditions:
+                    cells.append(results.cell(policy, condition.name))
+                for row, outcome in enumerate(_outcomes(cells)):
+                    axes = grid[row, column]
+                    line = "-" if series else "none"
+                    axes.plot(places, outcome.value, linestyle=line, **look)
+                    axes.vlines(places, outcome.low, outcome.high, color=look["color"])
+                    if column == 0:
+                        axes.set_ylabel(outcome.label)
         grid[0, 0].set_ylim(-0.04, 1.04)
-        keys = _policy_keys(policies)
+        keys = _policy_keys(results.policy_names)
         bar_look: dict[str, Any] = {"color": "#444444", "marker": "|", "linestyle": "none"}
         keys.append(key("95 % interval of the share; standard deviation", **bar_look))
         legend(figure, keys)
@@ -214,23 +211,30 @@ def draw_conditions(results: ConditionResults) -> MplFigure:
 
 def _outcomes(cells: Sequence[ConditionCell]) -> list[_Outcome]:
     """Return the rows of the figure, of one policy under several conditions."""
-    landed = _Outcome(
-        label="landed [1]",
-        value=np.array([cell.landed_share for cell in cells]),
-        low=np.array([cell.landed_interval[0] for cell in cells]),
-        high=np.array([cell.landed_interval[1] for cell in cells]),
-    )
+    shares = []
+    intervals = []
+    heights = []
+    distances = []
+    velocity_errors = []
+    for cell in cells:
+        shares.append(cell.landed_share)
+        intervals.append(cell.landed_interval)
+        heights.append((cell.height.mean, cell.height.std))
+        distances.append((cell.distance.mean, cell.distance.std))
+        velocity_errors.append((cell.velocity_error.mean, cell.velocity_error.std))
+    low, high = np.array(intervals).T
     return [
-        landed,
-        _spread_outcome("height [m]", [cell.height for cell in cells]),
-        _spread_outcome("distance [m]", [cell.distance for cell in cells]),
-        _spread_outcome("velocity error [m/s]", [cell.velocity_error for cell in cells]),
+        _Outcome(label="landed [1]", value=np.array(shares), low=low, high=high),
+        _spread_outcome("height [m]", heights),
+        _spread_outcome("distance [m]", distances),
+        _spread_outcome("velocity error [m/s]", velocity_errors),
     ]
 
 
-def _spread_outcome(label: str, spreads: Sequence[Spread]) -> _Outcome:
-    mean = np.array([spread.mean for spread in spreads])
-    std = np.nan_to_num(np.array([spread.std for spread in spreads]))
+def _spread_outcome(label: str, spreads: Sequence[tuple[float, float]]) -> _Outcome:
+    """Return the row of an outcome by its means and standard deviations, NaN of one jump."""
+    mean, std = np.array(spreads).T
+    std = np.nan_to_num(std)
     return _Outcome(label=label, value=mean, low=mean - std, high=mean + std)
 
 

@@ -53,22 +53,15 @@ class CapturedTraces:
     """Roll rate [rad/s] over the time since the command to run, of `RATES` alone."""
     pitch_rate: Runs
     """Pitch rate [rad/s] over the time since the command to run, of `RATES` alone."""
+    captured: int
+    """Number of runs with a capture."""
     missing: int
     """Number of captures that the trial kept and the folder has not."""
-
-    @property
-    def captured(self) -> int:
-        """Number of runs with a capture."""
-        count = 0
-        for cases in self.height.values():
-            for runs in cases.values():
-                count += len(runs)
-        return count
 
 
 def policy_names(trial: TrialResults) -> list[str]:
     """Return the names of the policies, `naive` first."""
-    return in_paper_order(subject.name for subject in trial.subjects)
+    return in_paper_order(trial.policy_names)
 
 
 def jump_values(trial: TrialResults, figure: str) -> Values:
@@ -81,14 +74,22 @@ def jump_values(trial: TrialResults, figure: str) -> Values:
 
 def load_traces(trial: TrialResults, folder: Path) -> CapturedTraces | None:
     """Read the captures of a trial; None if the folder has none of them."""
-    kept = [row for row in trial.rows if row.capture]
-    present = [row for row in kept if (folder / row.capture).exists()]
-    if not present:
-        return None
-    height: Runs = {name: {} for name in policy_names(trial)}
-    roll_rate: Runs = {name: {} for name in policy_names(trial)}
-    pitch_rate: Runs = {name: {} for name in policy_names(trial)}
-    for row in present:
+    height: Runs = {}
+    roll_rate: Runs = {}
+    pitch_rate: Runs = {}
+    for name in policy_names(trial):
+        height[name] = {}
+        roll_rate[name] = {}
+        pitch_rate[name] = {}
+    captured = 0
+    missing = 0
+    for row in trial.rows:
+        if not row.capture:
+            continue
+        if not (folder / row.capture).exists():
+            missing += 1
+            continue
+        captured += 1
         capture = capture_file.load_capture(folder / row.capture)
         since_jump = capture.time - row.began - row.script.on
         trace = _cut(since_jump, capture.position[:, 2], -BEFORE_S, AFTER_S)
@@ -99,11 +100,14 @@ def load_traces(trial: TrialResults, folder: Path) -> CapturedTraces | None:
             pitch = _cut(since_run, capture.angular_velocity[:, 1], 0.0, row.script.run_s)
             roll_rate[row.policy].setdefault(row.case, []).append(roll)
             pitch_rate[row.policy].setdefault(row.case, []).append(pitch)
+    if not captured:
+        return None
     return CapturedTraces(
         height=height,
         roll_rate=roll_rate,
         pitch_rate=pitch_rate,
-        missing=len(kept) - len(present),
+        captured=captured,
+        missing=missing,
     )
 
 
@@ -175,9 +179,8 @@ def part(path: Path) -> Part:
     trial = load_results(folder)
     place = tables.place_words(trial.virtual)
     checks = trial_checks(trial)
-    passed = len([check for check in checks if check.passed])
+    passed = sum(check.passed for check in checks)
     policy = trial.subjects[0].name
-    others = trial.subjects[1:]
     panels = []
     for name in DRAWN_FIGURES:
         panels.append(
@@ -188,9 +191,10 @@ def part(path: Path) -> Part:
             )
         )
     scatter_tables = []
-    for other in others:
-        if trial.ratios:
-            scatter_tables.append(tables.scatter_table(trial, other.name))
+    verdicts = []
+    for other in trial.subjects[1:]:
+        scatter_tables.append(tables.scatter_table(trial, other.name))
+        verdicts.append(tables.scatter_verdict(trial, other.name))
     other_figures = {}
     for subject in trial.subjects:
         other_figures[subject.name] = tables.other_figures(trial, subject.name)
@@ -198,7 +202,7 @@ def part(path: Path) -> Part:
         "trial": trial,
         "where": place,
         "totals": {name: _total(trial, name) for name in policy_names(trial)},
-        "verdicts": [tables.scatter_verdict(trial, other.name) for other in others],
+        "verdicts": verdicts,
         "cells": picture(draw_jumps(panels)),
         "table_iii": [tables.paper_table(trial, "height"), tables.paper_table(trial, "distance")],
         "criteria": tables.criteria_table(trial),
@@ -229,12 +233,11 @@ def _total(trial: TrialResults, policy: str) -> dict[str, float]:
     jumped = 0
     landed = 0
     fell = 0
-    for cell in trial.cells:
-        if cell.policy == policy:
-            commanded += cell.n
-            jumped += cell.found
-            landed += cell.succeeded
-            fell += cell.fell
+    for cell in trial.cells_of(policy):
+        commanded += cell.n
+        jumped += cell.found
+        landed += cell.succeeded
+        fell += cell.fell
     low, high = share_interval(landed, commanded)
     return {
         "n": commanded,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.deploy.runtime.sweep import SweepTask
@@ -15,6 +16,18 @@ from pronk.names import file_name
 from pronk.processes import in_processes
 
 
+@dataclass(frozen=True, kw_only=True)
+class _LimbSweep:
+    """The sweep of one limb of a virtual robot."""
+
+    task: SweepTask
+    sim_params: SimParams
+    limb: str
+    """Name of the limb."""
+    seed: int
+    """Seed of the limb's noise."""
+
+
 def sweep_virtual(
     plan: SweepPlan,
     sim_params: SimParams,
@@ -25,24 +38,54 @@ def sweep_virtual(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> list[Path]:
-    """Excite the virtual robot and return the logs in the order of its joints.
+    """Excite the virtual robot and write its logs.
 
     On a rigid bench limbs do not affect each other: each is simulated by itself, with noise of its
-    own derived from `seed`, `processes` at once, which the logs do not depend on. The caller has
-    checked the plan; `overwrite` replaces logs; `progress` is called with the share done.
+    own derived from the seed.
+
+    Args:
+        plan: The sweep, which the caller has checked.
+        sim_params: Parameters of the virtual robot.
+        out: Folder of the logs.
+        seed: Seed of all noise.
+        processes: Number of limbs at once, which the logs do not depend on.
+        overwrite: Replace logs.
+        progress: Called with the share of the limbs that are done, 0 to 1.
+
+    Returns:
+        The logs in the order of the robot's joints.
     """
-    robot, metadata, jobs = plan.robot, {"link": "virtual robot, in this program"}, []
-    for index, limb in enumerate(legs_of(robot)):
-        joints = tuple(name for name in plan.joints if limb_of(robot, name) == limb)
-        task = SweepTask(
-            plan=plan, out_dir=out, joints=joints, overwrite=overwrite, metadata=metadata
-        )
-        jobs += [(task, sim_params, limb, 1000 * seed + index)] if joints else []
-    logs = in_processes(_sweep_limb, jobs, processes=processes, progress=progress)
-    order = {file_name(name): i for i, name in enumerate(robot.joint_names)}
-    return sorted((path for paths in logs for path in paths), key=lambda path: order[path.stem])
+    robot = plan.robot
+    joints_by_limb: dict[str, list[str]] = {limb: [] for limb in legs_of(robot)}
+    for joint in plan.joints:
+        joints_by_limb[limb_of(robot, joint)].append(joint)
+    sweeps = []
+    for index, (limb, joints) in enumerate(joints_by_limb.items()):
+        if joints:
+            task = SweepTask(
+                plan=plan,
+                out_dir=out,
+                joints=tuple(joints),
+                overwrite=overwrite,
+                metadata={"link": "virtual robot, in this program"},
+            )
+            sweeps.append(
+                _LimbSweep(task=task, sim_params=sim_params, limb=limb, seed=1000 * seed + index)
+            )
+    log_by_stem = {}
+    for logs in in_processes(_sweep_limb, sweeps, processes=processes, progress=progress):
+        for log in logs:
+            log_by_stem[log.stem] = log
+    ordered = []
+    for joint in robot.joint_names:
+        stem = file_name(joint)
+        if stem in log_by_stem:
+            ordered.append(log_by_stem[stem])
+    return ordered
 
 
-def _sweep_limb(job: tuple[SweepTask, SimParams, str, int]) -> list[Path]:
-    task, sim_params, limb, seed = job
-    return record_sweep(VirtualRobot(task.plan.robot, sim_params, seed=seed, legs=(limb,)), task)
+def _sweep_limb(sweep: _LimbSweep) -> list[Path]:
+    machine = VirtualRobot(
+        sweep.task.plan.robot, sweep.sim_params, seed=sweep.seed, legs=(sweep.limb,)
+    )
+    return record_sweep(machine, sweep.task)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -180,20 +180,24 @@ class Gauge:
 
 def joined(captures: Sequence[Capture]) -> Capture:
     """Return captures that follow one another as one."""
+
+    def join(name: str) -> Any:
+        return np.concatenate([getattr(capture, name) for capture in captures])
+
     return Capture(
-        time=np.concatenate([capture.time for capture in captures]),
-        position=np.concatenate([capture.position for capture in captures]),
-        orientation=np.concatenate([capture.orientation for capture in captures]),
-        velocity=np.concatenate([capture.velocity for capture in captures]),
-        angular_velocity=np.concatenate([capture.angular_velocity for capture in captures]),
-        foot_position=np.concatenate([capture.foot_position for capture in captures]),
-        contact=np.concatenate([capture.contact for capture in captures]),
-        other_contact=np.concatenate([capture.other_contact for capture in captures]),
-        joint_position=np.concatenate([capture.joint_position for capture in captures]),
-        joint_velocity=np.concatenate([capture.joint_velocity for capture in captures]),
-        torque=np.concatenate([capture.torque for capture in captures]),
-        electrical_power=np.concatenate([capture.electrical_power for capture in captures]),
-        bus_voltage=np.concatenate([capture.bus_voltage for capture in captures]),
+        time=join("time"),
+        position=join("position"),
+        orientation=join("orientation"),
+        velocity=join("velocity"),
+        angular_velocity=join("angular_velocity"),
+        foot_position=join("foot_position"),
+        contact=join("contact"),
+        other_contact=join("other_contact"),
+        joint_position=join("joint_position"),
+        joint_velocity=join("joint_velocity"),
+        torque=join("torque"),
+        electrical_power=join("electrical_power"),
+        bus_voltage=join("bus_voltage"),
     )
 
 

@@ -115,6 +115,11 @@ class ConditionResults:
     kept: int = 0
     """Number of cells that were there already."""
 
+    @property
+    def policy_names(self) -> list[str]:
+        """Names of the policies."""
+        return [subject.name for subject in self.subjects]
+
     def cell(self, policy: str, condition: str) -> ConditionCell:
         """Return the cell of one policy under one condition."""
         for cell in self.cells:
@@ -166,12 +171,11 @@ def run_conditions(
         path = setup.out / ROBOTS / f"{stem}.yaml"
         save_sim_params(path, params, comment=f"Condition {condition.name!r} of `{WRITER}`.")
 
-    missing: list[_PlannedCell] = []
+    missing: dict[str, _PlannedCell] = {}
     for cell in cells:
-        is_planned = any(cell.key == planned.key for planned in missing)
-        if not is_planned and not _cell_path(setup.out, cell.key).exists():
-            missing.append(cell)
-    _run_cells(missing, plan, setup, progress)
+        if not _cell_path(setup.out, cell.key).exists():
+            missing.setdefault(cell.key, cell)
+    _run_cells(list(missing.values()), plan, setup, progress)
 
     summed_cells = []
     for cell in cells:
@@ -262,21 +266,30 @@ def _run_cells(
 
 
 def _sum_up(cell: _PlannedCell, rows: Sequence[TrialRun]) -> ConditionCell:
-    jumps = [row.figures for row in rows if row.figures.found]
-    landed = [row for row in rows if row.figures.success]
-    fell = [row for row in rows if row.figures.fell]
+    landed = 0
+    fell = 0
+    heights = []
+    distances = []
+    velocity_errors = []
+    for row in rows:
+        landed += row.figures.success
+        fell += row.figures.fell
+        velocity_errors.append(velocity_error(row))
+        if row.figures.found:
+            heights.append(row.figures.height)
+            distances.append(row.figures.flight.distance)
     return ConditionCell(
         policy=cell.subject.name,
         condition=cell.condition.name,
         key=cell.key,
         jumps=len(rows),
-        landed=len(landed),
-        landed_share=len(landed) / len(rows),
-        landed_interval=share_interval(len(landed), len(rows)),
-        fell=len(fell),
-        height=Spread.of([figures.height for figures in jumps]),
-        distance=Spread.of([figures.flight.distance for figures in jumps]),
-        velocity_error=Spread.of([velocity_error(row) for row in rows]),
+        landed=landed,
+        landed_share=landed / len(rows),
+        landed_interval=share_interval(landed, len(rows)),
+        fell=fell,
+        height=Spread.of(heights),
+        distance=Spread.of(distances),
+        velocity_error=Spread.of(velocity_errors),
     )
 
 

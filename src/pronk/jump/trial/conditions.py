@@ -82,11 +82,11 @@ class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("parameters is empty; expected one or more, as joints.torque_scale")
         for parameter in self.parameters:
             _check_parameter(parameter)
-        given = [number for number in (self.factor, self.offset, self.value) if number is not None]
-        if len(given) != 1:
+        count = 3 - (self.factor, self.offset, self.value).count(None)
+        if count != 1:
             raise ValueError(
-                f"the change of {', '.join(self.parameters)} has {len(given)} of factor, offset "
-                "and value; expected exactly one"
+                f"the change of {', '.join(self.parameters)} has {count} of factor, offset and "
+                "value; expected exactly one"
             )
 
     def applied(self, nominal: Number) -> Number:
@@ -161,11 +161,11 @@ class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def __post_init__(self) -> None:
         """Refuse a series without points, or with points of two kinds."""
-        kinds = [numbers for numbers in (self.factors, self.offsets, self.values) if numbers]
-        if len(kinds) != 1:
+        count = 3 - (self.factors, self.offsets, self.values).count(())
+        if count != 1:
             raise ValueError(
-                f"the series {self.name} has {len(kinds)} of factors, offsets and values; "
-                "expected exactly one"
+                f"the series {self.name} has {count} of factors, offsets and values; expected "
+                "exactly one"
             )
 
 

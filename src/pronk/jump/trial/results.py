@@ -278,14 +278,24 @@ class TrialResults:
     """Wall seconds, simulated seconds, processes: the only numbers that a repeat changes."""
 
     @property
+    def policy_names(self) -> list[str]:
+        """Names of the policies."""
+        return [subject.name for subject in self.subjects]
+
+    @property
     def pooled(self) -> tuple[str, ...]:
         """Commands that an overall figure is over: the paper's, or all without them."""
-        paper = tuple(case.name for case in self.cases if case in PAPER_COMMANDS)
-        return paper or tuple(case.name for case in self.cases)
+        paper = []
+        commands = []
+        for case in self.cases:
+            commands.append(case.name)
+            if case in PAPER_COMMANDS:
+                paper.append(case.name)
+        return tuple(paper or commands)
 
-    def of(self, policy: str, case: str) -> tuple[TrialRun, ...]:
+    def of(self, policy: str, case: str) -> list[TrialRun]:
         """Return the runs of one policy with one command."""
-        return tuple(row for row in self.rows if row.policy == policy and row.case == case)
+        return [row for row in self.rows if row.policy == policy and row.case == case]
 
     def values(self, policy: str, case: str, figure: str) -> Array:
         """Return the finite values of one figure, of the jumps that there were. (n,)."""
@@ -298,12 +308,16 @@ class TrialResults:
         return numbers[np.isfinite(numbers)]
 
     @cached_property
-    def cells(self) -> tuple[RunCell, ...]:
+    def cells(self) -> list[RunCell]:
         """Sums of every policy with every command."""
         groups: dict[tuple[str, str], list[TrialRun]] = {}
         for row in self.rows:
             groups.setdefault((row.policy, row.case), []).append(row)
-        return tuple(self._sum_up(rows) for rows in groups.values())
+        return list(map(self._sum_up, groups.values()))
+
+    def cells_of(self, policy: str) -> list[RunCell]:
+        """Return the sums of one policy with every command."""
+        return [cell for cell in self.cells if cell.policy == policy]
 
     def cell(self, policy: str, case: str) -> RunCell:
         """Return the sums of one policy with one command."""
@@ -313,40 +327,59 @@ class TrialResults:
         raise KeyError(f"{policy}, {case}")
 
     def _sum_up(self, rows: Sequence[TrialRun]) -> RunCell:
-        all_figures: list[MeasuredRun] = [row.figures for row in rows]
-        with_jump = [figures for figures in all_figures if figures.found]
+        standing = 0
+        succeeded = 0
+        fell = 0
+        non_foot_contact = 0
+        with_jump = []
+        for row in rows:
+            figures: MeasuredRun = row.figures
+            standing += figures.standing
+            succeeded += figures.success
+            fell += figures.fell
+            non_foot_contact += figures.non_foot_contact
+            if figures.found:
+                with_jump.append(figures)
         spreads: dict[str, Spread] = {}
         joint_spreads: dict[str, dict[str, Spread]] = {}
         for name, definition in figures_of(self.kind.figures).items():
             values = [definition.value(figures) for figures in with_jump]
-            if not definition.joints:
+            if definition.joints:
+                joint_spreads[name] = self._joint_spreads(name, values)
+            else:
                 spreads[name] = Spread.of(values)
-                continue
-            by_joint = {}
-            joint_values = [value for value in values if value]
-            if any(len(value) != len(self.joint_names) for value in joint_values):
-                raise ValueError(f"{name} has not one number for each joint")
-            for index, joint in enumerate(self.joint_names):
-                by_joint[joint] = Spread.of([value[index] for value in joint_values])
-            joint_spreads[name] = by_joint
-        succeeded = len([figures for figures in all_figures if figures.success])
         return RunCell(
             policy=rows[0].policy,
             case=rows[0].case,
             n=len(rows),
-            standing=len([figures for figures in all_figures if figures.standing]),
+            standing=standing,
             found=len(with_jump),
             succeeded=succeeded,
             success=succeeded / len(rows),
             success_ci95=share_interval(succeeded, len(rows)),
-            fell=len([figures for figures in all_figures if figures.fell]),
-            non_foot_contact=len([figures for figures in all_figures if figures.non_foot_contact]),
+            fell=fell,
+            non_foot_contact=non_foot_contact,
             figures=spreads,
             joints=joint_spreads,
         )
 
+    def _joint_spreads(self, name: str, values: Sequence[tuple[float, ...]]) -> dict[str, Spread]:
+        """Sum up a figure of each joint; runs that do not have it are left out."""
+        columns: dict[str, list[float]] = {joint: [] for joint in self.joint_names}
+        for value in values:
+            if not value:
+                continue
+            if len(value) != len(self.joint_names):
+                raise ValueError(f"{name} has not one number for each joint")
+            for joint, number in zip(self.joint_names, value, strict=True):
+                columns[joint].append(number)
+        spreads = {}
+        for joint, column in columns.items():
+            spreads[joint] = Spread.of(column)
+        return spreads
+
     @cached_property
-    def ratios(self) -> tuple[ScatterRatio, ...]:
+    def ratios(self) -> list[ScatterRatio]:
         """Scatter of every other policy over that of the first, altogether and by command."""
         ratios = []
         for other in self.subjects[1:]:
@@ -354,7 +387,7 @@ class TrialResults:
                 ratios.append(self._ratio(other.name, figure, None))
                 for case in self.cases:
                     ratios.append(self._ratio(other.name, figure, case.name))
-        return tuple(ratios)
+        return ratios
 
     def _ratio(self, other: str, figure: str, case: str | None) -> ScatterRatio:
         policy = self.subjects[0].name
@@ -404,20 +437,19 @@ def ratio_of_scatter(
     """
     from scipy.stats import DegenerateDataWarning, bootstrap
 
-    largest = max((float(np.abs(sample).max()) for sample in samples if len(sample)), default=0.0)
     # A resample of one value alone scatters by rounding only.
-    least = 1e-9 * largest
+    rounding = 1e-9 * float(np.abs(np.concatenate(samples)).max(initial=0.0))
 
     def ratio(*resampled: Array, axis: int = -1) -> Array:
         stds = [np.std(sample, axis=axis, ddof=1) for sample in resampled]
         below = np.asarray(sum(stds[: len(samples)]))
         above = np.asarray(sum(stds[len(samples) :]))
         unknown = np.full(below.shape, np.nan)
-        quotient: Array = np.divide(above, below, out=unknown, where=below > least)
+        quotient: Array = np.divide(above, below, out=unknown, where=below > rounding)
         return quotient
 
     all_samples = (*samples, *other_samples)
-    fewest = min(len(sample) for sample in all_samples)
+    fewest = min(map(len, all_samples))
     value = float(ratio(*all_samples)) if fewest > 1 else math.nan
     if not math.isfinite(value) or fewest < FEWEST:
         return value, math.nan, math.nan
@@ -568,9 +600,9 @@ def load_results(folder: Path, kind: RunKind = JUMPS) -> TrialResults:
         for name in ("schema", "definitions", "ratios"):
             del body[name]
         results = replace(msgspec.convert(body, TrialResults), kind=kind, rows=rows)
-        counts = [(cell["policy"], cell["case"], cell["n"]) for cell in sums]
-        if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
-            raise ValueError("runs and sums do not fit together")
+        for stored, cell in zip(sums, results.cells, strict=True):
+            if (stored["policy"], stored["case"], stored["n"]) != (cell.policy, cell.case, cell.n):
+                raise ValueError("runs and sums do not fit together")
         return results
 
 

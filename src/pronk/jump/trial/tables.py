@@ -114,19 +114,23 @@ def paper_table(trial: TrialResults, figure: str) -> Table:
             stds.append(std)
         columns_of_cells.append(cells)
         mean_scatter.append(sum(stds) / len(stds))
-    for policy in in_paper_order(subject.name for subject in trial.subjects):
+    for policy in in_paper_order(trial.policy_names):
         columns.append(Column(heading=f"{policy}, {place_words(trial.virtual)}"))
         cells = {}
         for case in trial.cases:
             cell = trial.cell(policy, case.name)
             cells[case.name] = f"{spread_text(cell.figures[figure])} ({cell.found}/{cell.n})"
         columns_of_cells.append(cells)
-        stds = [trial.cell(policy, command).figures[figure].std for command in trial.pooled]
+        stds = []
+        for command in trial.pooled:
+            stds.append(trial.cell(policy, command).figures[figure].std)
         mean_scatter.append(sum(stds) / len(stds))
     rows: list[tuple[Cell, ...]] = []
     for case in trial.cases:
-        cells_of_command = [cells.get(case.name, NOT_MEASURED) for cells in columns_of_cells]
-        rows.append((case.name, *cells_of_command))
+        row = [case.name]
+        for cells in columns_of_cells:
+            row.append(cells.get(case.name, NOT_MEASURED))
+        rows.append(tuple(row))
     scatter_cells = []
     for std in mean_scatter:
         scatter_cells.append(f"+- {std:.3f}" if math.isfinite(std) else NOT_MEASURED)
@@ -187,7 +191,7 @@ def other_figures(trial: TrialResults, policy: str) -> Table:
     for name, figure in FIGURES.items():
         if not figure.joints and name not in _ELSEWHERE:
             figures.append(figure)
-    cells = [cell for cell in trial.cells if cell.policy == policy]
+    cells = trial.cells_of(policy)
     return Table(
         title=f"Every other figure of {policy}: mean +- standard deviation",
         columns=_command_columns(cells),
@@ -209,8 +213,10 @@ def _figure_rows(
     """Return a row for each figure, with its unit and its spread in each cell."""
     rows: list[tuple[Cell, ...]] = []
     for figure in figures:
-        spreads = [spread_text(cell.figures[figure.name], digits) for cell in cells]
-        rows.append((f"{figure.name.replace('_', ' ')} [{figure.unit}]", *spreads))
+        row = [f"{figure.name.replace('_', ' ')} [{figure.unit}]"]
+        for cell in cells:
+            row.append(spread_text(cell.figures[figure.name], digits))
+        rows.append(tuple(row))
     return tuple(rows)
 
 
@@ -218,11 +224,15 @@ def drive_loads(trial: TrialResults) -> Table:
     """Return the largest loads of the drives over all jumps, by policy and joint."""
     rows: list[tuple[Cell, ...]] = []
     for subject in trial.subjects:
-        cells = [cell for cell in trial.cells if cell.policy == subject.name and cell.found]
         for joint in trial.joint_names:
-            torques = [cell.joints["peak_torque"][joint].most for cell in cells]
-            speeds = [cell.joints["peak_speed"][joint].most for cell in cells]
-            margins = [cell.joints["torque_margin"][joint].least for cell in cells]
+            torques = []
+            speeds = []
+            margins = []
+            for cell in trial.cells_of(subject.name):
+                if cell.found:
+                    torques.append(cell.joints["peak_torque"][joint].most)
+                    speeds.append(cell.joints["peak_speed"][joint].most)
+                    margins.append(cell.joints["torque_margin"][joint].least)
             rows.append(
                 (
                     f"{subject.name}: {joint}",
@@ -390,7 +400,7 @@ def _compared_with_paper(ratio: ScatterRatio, claim: float) -> str:
 
 def walk_table(walks: TrialResults, policy: str) -> Table:
     """Return the figures of one policy's walks by velocity."""
-    cells = [cell for cell in walks.cells if cell.policy == policy]
+    cells = walks.cells_of(policy)
     rows: list[tuple[Cell, ...]] = [
         ("walks", *(cell.n for cell in cells)),
         ("fell", *(cell.fell for cell in cells)),
