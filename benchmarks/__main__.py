@@ -19,7 +19,7 @@ SUMMARIES = {
     "sensor-faults": "From a sensor's fault to damping, over LCM and DDS in real time.",
     "probe": "Laws, parameters and faults of simulators drawn at random, named blind.",
     "frameworks": "Gains matched for frameworks, in the engines themselves, beside the logs.",
-    "profiles": "All profiles matched from one set of logs: time, and cells beside the grid's.",
+    "profiles": "The same logs matched for every profile: errors and time.",
     "transfer": "A policy in training simulators of other drive laws.",
     "fuzz": "Mutated files of every reader: tracebacks, hangs, other numbers.",
     "kills": "Processes of commands killed and stopped: files, orphans, damping.",

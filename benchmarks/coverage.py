@@ -18,11 +18,10 @@ from benchmarks.runner import Progress, finish
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
-from pronk.identify.match.measured_joint import measured_joints
+from pronk.identify.match.magnitude import gain_interval, refine
+from pronk.identify.match.measured import measured_joints
 from pronk.identify.match.parameters import GAINS
-from pronk.identify.match.response_fit import refine
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.match.uncertainty import gain_interval
 from pronk.identify.response.estimate import operators
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.report.paper import TABLE_I
@@ -58,9 +57,9 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
         log = synthetic_log(
             robot, name, [chirp], *known, noise=list(noise(rng, (REPEATS, samples)))
         )
-        noisy = measured_joints(log, name, robot, settings)[0]
+        noisy = measured_joints([log], name, robot, settings)[0]
         quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *known)
-        clean = measured_joints(quiet, name, robot, settings)[0].measured.response
+        clean = measured_joints([quiet], name, robot, settings)[0].measured.response
         operator = operators(log, name, settings.estimator)[0][0]
         to_response = operator.matrix(operator.time)
         gains, low, high = (np.empty((trials, 2)) for _ in range(3))
@@ -68,14 +67,15 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
             for begin in range(0, trials, BATCH):
                 count = min(BATCH, trials - begin)
                 errors = noise(rng, (count, REPEATS, len(operator.time))) @ to_response
-                goals = []
-                for response in clean + errors:
-                    each = replace(noisy.measured, response=response.mean(axis=0), repeats=response)
-                    goals.append(replace(noisy, measured=each))
-                for k, fit in enumerate(refine(simulator, goals, [known] * count), start=begin):
-                    ci95 = gain_interval(fit.target, fit.solution).ci95
-                    gains[k] = fit.gains
-                    low[k], high[k] = zip(*(ci95[one] for one in GAINS), strict=True)
+                for trial, repeats in enumerate(clean + errors, start=begin):
+                    measured = replace(
+                        noisy.measured, response=repeats.mean(axis=0), repeats=repeats
+                    )
+                    fit = refine(simulator, replace(noisy, measured=measured), known)
+                    ci95 = gain_interval(fit).ci95
+                    gains[trial] = fit.gains
+                    for column, parameter in enumerate(GAINS):
+                        low[trial, column], high[trial, column] = ci95[parameter]
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))
         expected = np.array(known)
         found[name] = {

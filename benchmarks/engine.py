@@ -14,10 +14,9 @@ import numpy as np
 from benchmarks.runner import finish
 from pronk.cli import console
 from pronk.identify.excitation.signals import Chirp
-from pronk.identify.match.grid import axes, quick_search
-from pronk.identify.match.measured_joint import DB, measured_joints
+from pronk.identify.match.magnitude import refine
+from pronk.identify.match.measured import DB, measured_joints, simulated_response
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.match.simulated import SimRequest, responses
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -58,14 +57,16 @@ def engine_gap(
     fine = replace(robot, timestep_s=fine_timestep_s, decimation=round(tick / fine_timestep_s))
     excitation = Excitation(offsets=chirp.samples(1.0 / tick), band_hz=chirp.band_hz)
     log = synthetic_log(fine, joint, [excitation], *gains, threads=settings.threads)
-    goal = measured_joints(log, joint, robot, settings)[0]
+    target = measured_joints([log], joint, robot, settings)[0]
     with MujocoSimulator(robot, threads=settings.threads) as simulator:
-        matched = quick_search(simulator, [goal], *axes(robot, settings.grid_points))[1][0].gains
-        requests = [SimRequest(goal, *gains), SimRequest(goal, *matched)]
-        found = np.array(responses(simulator, requests, whole=True))
-    equal_db, matched_db = (
-        DB * np.log(np.abs(found / goal.measured.response))[:, goal.measured.band(*drive.band_hz)]
-    )
+        matched = refine(simulator, target, gains).gains
+        errors_db = []
+        for stiffness, damping in (gains, matched):
+            values = {"stiffness": stiffness, "damping": damping}
+            response = simulated_response(simulator, target, values)
+            ratio = np.abs(response / target.measured.response)
+            errors_db.append(DB * np.log(ratio[target.measured.band(*drive.band_hz)]))
+    equal_db, matched_db = errors_db
     return EngineGap(
         gains=gains,
         matched_gains=matched,

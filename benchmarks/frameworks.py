@@ -29,17 +29,16 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_logs
 from pronk.identify.logs.segment import Segment
 from pronk.identify.match.gains import MatchedGains
-from pronk.identify.match.measured_joint import (
+from pronk.identify.match.match import match
+from pronk.identify.match.measured import (
     DB,
     MeasuredJoint,
     logs_by_joint,
     measured_joints,
-    merged,
+    simulated_response,
 )
-from pronk.identify.match.pipeline import match_frameworks
 from pronk.identify.match.predict import drives_of
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.match.simulated import SimRequest, responses
 from pronk.identify.simulators.chain import (
     ChainSimulation,
     StribeckChain,
@@ -65,7 +64,7 @@ ENGINES = {
     "newton-featherstone": "examples/engines/newton.py:featherstone",
 }
 """Framework, and the value of `--simulator` that runs its engine."""
-SETTINGS = MatchSettings(method="paper", zero_armature=False)
+SETTINGS = MatchSettings(zero_armature=False)
 
 
 BAND_HZ = (0.3, 3.4)
@@ -102,15 +101,16 @@ def alone(
         rigs = stack.enter_context(joint_rigs(engine, robot, python=python))
         for goal in goals:
             joint = gains.joints[goal.joint]
-            request = SimRequest(
-                goal, joint.stiffness.value, joint.damping.value, delay=joint.delay_s.value
-            )
-            friction = joint.frictionloss.value
-            dry = None if np.isnan(friction) else friction
-            own = dry if "frictionloss" in rigs.parameters else None
+            values = {
+                "stiffness": joint.stiffness.value,
+                "damping": joint.damping.value,
+                "delay": joint.delay_s.value,
+            }
+            if not np.isnan(joint.frictionloss.value):
+                values["frictionloss"] = joint.frictionloss.value
             of = {
-                "engine": responses(rigs, [replace(request, frictionloss=own)])[0],
-                "law": responses(law, [replace(request, frictionloss=dry)])[0],
+                "engine": simulated_response(rigs, goal, values)[goal.fit_mask],
+                "law": simulated_response(law, goal, values)[goal.fit_mask],
                 "recorded": goal.measured.response[goal.fit_mask],
             }
             rows.append(pairs(of, goal.omega))
@@ -204,19 +204,25 @@ def frameworks(
         for name in only or ENGINES:
             framework, engine = profile(name), ENGINES[name]
             own = framework.robot(known)
-            more: Any = {"settings": SETTINGS, "progress": report, "drive_gains": drive_gains}
-            gains = match_frameworks(logs, known, [name], **more)[name].gains
+            gains = match(
+                logs,
+                known,
+                name,
+                method="paper",
+                drive_gains=drive_gains,
+                settings=SETTINGS,
+                progress=report,
+            ).gains
             found: list[dict[str, float]] = []
             for python in (None, *simulator_python):
                 try:
                     if moves_together(logs[0]):
                         found = together(logs[0], gains, engine, python, own)
                     else:
-                        goals = [
-                            merged([measured_joints(log, joint, own, SETTINGS) for log in sources])
-                            for joint, sources in logs_by_joint(logs, own).items()
-                        ]
-                        found = alone([one[0] for one in goals], gains, engine, python, own)
+                        goals = []
+                        for joint, sources in logs_by_joint(logs, own).items():
+                            goals.append(measured_joints(sources, joint, own, SETTINGS)[0])
+                        found = alone(goals, gains, engine, python, own)
                     break
                 except PronkError as error:
                     reason = str(error)

@@ -191,7 +191,7 @@ def _kinds() -> dict[str, _Kind]:
                 write_text(path.parent / "out" / "a.py", export(found, target))
 
     def match(path: Path) -> Any:
-        return match_file.load(path, gains_file.load_gains(path.with_name("gains.yaml")))
+        return match_file.load(path)
 
     def model(path: Path) -> None:
         read_model.cache_clear()

@@ -28,7 +28,7 @@ from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.match import match
 from pronk.identify.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -104,8 +104,9 @@ def known_log(
 def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
     """Match a log the way `pronk match --method paper` does."""
     before = time.perf_counter()
-    settings = MatchSettings(method="paper", zero_armature=False, threads=threads)
-    found = match_logs([log], robot, settings=settings).gains.joints[JOINT]
+    settings = MatchSettings(zero_armature=False, threads=threads)
+    result = match([log], robot, method="paper", settings=settings)
+    found = result.gains.joints[JOINT]
     return Estimate(
         stiffness=found.stiffness.value,
         damping=found.damping.value,

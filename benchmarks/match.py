@@ -47,7 +47,8 @@ from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.match import Method
+from pronk.identify.match.match import match as match_logs
 from pronk.identify.match.predict import drives_of
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.simulators.chain import ChainSimulation, DriveValues
@@ -87,11 +88,16 @@ class Found:
 Fit = Callable[[JointRigs, JointLog, str], Found]
 
 
-def _pronk(settings: MatchSettings, rigs: JointRigs, log: JointLog, joint: str) -> Found:
-    result = match_logs([log], rigs.robot, settings=settings)
-    fit = result.joints[joint]
-    values = drives_of(rigs.robot, result.gains)[joint]
-    return Found(values=values, repeat=fit.ci95, total=fit.total95, flags=fit.flags)
+def _pronk(method: Method, rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    settings = MatchSettings(zero_armature=False, threads=1)
+    result = match_logs([log], rigs.robot, method=method, settings=settings)
+    joint_result = result.joints[joint]
+    return Found(
+        values=drives_of(rigs.robot, result.gains)[joint],
+        repeat=joint_result.fit.ci95,
+        total=joint_result.fit.total95,
+        flags=joint_result.gains.flags,
+    )
 
 
 def _sysid(rigs: JointRigs, log: JointLog, joint: str) -> Found:
@@ -103,12 +109,11 @@ def _sysid(rigs: JointRigs, log: JointLog, joint: str) -> Found:
 
 def methods() -> dict[str, Fit]:
     """Methods by name; that of the nominal gains first, for the others are related to it."""
-    paper = MatchSettings(method="paper", zero_armature=False, threads=1)
     return {
         NOMINAL: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint, ("delay",))),
         PLAIN: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint)),
-        PRONK: partial(_pronk, MatchSettings(threads=1)),
-        PAPER: partial(_pronk, paper),
+        PRONK: partial(_pronk, "time"),
+        PAPER: partial(_pronk, "paper"),
         "mujoco.sysid": _sysid,
         "CMA-ES": lambda rigs, log, joint: Found(values=search_cma(rigs, log, joint, seed=0)),
     }

@@ -29,7 +29,7 @@ from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.errors import PronkError
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.readers import read_logs
-from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.match import match
 from pronk.identify.match.settings import MatchSettings
 from pronk.jump.virtual.plant import limb_of
 from pronk.jump.virtual.robot import VirtualRobot
@@ -104,8 +104,8 @@ def recorded(robot: RobotSpec, seed: int, number: int, cache: Path) -> Case:
 def wrong_number(right: Case, wrong: Case) -> bool:
     """Return whether a corruption moves a matched number by more than the limits."""
     settings = MatchSettings(zero_armature=False, threads=1)
-    before = match_logs([right.log], right.robot, settings=settings).gains.joints[right.joint]
-    after = match_logs([wrong.log], wrong.robot, settings=settings).gains.joints[wrong.joint]
+    before = match([right.log], right.robot, settings=settings).gains.joints[right.joint]
+    after = match([wrong.log], wrong.robot, settings=settings).gains.joints[wrong.joint]
     return (
         abs(after.stiffness.value / before.stiffness.value - 1.0) > WRONG_STIFFNESS
         or abs(after.damping.value / before.damping.value - 1.0) > WRONG_DAMPING

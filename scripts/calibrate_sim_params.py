@@ -23,7 +23,7 @@ from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.files import write_text
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.mcap_reader import read_mcap
-from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.match import match
 from pronk.identify.match.settings import MatchSettings
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import (
@@ -154,7 +154,7 @@ def designed() -> SimParams:
 
 
 def matched(
-    sim_params: SimParams, name: str, exhaustive: bool = False
+    sim_params: SimParams, name: str, grid_points: int = 12
 ) -> tuple[np.ndarray, float, float]:
     """Matched (stiffness, damping) of one joint, its error and the naive error [dB RMS]."""
     robot = load_robot("mini_cheetah")
@@ -163,9 +163,10 @@ def matched(
     with tempfile.TemporaryDirectory() as folder:
         task = SweepTask(plan=plan, out_dir=Path(folder))
         logs = [read_mcap(path) for path in record_sweep(machine, task)]
-    settings = MatchSettings(method="paper", exhaustive=exhaustive, zero_armature=False)
-    found = match_logs(logs, robot, settings=settings).joints[name]
-    return np.array([found.stiffness, found.damping]), found.error_db, found.naive_error_db
+    settings = MatchSettings(grid_points=grid_points, zero_armature=False)
+    found = match(logs, robot, method="paper", settings=settings).gains.joints[name]
+    gains = np.array([found.stiffness.value, found.damping.value])
+    return gains, found.quality.error_db, found.quality.nominal_error_db
 
 
 def calibrated(sim_params: SimParams, name: str) -> JointParams:
@@ -230,7 +231,7 @@ def main() -> None:
     if arguments.check:
         sim_params = load_sim_params(arguments.out)
         for name in sim_params.joints:
-            got, error, naive = matched(sim_params, name, exhaustive=True)
+            got, error, naive = matched(sim_params, name, grid_points=50)
             cells = (got - TABLE_I[name]) / CELL
             print(
                 f"{name:14s} {got[0]:6.2f} {got[1]:.4f}  {cells[0]:+.2f} {cells[1]:+.2f} cells off"

@@ -11,9 +11,17 @@ from PIL import Image
 
 from pronk.identify.match import gains as gains_file
 from pronk.identify.match import result as match_file
-from pronk.identify.match.gains import GroupGains, MatchedGains
+from pronk.identify.match.compared import ComparedResponses
+from pronk.identify.match.gains import GroupGains
 from pronk.identify.match.predict import JointPrediction, Prediction, save_prediction
-from pronk.identify.match.result import JointFit, MatchResult
+from pronk.identify.match.result import (
+    DriveFit,
+    GridSearch,
+    JointResult,
+    MatchResult,
+    ZeroArmature,
+    joint_gains,
+)
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.jump.trial import walk
@@ -63,8 +71,8 @@ def error_db(measured, simulated, band):
     return np.sqrt(np.mean(gap[..., band] ** 2, axis=-1))
 
 
-def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
-    """Return a fit of one joint at two amplitudes with noise of a few per cent."""
+def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResult:
+    """Return the result of one joint at two amplitudes with noise of a few per cent."""
     rng = np.random.default_rng(leg)
     inertia, stiffness, damping, band_hz = GROUPS[name]
     stiffness *= 1.0 + 0.02 * (leg - 1.5)
@@ -81,63 +89,86 @@ def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
         repeats = matched * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
         found = {"amplitude": amplitude, "response": repeats.mean(axis=0), "repeats": repeats}
         responses.append(FrequencyResponse(**found, **known))
-    first, band = responses[0].response, responses[0].band(*band_hz)
-    k, d = np.linspace(13, 27, 21), np.linspace(0.1, 0.7, 21)
-    grid = second_order(omega, k[:, None, None], d[None, :, None], inertia)
-    flags = ["zero armature: no match, the best node misses by 2.9 dB RMS, 30 times the match"]
-    extra: dict[str, Any] = {"zero_armature": None, "zero_armature_error_db": float("nan")}
+    first = responses[0].response
+    band = responses[0].band(*band_hz)
+    stiffness_axis = np.linspace(13, 27, 21)
+    damping_axis = np.linspace(0.1, 0.7, 21)
+    nodes = second_order(omega, stiffness_axis[:, None, None], damping_axis[None, :, None], inertia)
+    flags: tuple[str, ...] = ()
+    zero_armature = None
     if name == "knee":
-        flags.insert(0, "3 of 60 frequencies left out for low coherence")
-        bare = second_order(omega, 27.0, 0.62, 0.0012)
-        extra = {"zero_armature": bare, "zero_armature_error_db": 2.9}
-    return JointFit(
+        flags = ("3 of 60 frequencies left out for low coherence",)
+        response = second_order(omega, 27.0, 0.62, 0.0012)
+        zero_armature = ZeroArmature(error_db=2.9, response=response, ruled_out=True)
+    fit = DriveFit(
         joint=known["joint"],
-        responses=tuple(responses),
-        grid_stiffness=k,
-        grid_damping=d,
-        grid_error=error_db(first, grid, band) ** 2,
-        stiffness=stiffness,
-        damping=damping,
+        values={
+            "stiffness": stiffness,
+            "damping": damping,
+            "armature": 0.0026,
+            "frictionloss": float("nan"),
+            "stribeck": 0.0,
+            "delay": 0.0,
+        },
         ci95={
             "stiffness": (stiffness - 0.6, stiffness + 0.6),
             "damping": (damping - 0.02, damping + 0.02),
         },
         covariance=np.array([[0.09, 0.0015], [0.0015, 1e-4]]),
-        band_hz=band_hz,
-        matched=matched,
-        naive=naive,
-        coherence_min=0.91,
-        armature=0.0026,
-        error_db=float(error_db(first, matched, band)),
-        naive_error_db=float(error_db(first, naive, band)),
         amplitude_gains=np.array(
             [[0.25, stiffness, damping], [0.125, stiffness * 0.98, damping * 1.03]]
         ),
-        flags=tuple(flags),
-        **extra,
+        flags=flags,
+    )
+    compared = ComparedResponses(
+        measured=tuple(responses),
+        matched=matched,
+        nominal=naive,
+        band_hz=band_hz,
+        error_db=float(error_db(first, matched, band)),
+        nominal_error_db=float(error_db(first, naive, band)),
+        coherence_min=0.91,
+    )
+    return JointResult(
+        joint=fit.joint,
+        gains=joint_gains(fit, compared, flags),
+        fit=fit,
+        responses=compared,
+        grid=GridSearch(
+            stiffness=stiffness_axis,
+            damping=damping_axis,
+            error=error_db(first, nodes, band) ** 2,
+        ),
+        zero_armature=zero_armature,
     )
 
 
 def match(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 4) -> MatchResult:
     """Return a match of the three joints of some legs."""
-    fits = [joint_fit(name, leg, virtual=virtual) for leg in range(legs) for name in GROUPS]
-    joints = {fit.joint: fit for fit in fits}
-    box: dict[str, Any] = {"stiffness_range": 2.0, "damping_range": 0.05}
-    box["ellipsoid"] = ((1.2, 0.0), (0.0, 0.001))
+    joints = {}
+    for leg in range(legs):
+        for name in GROUPS:
+            result = joint_result(name, leg, virtual=virtual)
+            joints[result.joint] = result
     groups = {}
-    for name, (_, k, d, _) in GROUPS.items():
-        centre = {"stiffness": round(k * 2) / 2, "damping": round(d * 20) / 20}
-        groups[name] = GroupGains(ellipsoid_center=(k, d), **centre, **box)
-    gains = MatchedGains(
+    for name, (_, stiffness, damping, _) in GROUPS.items():
+        groups[name] = GroupGains(
+            stiffness=round(stiffness * 2) / 2,
+            damping=round(damping * 20) / 20,
+            stiffness_range=2.0,
+            damping_range=0.05,
+            ellipsoid=((1.2, 0.0), (0.0, 0.001)),
+            ellipsoid_center=(stiffness, damping),
+        )
+    return MatchResult(
         robot=robot,
         simulator=SimulatorInfo(version="3.11.0"),
-        joints={name: fit.gains() for name, fit in joints.items()},
+        joints=joints,
         groups=groups,
-        logs={f"{name}.mcap": f"{i:064x}" for i, name in enumerate(joints)},
+        logs={f"{name}.mcap": f"{number:064x}" for number, name in enumerate(joints)},
         virtual=virtual,
+        seconds={"estimate": 1.2, "grid": 31.0},
     )
-    seconds = {"estimate": 1.2, "grid": 31.0}
-    return MatchResult(gains=gains, joints=joints, seconds=seconds, grid_steps_per_second=6e5)
 
 
 def joint_prediction() -> JointPrediction:

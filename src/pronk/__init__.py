@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pronk.identify.logs.options import ReadOptions
     from pronk.identify.logs.readers import read_log, read_logs
     from pronk.identify.match.export.targets import export
-    from pronk.identify.match.pipeline import match_logs as match
+    from pronk.identify.match.match import match
     from pronk.identify.match.predict import predict
     from pronk.identify.response.estimate import estimate as response
     from pronk.policy.runtime import load_policy
@@ -44,7 +44,7 @@ _HOMES = {
     "export": ("pronk.identify.match.export.targets", "export"),
     "load_policy": ("pronk.policy.runtime", "load_policy"),
     "load_robot": ("pronk.robots", "load_robot"),
-    "match": ("pronk.identify.match.pipeline", "match_logs"),
+    "match": ("pronk.identify.match.match", "match"),
     "predict": ("pronk.identify.match.predict", "predict"),
     "read_log": ("pronk.identify.logs.readers", "read_log"),
     "read_logs": ("pronk.identify.logs.readers", "read_logs"),

@@ -14,11 +14,12 @@ from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
 from pronk.identify.match import gains as gains_file
-from pronk.identify.match import match_logs
 from pronk.identify.match.arm import fit_together, trusted_frequency, trusted_samples
+from pronk.identify.match.match import match
 from pronk.identify.match.parameters import DRIVE_MODE
 from pronk.identify.match.predict import drives_of, predict
 from pronk.identify.match.result import MatchResult
+from pronk.identify.match.settings import MatchSettings
 from pronk.identify.simulators.chain import ChainSimulation, moves_together
 from pronk.robots import load_robot
 
@@ -65,16 +66,16 @@ def recorded_with_known_drives(log: JointLog) -> JointLog:
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
     log = recorded_with_known_drives(commands(65.0, (0.15, 8.0), 0.35))
-    joints, _ = fit_together([log], ARM, DRIVE_MODE, most_held=0)
+    chains, _ = fit_together([log], ARM, DRIVE_MODE, most_held=0)
     for name, known in KNOWN.items():
-        joint = joints[name]
-        assert joint.stiffness == known["stiffness"]
-        assert joint.damping == pytest.approx(known["damping"], rel=0.03)
-        assert joint.armature == pytest.approx(known["armature"], rel=0.08)
-        assert joint.frictionloss == pytest.approx(known["frictionloss"], rel=0.05)
-        assert joint.stribeck == pytest.approx(known["stribeck"], abs=0.08)
-        assert joint.delay_s == pytest.approx(known["delay"], abs=1e-3)
-        assert joint.rmse < 1e-3 < joint.published_rmse
+        fit, _ = chains[name]
+        assert fit.values["stiffness"] == known["stiffness"]
+        assert fit.values["damping"] == pytest.approx(known["damping"], rel=0.03)
+        assert fit.values["armature"] == pytest.approx(known["armature"], rel=0.08)
+        assert fit.values["frictionloss"] == pytest.approx(known["frictionloss"], rel=0.05)
+        assert fit.values["stribeck"] == pytest.approx(known["stribeck"], abs=0.08)
+        assert fit.values["delay"] == pytest.approx(known["delay"], abs=1e-3)
+        assert fit.rmse < 1e-3 < fit.nominal_rmse
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.15, 0.6])
@@ -104,32 +105,38 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
 def test_command_that_is_logged_late_is_flagged() -> None:
     log = recorded_with_known_drives(commands(30.0, (0.2, 6.0), 0.3))
     late = np.concatenate([log.command[:1], log.command[:-1]])
-    joints, _ = fit_together([replace(log, command=late)], ARM, DRIVE_MODE)
-    for joint in joints.values():
-        assert joint.delay_s.value == 0.0
-        assert any("delay -8.0 ms" in flag and "command later" in flag for flag in joint.flags)
+    late_log = replace(log, command=late)
+    result = match([late_log], ARM, mode="drive", drive_gains="default")
+    for joint in result.joints.values():
+        assert joint.fit.values["delay"] < 0.0
+        assert joint.gains.delay_s.value == 0.0
+        flags = joint.gains.flags
+        assert any("delay -8.0 ms" in flag and "command later" in flag for flag in flags)
 
 
 def test_named_parameters_alone_are_fitted() -> None:
     log = recorded_with_known_drives(commands(20.0, (0.2, 3.0), 0.2))
-    found = match_logs([log], ARM, mode="drive", free=("damping",), drive_gains="default")
-    for joint in found.joints.values():
-        assert set(joint.ci95) == {"damping"}
-        assert joint.stiffness == 17.8
-    (delay,) = {
-        joint.ci95["delay"]
-        for joint in fit_together([log], ARM, ("delay",))[0].values()
-        if set(joint.ci95) == {"delay"}
-    }
-    assert delay[0] < delay[1]
+    damping = MatchSettings(fitted=("damping",))
+    result = match([log], ARM, mode="drive", settings=damping, drive_gains="default")
+    for joint in result.joints.values():
+        assert set(joint.fit.ci95) == {"damping"}
+        assert joint.gains.stiffness.value == 17.8
+    intervals = set()
+    for fit, _ in fit_together([log], ARM, ("delay",))[0].values():
+        assert set(fit.ci95) == {"delay"}
+        intervals.add(fit.ci95["delay"])
+    # The delay is one for the chain.
+    ((low, high),) = intervals
+    assert low < high
+    offset = MatchSettings(fitted=("offset",))
     with pytest.raises(PronkError, match="offset"):
-        match_logs([log], ARM, mode="drive", free=("offset",), drive_gains="default")
+        match([log], ARM, mode="drive", settings=offset, drive_gains="default")
 
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     log = commands(5.0, (0.2, 3.0), 0.2)
     with pytest.raises(LogError, match="at least 3"):
-        match_logs([log], ARM, drive_gains="default")
+        match([log], ARM, drive_gains="default")
     with pytest.raises(PronkError, match="stiffness, damping"):
         fit_together([log], ARM, ("kd",))
     with pytest.raises(LogError, match="at least one"):
@@ -167,7 +174,7 @@ def test_sweep_is_used_up_to_where_it_breaks() -> None:
 
 @pytest.fixture(scope="module")
 def matched() -> MatchResult:
-    return match_logs([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM, drive_gains="default")
+    return match([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM, drive_gains="default")
 
 
 @recorded
@@ -176,7 +183,7 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 ) -> None:
     gains_file.save_gains(tmp_path / "gains.yaml", matched.gains)
     gains = gains_file.load_gains(tmp_path / "gains.yaml")
-    friction = matched.joints["elbow_flex"].frictionloss
+    friction = matched.joints["elbow_flex"].fit.values["frictionloss"]
     assert drives_of(ARM, gains)["elbow_flex"]["frictionloss"] == pytest.approx(friction, rel=1e-5)
     found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains, drive_gains="default")
     assert tuple(one.joint for one in found.joints) == JOINTS
@@ -200,9 +207,10 @@ def test_recorded_sweep_is_matched_and_what_it_does_not_identify_held(matched: M
         low, high = matched.gains.joints[name].stiffness.repeat95
         assert high - low < 0.3 * matched.gains.joints[name].stiffness.value
     assert set(matched.joints) == set(JOINTS)
-    for name, fit in matched.joints.items():
-        assert fit.error_db < 0.5 * fit.naive_error_db, name
-        assert fit.band_hz[1] < 3.0  # the chirp outran the servos above
+    for name, joint in matched.joints.items():
+        assert joint.responses is not None
+        assert joint.responses.error_db < 0.5 * joint.responses.nominal_error_db, name
+        assert joint.responses.band_hz[1] < 3.0  # the chirp outran the servos above
 
 
 @recorded

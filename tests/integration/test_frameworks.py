@@ -12,7 +12,7 @@ from command_line import accepted, refused
 from pronk.errors import ArtefactError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.gains import load_gains, save_gains
-from pronk.identify.match.pipeline import match_frameworks
+from pronk.identify.match.match import Method, match
 from pronk.identify.match.predict import predict
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.simulators.profiles import load_profiles, profile, profile_of
@@ -33,21 +33,23 @@ def recorded(name: str) -> JointLog:
 
 @pytest.mark.parametrize("name", CHOSEN)
 @pytest.mark.parametrize("method", ["time", "paper"])
-def test_the_gains_of_a_simulated_framework_are_found(name: str, method: str) -> None:
-    settings = MatchSettings(method=method, zero_armature=False)  # type: ignore[arg-type]
-    found = match_frameworks([recorded(name)], ROBOT, [name], settings=settings)
-    joint = found[name].gains.joints["FR_knee"]
-    assert (joint.stiffness.value, joint.damping.value) == pytest.approx(GAINS, rel=0.005)
-    assert joint.delay_s.value == pytest.approx(0.0, abs=2e-4)
-    assert joint.quality.error_db < 0.02
+def test_the_gains_of_a_simulated_framework_are_found(name: str, method: Method) -> None:
+    settings = MatchSettings(zero_armature=False, grid_points=8)
+    log = recorded(name)
+    result = match([log], ROBOT, name, method=method, settings=settings)
+    gains = result.gains.joints["FR_knee"]
+    assert (gains.stiffness.value, gains.damping.value) == pytest.approx(GAINS, rel=0.005)
+    assert gains.delay_s.value == pytest.approx(0.0, abs=2e-4)
+    assert gains.quality.error_db < 0.02
     # The explicit law needs other gains, by far more than they are known to.
-    assert found[""].gains.joints["FR_knee"].stiffness.value < 0.95 * GAINS[0]
-    assert profile_of(found[name].gains.simulator).drive_law == profile(name).drive_law
+    explicit = match([log], ROBOT, method=method, settings=settings).gains.joints["FR_knee"]
+    assert explicit.stiffness.value < 0.95 * GAINS[0]
+    assert profile_of(result.simulator).drive_law == profile(name).drive_law
 
 
 def test_gains_of_a_framework_are_replayed_and_not_trained_with(tmp_path: Path) -> None:
-    name, log = "isaaclab-implicit", recorded("isaaclab-implicit")
-    gains = match_frameworks([log], ROBOT, [name])[name].gains
+    log = recorded("isaaclab-implicit")
+    gains = match([log], ROBOT, "isaaclab-implicit").gains
     save_gains(tmp_path / "gains.yaml", gains)
     assert load_gains(tmp_path / "gains.yaml").simulator == gains.simulator
     [joint] = predict(log, ROBOT, gains).joints
@@ -57,12 +59,15 @@ def test_gains_of_a_framework_are_replayed_and_not_trained_with(tmp_path: Path) 
         training_gains(tmp_path / "gains.yaml", ROBOT)
 
 
-def test_frameworks_with_one_law_share_their_gains() -> None:
-    names = ["mjlab", "isaaclab-explicit"]
-    found = match_frameworks([recorded("mjlab")], ROBOT, names)
-    joints = [found[name].gains.joints["FR_knee"] for name in ["", *names]]
-    assert joints[0] == joints[1] == joints[2]
-    assert [found[n].gains.simulator.engine for n in names] == ["mujoco", "physx"]
+def test_frameworks_with_one_law_need_the_same_gains() -> None:
+    log = recorded("mjlab")
+    own = match([log], ROBOT).gains.joints["FR_knee"]
+    for name, engine in (("mjlab", "mujoco"), ("isaaclab-explicit", "physx")):
+        result = match([log], ROBOT, name)
+        gains = result.gains.joints["FR_knee"]
+        assert gains.stiffness.value == pytest.approx(own.stiffness.value, rel=1e-6)
+        assert gains.damping.value == pytest.approx(own.damping.value, rel=1e-6)
+        assert result.simulator.engine == engine
 
 
 def test_profiles_are_named_with_other_steps_and_iterations() -> None:

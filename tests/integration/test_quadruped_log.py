@@ -10,7 +10,7 @@ import pytest
 
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match.pipeline import match_logs
+from pronk.identify.match.match import match
 from pronk.identify.match.predict import predict, rmse
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.jump.virtual.sim_params import load_sim_params
@@ -51,7 +51,7 @@ def test_all_legs_at_once_are_matched_leg_by_leg(tmp_path: Path) -> None:
     for rows in (slice(None, len(log.time) // 2), slice(len(log.time) // 2, None)):
         columns = {name: getattr(log, name)[rows] for name in ("time", "command", "position")}
         halves.append(replace(log, **columns))
-    gains = match_logs(halves[:1], ROBOT, drive_gains="default").gains
+    gains = match(halves[:1], ROBOT, drive_gains="default").gains
     assert list(gains.joints) == list(ROBOT.joint_names)
     found = predict(halves[1], ROBOT, gains, drive_gains="default")
     later = slice(round(RATE_HZ), None)  # the second half begins in motion, the simulation at rest

@@ -15,7 +15,8 @@ from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
-from pronk.identify.match import gains, match_logs
+from pronk.identify.match import gains
+from pronk.identify.match.match import match
 from pronk.identify.match.torque import fit_drives, fit_torque
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
@@ -99,7 +100,7 @@ def test_torque_that_cannot_be_used_is_named(logs: list[JointLog]) -> None:
         assert drives == {}
         assert reason in flags["elbow"]
     with pytest.raises(IdentifiabilityError, match="magnitudes"):
-        match_logs([replace(log, command=0.0 * log.command, torque=size)], rig(), mode="drive")
+        match([replace(log, command=0.0 * log.command, torque=size)], rig(), mode="drive")
     with pytest.raises(LogError, match="no torque channel"):
         fit_torque([replace(log, torque=None)], rig(), JOINTS[0], links_known=True)
 
@@ -119,8 +120,8 @@ def heavier(factor: float) -> RobotSpec:
 def test_mode_drive_fits_torque_and_keeps_it(logs: list[JointLog], tmp_path: Path) -> None:
     still = [replace(log, command=0.0 * log.command) for log in logs]
     with pytest.raises(LogError, match="--mode drive"):
-        match_logs(still, rig())
-    result = match_logs(still, rig(), mode="drive")
+        match(still, rig())
+    result = match(still, rig(), mode="drive")
     gains.save_gains(tmp_path / "gains.yaml", result.gains)
     kept = gains.load_gains(tmp_path / "gains.yaml")
     for j, joint in enumerate(JOINTS):

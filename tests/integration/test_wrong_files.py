@@ -16,7 +16,7 @@ from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match import match_logs
+from pronk.identify.match.match import match
 from virtual_robot import ROBOT, SIM_PARAMS
 
 JOINT = "FL_hip_roll"
@@ -45,8 +45,8 @@ def test_a_clock_that_runs_wrong_is_named(swept: JointLog, tmp_path: Path, facto
 
 
 def test_a_clock_that_begins_elsewhere_changes_nothing(swept: JointLog, tmp_path: Path) -> None:
-    at_zero = match_logs([read(tmp_path, swept)], ROBOT).gains.joints[JOINT]
-    later = match_logs([read(tmp_path, swept, offset=12_345.0)], ROBOT).gains.joints[JOINT]
+    at_zero = match([read(tmp_path, swept)], ROBOT).gains.joints[JOINT]
+    later = match([read(tmp_path, swept, offset=12_345.0)], ROBOT).gains.joints[JOINT]
     assert later.stiffness.value == pytest.approx(at_zero.stiffness.value, rel=1e-3)
     assert later.damping.value == pytest.approx(at_zero.damping.value, rel=1e-3)
     assert later.delay_s.value == pytest.approx(at_zero.delay_s.value, abs=1e-4)
@@ -64,4 +64,4 @@ def test_degrees_are_refused(swept: JointLog, tmp_path: Path, columns: tuple[str
     small = {c: 0.2 * getattr(swept, c) for c in ("command", "position")}
     wrong = {c: np.rad2deg(small[c]) for c in columns}
     with pytest.raises(LogError, match="degrees"):
-        match_logs([read(tmp_path, replace(swept, velocity=None, **small | wrong))], ROBOT)
+        match([read(tmp_path, replace(swept, velocity=None, **small | wrong))], ROBOT)

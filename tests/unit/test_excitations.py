@@ -11,7 +11,7 @@ import pytest
 from log_files import write_mcap
 from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match.measured_joint import measured_joints
+from pronk.identify.match.measured import measured_joints
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.time_fit import recorded
 from pronk.identify.response.estimate import estimate
@@ -65,7 +65,7 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
     alone = estimate(log_of(knee[0]), "FR_knee")[0]
     for found in (loud, quiet):
         np.testing.assert_allclose(found.response, alone.response, atol=0.02)
-    assert len(measured_joints(log, "FR_knee", ROBOT, MatchSettings())) == 2
+    assert len(measured_joints([log], "FR_knee", ROBOT, MatchSettings())) == 2
 
 
 def test_joints_after_one_another_do_not_move_together() -> None:

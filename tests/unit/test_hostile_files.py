@@ -33,7 +33,7 @@ from pronk.policy.contract import from_json
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model, yaml_of_model
 from pronk.robots.load import read_robot
-from report_cases import CASES, joint_fit, write_trial
+from report_cases import CASES, joint_result, write_trial
 
 GAINS = """
 schema: pronk/gains/1
@@ -279,7 +279,7 @@ def test_an_mcap_log_without_gains_is_read_and_one_with_a_segment_twice_is_not(
 
 def test_a_fit_with_gains_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match="amplitude_gains"):
-        replace(joint_fit("knee"), amplitude_gains=np.ones(2))
+        replace(joint_result("knee").fit, amplitude_gains=np.ones(2))
 
 
 def test_more_steps_than_a_float_holds_are_refused(tmp_path: Path) -> None:

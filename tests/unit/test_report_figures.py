@@ -45,7 +45,7 @@ def test_axes_have_units_and_legends_fit(result) -> None:
         figures.ranges(result.gains, groups),
         figures.zero_armature(knee),
         figures.prediction(joint_prediction(), virtual=True),
-        figures.responses(knee.responses),
+        figures.responses(knee.responses.measured),
     ):
         labels = [text for a in figure.axes for text in (a.get_xlabel(), a.get_ylabel())]
         named = [label for label in labels if label and label != "coherence"]
@@ -60,26 +60,28 @@ def test_axes_have_units_and_legends_fit(result) -> None:
 def test_bode_has_gain_in_decibel_and_phase_in_degrees(result) -> None:
     fit = result.joints["FR_knee"]
     gain, phase, _ = figures.bode(fit).axes
-    for colour, values in ((style.MATCHED, fit.matched), (style.NAIVE, fit.naive)):
+    for colour, values in (
+        (style.MATCHED, fit.responses.matched),
+        (style.NAIVE, fit.responses.nominal),
+    ):
         assert np.allclose(curve(gain, colour).get_ydata(), 20.0 * np.log10(np.abs(values)))
         degrees = np.degrees(np.unwrap(np.angle(values)))
         assert np.allclose(curve(phase, colour).get_ydata(), degrees)
-    hz = fit.responses[0].omega / (2.0 * np.pi)
+    hz = fit.responses.measured[0].omega / (2.0 * np.pi)
     assert np.allclose(curve(gain, style.MATCHED).get_xdata(), hz)
 
 
 def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> None:
     axes = figures.error_maps(result, dict.fromkeys(result.joints, NOMINAL_GAINS)).axes[0]
-    fit = result.joints["FR_hip_roll"]
-    i, j = np.unravel_index(fit.grid_error.argmin(), fit.grid_error.shape)
+    joint = result.joints["FR_hip_roll"]
     marked = {line.get_marker(): line.get_xydata()[0] for line in axes.lines}
-    assert np.allclose(marked["s"], (fit.grid_stiffness[i], fit.grid_damping[j]))
-    assert np.allclose(marked["o"], (fit.stiffness, fit.damping))
+    assert np.allclose(marked["s"], joint.grid.gains)
+    assert np.allclose(marked["o"], (joint.gains.stiffness.value, joint.gains.damping.value))
     assert np.allclose(marked["x"], NOMINAL_GAINS)
     assert np.allclose(marked["+"], (20.6, 0.492))
     # The map shows RMS dB: the square root of what the artefact holds.
-    shown = np.asarray(axes.collections[0].get_array()).reshape(fit.grid_error.T.shape)
-    assert np.allclose(shown, np.sqrt(fit.grid_error.T))
+    shown = np.asarray(axes.collections[0].get_array()).reshape(joint.grid.error.T.shape)
+    assert np.allclose(shown, np.sqrt(joint.grid.error.T))
 
 
 def test_ellipse_passes_through_the_points_of_its_equation() -> None:

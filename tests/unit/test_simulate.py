@@ -16,7 +16,8 @@ from pronk.errors import LogError, PronkError
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.segment import Segment
-from pronk.identify.match import MatchSettings, match_logs, predict
+from pronk.identify.match.match import match
+from pronk.identify.match.predict import predict
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.load import joint_rigs, load_simulator
 from pronk.identify.simulators.mujoco import JointTestRig, MujocoSimulator
@@ -210,8 +211,7 @@ def test_gains_matched_in_another_simulator_are_those_it_was_swept_with() -> Non
     chirp = Excitation(offsets=Chirp(length_s=8.0).samples())
     rigs = joint_rigs(EXAMPLE, ROBOT)
     log = synthetic_log(ROBOT, "FR_knee", [chirp], 19.3, 0.41, simulator=rigs)
-    settings = MatchSettings(simulator=EXAMPLE, grid_points=8)
-    gains = match_logs([log], ROBOT, settings=settings).gains
+    gains = match([log], ROBOT, EXAMPLE).gains
     found = gains.joints["FR_knee"]
     assert found.stiffness.value == pytest.approx(19.3, rel=2e-3)
     assert found.damping.value == pytest.approx(0.41, rel=5e-3)

@@ -73,8 +73,8 @@ class Outcome:
     """Numbers that `--json` writes; arrays become lists, and numbers that are not finite null."""
     wrote: Sequence[Path] = ()
     """Files that were written."""
-    page_of: Path | None = None
-    """Artefact whose page is written when the command has ended, for instance `match.npz`."""
+    pages_of: Sequence[Path] = ()
+    """Artefacts whose pages are written when the command has ended, for instance `match.npz`."""
     following: Sequence[str] = ()
     """Commands to run next."""
     status: int = 0

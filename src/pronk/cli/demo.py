@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pronk.cli import console
 from pronk.cli.match import summary
 from pronk.cli.predict import prediction_rows
@@ -155,7 +153,7 @@ def sweep_and_match(
     from pronk.identify.logs.readers import read_logs
     from pronk.identify.match import gains as gains_file
     from pronk.identify.match import result as result_file
-    from pronk.identify.match.pipeline import match_logs
+    from pronk.identify.match.match import match
     from pronk.identify.match.predict import Prediction, predict, save_prediction
     from pronk.identify.response import save as save_responses
     from pronk.jump.virtual.sim_params import load_sim_params
@@ -179,11 +177,13 @@ def sweep_and_match(
     paths = record("logs", seed, Chirp(), amplitudes=AMPLITUDES, repeats=counts)
     fresh = record("fresh", seed + 1, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     logs = read_logs(paths, processes=cpus, robot=robot)
-    result = match_logs(logs, robot, progress=report)
+    result = match(logs, robot, progress=report)
     gains_file.save_gains(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
-        save_responses(out / "logs" / f"{file_name(name)}.response.npz", joint.responses)
+        if joint.responses is not None:
+            path = out / "logs" / f"{file_name(name)}.response.npz"
+            save_responses(path, joint.responses.measured)
     read = read_logs(fresh, robot=robot)
     replays = [one for log in read for one in predict(log, robot, result.gains).joints]
     prediction = Prediction(joints=tuple(replays), source="fresh", virtual=True)
@@ -198,22 +198,47 @@ def show_match(
 
     Return the distance of each joint's stiffness and damping from Table I, in cells of the grid.
     """
-    from pronk.report.paper import TABLE_I
+    from pronk.identify.match.magnitude import grid_axes
+    from pronk.report.paper import ROBOT, TABLE_I
+    from pronk.robots import load_robot
+    from pronk.tables import Cell, Column, Table
 
-    by_joint, cells, rows = {one.joint: one for one in replays}, {}, []
-    for name, one in result.joints.items():
-        (k, d), fresh = TABLE_I[name], by_joint[name]
-        k_cell, d_cell = (axis[1] - axis[0] for axis in (one.grid_stiffness, one.grid_damping))
-        cells[name] = abs(one.stiffness - k) / k_cell, abs(one.damping - d) / d_cell
-        gains = (f"{one.stiffness:.2f} / {one.damping:.3f}", f"{k:g} / {d:g}")
-        errors = (one.naive_error_db, one.error_db, fresh.rmse_nominal, fresh.rmse_matched)
-        apart = "{:.1f} / {:.1f}".format(*cells[name])
-        row, column = np.unravel_index(int(np.nanargmin(one.grid_error)), one.grid_error.shape)
-        magnitude = f"{one.grid_stiffness[row]:.2f} / {one.grid_damping[column]:.3f}"
-        rows.append((name, *gains, apart, magnitude, *errors))
-    columns = "joint | matched | Table I | grid cells apart | best of the grid by magnitude"
-    columns += " | gain error nominal [dB];2"
-    columns += " | matched [dB];2 | fresh RMSE nominal [rad];4 | matched [rad];4"
+    robot = load_robot(ROBOT)
+    stiffness_axis, damping_axis = grid_axes(robot)
+    stiffness_cell = stiffness_axis[1] - stiffness_axis[0]
+    damping_cell = damping_axis[1] - damping_axis[0]
+    replay_by_joint = {replay.joint: replay for replay in replays}
+    cells = {}
+    rows: list[tuple[Cell, ...]] = []
+    for name, joint in result.joints.items():
+        gains = joint.gains
+        stiffness, damping = TABLE_I[name]
+        stiffness_distance = abs(gains.stiffness.value - stiffness) / stiffness_cell
+        damping_distance = abs(gains.damping.value - damping) / damping_cell
+        cells[name] = (stiffness_distance, damping_distance)
+        replay = replay_by_joint[name]
+        rows.append(
+            (
+                name,
+                f"{gains.stiffness.value:.2f} / {gains.damping.value:.3f}",
+                f"{stiffness:g} / {damping:g}",
+                f"{stiffness_distance:.1f} / {damping_distance:.1f}",
+                gains.quality.nominal_error_db,
+                gains.quality.error_db,
+                replay.rmse_nominal,
+                replay.rmse_matched,
+            )
+        )
+    columns = (
+        Column(heading="joint"),
+        Column(heading="matched"),
+        Column(heading="Table I"),
+        Column(heading="grid cells apart"),
+        Column(heading="gain error nominal", unit="dB", digits=2),
+        Column(heading="matched", unit="dB", digits=2),
+        Column(heading="fresh RMSE nominal", unit="rad", digits=4),
+        Column(heading="matched", unit="rad", digits=4),
+    )
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
-    console.show_table(columns, rows, title=title)
+    console.show(Table(title=title, columns=columns, rows=tuple(rows)))
     return cells

@@ -112,25 +112,24 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
     outcome = command(**values)
     if outcome is None:
         return 0
-    if outcome.page_of is not None:
-        outcome = _with_page(outcome)
+    if outcome.pages_of:
+        outcome = _with_pages(outcome)
     return int(outcome.end(json_file))
 
 
-def _with_page(outcome: Outcome) -> Outcome:
-    """Write the page of a command's artefact, and name it first in what to do next.
+def _with_pages(outcome: Outcome) -> Outcome:
+    """Write the pages of a command's artefacts, and name the first one in what to do next.
 
     Pages are made here, so that no command imports the report.
     """
     from pronk.report.build import write_artefact_page
 
-    assert outcome.page_of is not None
-    page = write_artefact_page(outcome.page_of)
+    pages = [write_artefact_page(artefact) for artefact in outcome.pages_of]
     return dataclasses.replace(
         outcome,
-        figures={**outcome.figures, "page": page},
-        wrote=[*outcome.wrote, page],
-        following=[f"open {page} in a browser", *outcome.following],
+        figures={**outcome.figures, "page": pages[0]},
+        wrote=[*outcome.wrote, *pages],
+        following=[f"open {pages[0]} in a browser", *outcome.following],
     )
 
 

@@ -111,7 +111,7 @@ def _stated_gains(
     robot: str | None, begin: str | None, drive_gains: Sequence[str]
 ) -> tuple[MatchedGains, RobotSpec]:
     """Return the gains that the options state, and the robot."""
-    from pronk.identify.match.measured_joint import gains_by_joint
+    from pronk.identify.match.nominal_gains import gains_by_joint
     from pronk.identify.match.translate import stated_gains
     from pronk.identify.simulators.profiles import profile
     from pronk.robots import load_robot

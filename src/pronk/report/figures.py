@@ -16,9 +16,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 from scipy import stats
 
 from pronk.arrays import Array, ComplexArray, Mask
+from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import MatchedGains
 from pronk.identify.match.predict import JointPrediction
-from pronk.identify.match.result import JointFit, MatchResult
+from pronk.identify.match.result import JointResult, MatchResult
 from pronk.identify.response.response import FrequencyResponse
 from pronk.report import style
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
@@ -61,10 +62,17 @@ def _measured(
     axes.plot(response.frequency_hz, middle, **look)
 
 
-def _panel(axes: Axes, fit: JointFit, curves: _Curves, *, phase: bool = False) -> None:
+def compared(fit: JointResult) -> ComparedResponses:
+    """Return the responses of a joint that has some."""
+    if fit.responses is None:
+        raise ValueError(f"{fit.joint} has no response to draw")
+    return fit.responses
+
+
+def _panel(axes: Axes, fit: JointResult, curves: _Curves, *, phase: bool = False) -> None:
     """Draw measured and simulated gain [dB] or phase [deg] of a joint, the compared band tinted."""
-    response = fit.responses[0]
-    axes.axvspan(*fit.band_hz, color=style.BAND, zorder=0, linewidth=0)
+    response = compared(fit).measured[0]
+    axes.axvspan(*compared(fit).band_hz, color=style.BAND, zorder=0, linewidth=0)
     style.frequency_axis(axes, *_limits_hz([response]))
     _measured(axes, response, style.MEASURED_LINE, phase=phase)
     for curve, look in curves:
@@ -72,8 +80,9 @@ def _panel(axes: Axes, fit: JointFit, curves: _Curves, *, phase: bool = False) -
         axes.plot(response.frequency_hz, np.where(_coherent(response), values, np.nan), **look)
 
 
-def _simulated(fit: JointFit) -> _Curves:
-    return [(fit.naive, style.NAIVE_LINE), (fit.matched, style.MATCHED_LINE)]
+def _simulated(fit: JointResult) -> _Curves:
+    responses = compared(fit)
+    return [(responses.nominal, style.NAIVE_LINE), (responses.matched, style.MATCHED_LINE)]
 
 
 def _coherence(axes: Axes, response: FrequencyResponse, **look: Any) -> None:
@@ -92,9 +101,9 @@ def _keys(virtual: bool, matched: str = "", naive: str = "") -> list[Line2D | Pa
     ]
 
 
-def bode(fit: JointFit, *, title: str | None = None, coherence: bool = True) -> Figure:
+def bode(fit: JointResult, *, title: str | None = None, coherence: bool = True) -> Figure:
     """Draw the Bode plot of one joint: measured with its 95 % interval, matched, nominal."""
-    response = fit.responses[0]
+    response = compared(fit).measured[0]
     ratios = [3.0, 2.0, 0.8] if coherence else [3.0, 2.0]
     options: dict[str, Any] = {"sharex": True, "height_ratios": ratios}
     with drawing(len(ratios), height=1.0 + 1.0 * sum(ratios), **options) as (figure, grid):
@@ -104,14 +113,17 @@ def bode(fit: JointFit, *, title: str | None = None, coherence: bool = True) -> 
         _panel(gain, fit, _simulated(fit))
         _panel(phase, fit, _simulated(fit), phase=True)
         gain.set_title(title or style.joint_words(fit.joint))
-        if fit.grid_error.size:
+        if fit.grid is not None:
             # Reading F9: the paper discards the phase, because the links' delay is in it.
             note = "not compared: contains the delay of command and measurement"
             phase.text(0.01, 0.06, note, transform=phase.transAxes, fontsize=8.5, color="#333333")
         if coherence:
             _coherence(grid[2, 0], response, color=style.MEASURED, linewidth=1.0)
         grid[-1, 0].set_xlabel("frequency [Hz]")
-        errors = (f": error {db:.2f} dB" for db in (fit.error_db, fit.naive_error_db))
+        errors = (
+            f": error {db:.2f} dB"
+            for db in (compared(fit).error_db, compared(fit).nominal_error_db)
+        )
         legend(figure, _keys(response.virtual, *errors), 2)
     return figure
 
@@ -124,15 +136,16 @@ def knees_first(names: Sequence[str]) -> list[str]:
 def hero(result: MatchResult) -> Figure:
     """Draw the Bode plot of one joint, a knee where there is one, without coherence."""
     fit = result.joints[knees_first(list(result.joints))[0]]
-    where = "the virtual robot" if fit.responses[0].virtual else "the robot"
+    where = "the virtual robot" if result.virtual else "the robot"
     title = (
-        f"{style.joint_words(fit.joint)} of {where} ({result.gains.robot.replace('_', ' ')}): "
-        f"matched at {fit.stiffness:.1f} N m/rad, {fit.damping:.3f} N m s/rad"
+        f"{style.joint_words(fit.joint)} of {where} ({result.robot.replace('_', ' ')}): "
+        f"matched at {fit.gains.stiffness.value:.1f} N m/rad, "
+        f"{fit.gains.damping.value:.3f} N m s/rad"
     )
     return bode(fit, title=title, coherence=False)
 
 
-def overview(fits: Mapping[str, JointFit]) -> Figure:
+def overview(fits: Mapping[str, JointResult]) -> Figure:
     """Draw the gain of every joint; rows are joint groups, columns are legs."""
     labels = ("frequency [Hz]", "gain [dB]")
     with style.joint_panels(list(fits), *labels, height=2.0, sharey="row") as (figure, panels):
@@ -140,26 +153,30 @@ def overview(fits: Mapping[str, JointFit]) -> Figure:
             fit = fits[name]
             _panel(axes, fit, _simulated(fit))
             axes.margins(y=0.2)
-            errors = f"{fit.naive_error_db:.2f} → {fit.error_db:.2f} dB"
+            errors = f"{compared(fit).nominal_error_db:.2f} → {compared(fit).error_db:.2f} dB"
             axes.text(0.03, 0.05, errors, transform=axes.transAxes, fontsize=8.5, color="#333333")
-        legend(figure, _keys(any(fit.responses[0].virtual for fit in fits.values())), 4)
+        legend(figure, _keys(any(compared(fit).measured[0].virtual for fit in fits.values())), 4)
     return figure
 
 
-def zero_armature(fit: JointFit) -> Figure:
+def zero_armature(fit: JointResult) -> Figure:
     """Draw the gain of one joint with the best match without rotor inertia (paper Fig. 3)."""
     assert fit.zero_armature is not None
-    curves = [(fit.zero_armature, style.ZERO_LINE), (fit.matched, style.MATCHED_LINE)]
+    responses = compared(fit)
+    curves = [
+        (fit.zero_armature.response, style.ZERO_LINE),
+        (responses.matched, style.MATCHED_LINE),
+    ]
     with drawing(height=3.9) as (figure, grid):
         axes = grid[0, 0]
         _panel(axes, fit, curves)
         # An antiresonance would leave the rest of the curves no room.
-        shallow = style.decibel(fit.matched).min() - 20.0
+        shallow = style.decibel(responses.matched).min() - 20.0
         axes.set(xlabel="frequency [Hz]", ylabel="gain [dB]")
         axes.set_ylim(max(shallow, axes.get_ylim()[0]), None)
         axes.set_title(f"{style.joint_words(fit.joint)}: with and without rotor inertia")
-        best = f"best without rotor inertia: error {fit.zero_armature_error_db:.2f} dB"
-        keys = _keys(fit.responses[0].virtual, f": error {fit.error_db:.2f} dB")
+        best = f"best without rotor inertia: error {fit.zero_armature.error_db:.2f} dB"
+        keys = _keys(responses.measured[0].virtual, f": error {responses.error_db:.2f} dB")
         legend(figure, [*keys[:2], key(best, **style.ZERO_LINE)])
     return figure
 
@@ -218,25 +235,27 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
 
     `drive` has stiffness [N m/rad] and damping [N m s/rad] of the real drive by joint.
     """
-    fits = {name: joint for name, joint in result.joints.items() if joint.grid_error.size}
-    paper = TABLE_I if result.gains.robot == ROBOT else {}
-    errors = {name: np.sqrt(fit.grid_error) for name, fit in fits.items()}
+    grids = {name: joint.grid for name, joint in result.joints.items() if joint.grid is not None}
+    paper = TABLE_I if result.robot == ROBOT else {}
+    errors = {name: np.sqrt(grid.error) for name, grid in grids.items()}
     low = max(min(float(np.nanmin(e)) for e in errors.values()), 0.05)
     high = max(float(np.nanmax(e)) for e in errors.values())
     norm, drawn = LogNorm(vmin=low, vmax=max(high, low * 1.01)), set()
     labels = ("stiffness [N m/rad]", "damping [N m s/rad]")
-    with style.joint_panels(list(fits), *labels, height=2.35) as (figure, panels):
+    with style.joint_panels(list(grids), *labels, height=2.35) as (figure, panels):
         for name, axes in panels.items():
-            fit, k, d = fits[name], fits[name].grid_stiffness, fits[name].grid_damping
+            gains = result.joints[name].gains
+            k = grids[name].stiffness
+            d = grids[name].damping
             look: dict[str, Any] = {"cmap": "viridis", "shading": "nearest", "rasterized": True}
             image = axes.pcolormesh(k, d, errors[name].T, norm=norm, **look)
             axes.grid(False)
             axes.set(xlim=(k[0], k[-1]), ylim=(d[0], d[-1]))
-            i, j = np.unravel_index(int(np.nanargmin(fit.grid_error)), fit.grid_error.shape)
-            refined = (fit.stiffness, fit.damping)
-            if np.isfinite(fit.covariance).all():
-                axes.add_patch(ellipse(refined, fit.covariance, edgecolor="white", zorder=4))
-            points = ((k[i], d[j]), refined, drive.get(name), paper.get(name))
+            refined = (gains.stiffness.value, gains.damping.value)
+            covariance = np.asarray(gains.covariance)
+            if np.isfinite(covariance).all():
+                axes.add_patch(ellipse(refined, covariance, edgecolor="white", zorder=4))
+            points = (grids[name].gains, refined, drive.get(name), paper.get(name))
             for (words, mark), point in zip(_MARKS.items(), points, strict=True):
                 if point is not None:
                     axes.plot(*point, **mark)

@@ -11,18 +11,17 @@ import numpy as np
 
 from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
-from pronk.identify.match import gains as gains_file
 from pronk.identify.match import result as result_file
 from pronk.identify.match.gains import Interval, MatchedGains
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.predict import Prediction, load_prediction
-from pronk.identify.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
+from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult
 from pronk.identify.match.torque import UNITS
 from pronk.jump.trial.tables import Sheet, table
 from pronk.report import figures
 from pronk.report.page import Part, page
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
-from pronk.report.style import joint_words, picture, rms
+from pronk.report.style import joint_words, picture
 from pronk.robots import load_robot
 from pronk.robots.robot import Joint
 
@@ -66,28 +65,16 @@ def group_members(gains: MatchedGains) -> dict[str, list[str]]:
 
 
 def verdict(result: MatchResult) -> dict[str, Any]:
-    """Return the figures of the summary, also those of `--json`."""
-    joints, all_flags = result.gains.joints, {}
-    for name, joint in joints.items():
-        fit = result.joints.get(name)
-        # A zero armature that is ruled out is a result, no warning.
-        found = dict.fromkeys((*joint.flags, *(fit.flags if fit else ())))
-        if flags := [flag for flag in found if not flag.startswith(ZERO_ARMATURE)]:
-            all_flags[name] = flags
-    unmatched = [f for f in all_flags.values() if any(flag.startswith("no match") for flag in f)]
-    errors = {}
-    for name, joint in joints.items():
-        if joint.quality.error_db >= 0.0:
-            errors[name] = joint.quality.error_db
+    """Return the figures of the summary."""
     return {
-        "robot": result.gains.robot,
-        "virtual": result.gains.virtual,
-        "joints": len(joints),
-        "matched": len(joints) - len(unmatched),
-        "naive_error_db": float(rms([joint.quality.nominal_error_db for joint in joints.values()])),
-        "error_db": float(rms([joint.quality.error_db for joint in joints.values()])),
-        "worst": max(errors, key=lambda name: errors[name], default=""),
-        "flags": all_flags,
+        "robot": result.robot,
+        "virtual": result.virtual,
+        "joints": len(result.joints),
+        "matched": len(result.matched_joints),
+        "naive_error_db": result.nominal_error_db,
+        "error_db": result.error_db,
+        "worst": result.worst_joint,
+        "flags": result.flags,
     }
 
 
@@ -101,11 +88,11 @@ def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
 def part(path: Path, gains: str | None = None) -> Part:
     """Make the part of a `match.npz` and the gains file beside it, of this name or found."""
     gains_path = path.parent / gains if gains else find_gains(path.parent)
-    result = result_file.load(path, gains_file.load_gains(gains_path))
+    result = result_file.load(path)
     own, found, drives = result.gains, verdict(result), drives_table(result)
-    fits = {name: fit for name, fit in result.joints.items() if fit.responses}
-    in_time = any(np.isfinite(fit.rmse) for fit in result.joints.values())
-    searched = any(fit.grid_error.size for fit in result.joints.values())
+    fits = {name: one for name, one in result.joints.items() if one.responses is not None}
+    in_time = any(np.isfinite(one.fit.rmse) for one in result.joints.values())
+    searched = any(one.grid is not None for one in result.joints.values())
     order = figures.knees_first(list(fits))
     members = group_members(own)
     drive = {name: (one.stiffness, one.damping) for name, one in robot_joints(own).items()}
@@ -133,7 +120,10 @@ def part(path: Path, gains: str | None = None) -> Part:
         ],
         "scale": None if in_time else _scale_table(own, members, drive),
         "estimators": sorted(
-            {f"{f.responses[0].estimator}, {f.responses[0].window}" for f in fits.values()}
+            {
+                f"{measured.estimator}, {measured.window}"
+                for measured in (figures.compared(fit).measured[0] for fit in fits.values())
+            }
         ),
         "excitation": _excitation_table(fits),
         "amplitudes": _amplitude_table(fits),
@@ -145,7 +135,7 @@ def part(path: Path, gains: str | None = None) -> Part:
         title=f"Match of {own.robot}",
         virtual=own.virtual,
         summary=f"{found['matched']} of {found['joints']} joints matched."
-        if result.joints or not drives.rows
+        if fits or not drives.rows
         else f"Drives of {found['joints']} joints fitted by torque.",
         warning=found["matched"] < found["joints"] or bool(found["flags"]),
         content=content,
@@ -220,9 +210,9 @@ def drives_table(result: MatchResult) -> Sheet:
     for name, joint in result.gains.joints.items():
         found: list[tuple[str, str, float, tuple[float, float], str]] = []
         if fit := result.joints.get(name):
-            for one in (one for one in PARAMETERS if one in fit.ci95):
-                value = getattr(fit, "delay_s" if one == "delay" else one, np.nan)
-                ends = fit.total95.get(one, fit.ci95[one])
+            for one in (one for one in PARAMETERS if one in fit.fit.ci95):
+                value = fit.fit.values[one]
+                ends = fit.fit.total95.get(one, fit.fit.ci95[one])
                 found.append((one, PARAMETERS[one].unit, value, ends, "position"))
         for term, by in joint.torque.items():
             words = "torque" if by.identified else f"not identified by torque: {by.reason}"
@@ -243,9 +233,9 @@ def drives_table(result: MatchResult) -> Sheet:
 def _held_out_table(result: MatchResult) -> Sheet:
     """Errors on what the fits did not use."""
     rows = [
-        (joint_words(name), *(1e3 * fit.held_out[key] for key in HELD_OUT))
-        for name, fit in result.joints.items()
-        if fit.held_out
+        (joint_words(name), *(1e3 * one.fit.held_out[key] for key in HELD_OUT))
+        for name, one in result.joints.items()
+        if one.fit.held_out
     ]
     return table(
         "joint | nominal;2 | nominal with the best delay;2 | plain fit;2 | matched;2",
@@ -275,13 +265,14 @@ def ranges_table(gains: MatchedGains, members: Mapping[str, list[str]]) -> Sheet
     return table(columns, rows, *[note] * paper)
 
 
-def _zero_armature_table(fits: Mapping[str, JointFit]) -> Sheet:
+def _zero_armature_table(fits: Mapping[str, JointResult]) -> Sheet:
     rows = []
     for name, fit in fits.items():
-        if np.isfinite(error := fit.zero_armature_error_db):
-            lost = any(flag.startswith(f"{ZERO_ARMATURE}no match") for flag in fit.flags)
-            errors = (error, fit.error_db, error / max(fit.error_db, 1e-6))
-            rows.append((joint_words(name), *errors, "no match" if lost else "not excluded"))
+        if fit.zero_armature is not None:
+            error = fit.zero_armature.error_db
+            matched = figures.compared(fit).error_db
+            verdict = "no match" if fit.zero_armature.ruled_out else "not excluded"
+            rows.append((joint_words(name), error, matched, error / max(matched, 1e-6), verdict))
     columns = "joint | best error without rotor inertia [dB];2 | matched error [dB];2 | ratio;1"
     return table(f"{columns} | without rotor inertia", rows)
 
@@ -321,13 +312,14 @@ def _scale_table(
     )
 
 
-def _excitation_table(fits: Mapping[str, JointFit]) -> Sheet:
+def _excitation_table(fits: Mapping[str, JointResult]) -> Sheet:
     rows = []
     for name, fit in fits.items():
-        first = fit.responses[0]
-        band = first.band(*fit.band_hz)
-        amplitudes = ", ".join(f"{one.amplitude:g}" for one in fit.responses)
-        compared = f"{fit.band_hz[0]:g} to {fit.band_hz[1]:g}"
+        responses = figures.compared(fit)
+        first = responses.measured[0]
+        band = first.band(*responses.band_hz)
+        amplitudes = ", ".join(f"{one.amplitude:g}" for one in responses.measured)
+        compared = f"{responses.band_hz[0]:g} to {responses.band_hz[1]:g}"
         coherence = first.coherence[band].min() if band.any() else None
         row = (joint_words(name), amplitudes, len(first.repeats), compared, coherence)
         rows.append((*row, 1000.0 * first.delay_s, 100.0 * first.third_harmonic))
@@ -335,12 +327,12 @@ def _excitation_table(fits: Mapping[str, JointFit]) -> Sheet:
     return table(f"{columns} | delay by phase [ms];1 | third harmonic [%];1", rows)
 
 
-def _amplitude_table(fits: Mapping[str, JointFit]) -> Sheet:
+def _amplitude_table(fits: Mapping[str, JointResult]) -> Sheet:
     rows = [
         (joint_words(name), *gains)
-        for name, fit in fits.items()
-        if len(fit.amplitude_gains) > 1
-        for gains in sorted(fit.amplitude_gains.tolist(), reverse=True)
+        for name, one in fits.items()
+        if len(one.fit.amplitude_gains) > 1
+        for gains in sorted(one.fit.amplitude_gains.tolist(), reverse=True)
     ]
     columns = "joint | amplitude [rad] | stiffness [N m/rad];2 | damping [N m s/rad]"
     return table(columns, rows, "Dry friction and backlash weigh more in small motions.")

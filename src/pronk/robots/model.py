@@ -282,3 +282,30 @@ def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     names = [model.actuator(i).name for i in range(model.nu)]
     ctrl = [robot.joint(name).default_position for name in names]
     spec.add_key(name="default", qpos=qpos, ctrl=ctrl)
+
+
+def bench_inertia(robot: RobotSpec, joint_name: str) -> tuple[float, float]:
+    """Measure the inertia and the pull of gravity of a joint in its bench model.
+
+    Args:
+        robot: The robot.
+        joint_name: The joint, at the default pose.
+
+    Returns:
+        Inertia, armature included [kg m^2], and how much gravity moves the joint back [N m/rad];
+        the latter is negative where gravity pulls the joint over.
+    """
+    model = bench_spec(robot, joint_name).compile()
+    data = mujoco.MjData(model)
+    dof = int(model.joint(joint_name).dofadr[0])
+    step = 1e-3
+    bias = {}
+    for shift in (step, -step, 0.0):
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.qpos[dof] += shift
+        mujoco.mj_forward(model, data)
+        bias[shift] = float(data.qfrc_bias[dof])
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    # The bias is the torque that holds the pose: where it grows with the angle, gravity pulls back.
+    return float(inertia[dof, dof]), (bias[step] - bias[-step]) / (2.0 * step)

@@ -1,15 +1,6 @@
-"""Find the parameters with which a simulated joint responds as the measured one does.
+"""Find the gains with which a simulated joint responds as the measured one.
 
-Start at `pipeline.match_frameworks`. In order: `measured_joint` (responses ready to be compared),
-`simulated` (the same of the simulator), `grid` (the paper's search, whole or linearized),
-`response_fit` (off the grid, and mode drive) or `arm` (joints that moved together), `result`,
-`ranges` (what training randomizes), `gains`. The one list of parameters is `parameters`;
-problems and solvers are in `fit`, confidence intervals in `uncertainty`.
+Start at `match.match`. A match measures responses (`measured`), fits the drive of each joint in
+time or by magnitude (`magnitude`), compares measured and simulated responses (`compared`), and
+puts gains, intervals and flags into a `result`. `gains` is the file that training reads.
 """
-
-from pronk.identify.match.pipeline import match_logs
-from pronk.identify.match.predict import predict
-from pronk.identify.match.result import MatchResult
-from pronk.identify.match.settings import MatchSettings
-
-__all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]

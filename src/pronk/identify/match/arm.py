@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +25,13 @@ from scipy import signal
 from pronk.arrays import Array, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.compared import ComparedResponses, compare_recordings
 from pronk.identify.match.fit import Problem, Solution, solve
-from pronk.identify.match.measured_joint import DB, gains_on_drive, rms
+from pronk.identify.match.measured import rms
+from pronk.identify.match.nominal_gains import gains_on_drive
 from pronk.identify.match.parameters import GAINS, PARAMETERS, checked_names
-from pronk.identify.match.result import HELD_OUT, JointFit, held_out_flags
+from pronk.identify.match.result import HELD_OUT, DriveFit, held_out_flags
 from pronk.identify.match.uncertainty import Estimate, block_moves, estimate, jackknife, time_blocks
-from pronk.identify.response.estimate import estimate as estimate_response
-from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.chain import (
     ChainSimulation,
     DriveValues,
@@ -48,8 +47,8 @@ and many times."""
 _BLOCKS = 8
 """Blocks of recordings that are too short for three of the longest."""
 MIN_BLOCKS = 3
-COHERENCE_MIN = 0.8
-"""Frequencies whose coherence is lower do not count towards an error in dB."""
+ChainFits = dict[str, tuple[DriveFit, ComparedResponses | None]]
+"""By joint: its drive, and its responses where a recording has one."""
 _PLAIN = ("stiffness", "damping", "delay")
 _ROUNDS = 15
 _SETTLED = 1e-3
@@ -144,7 +143,7 @@ def fit_together(
     most_held: int = 2,
     threads: int = 2,
     progress: Callable[[float], None] = lambda share: None,
-) -> tuple[dict[str, JointFit], dict[str, str]]:
+) -> tuple[ChainFits, dict[str, str]]:
     """Fit drive parameters of every joint that moves in some recordings, chain by chain.
 
     The base is fixed; several joints may move at once. `stribeck` is fitted with `frictionloss`
@@ -160,7 +159,7 @@ def fit_together(
     if not logs:
         raise LogError("no recordings; the fit of an arm needs at least one.")
     names = checked_names(names, [name for name in PARAMETERS if name != "stribeck"])
-    fits: dict[str, JointFit] = {}
+    fits: ChainFits = {}
     excluded: dict[str, str] = {}
     chains = branches(logs, robot)
     for k, joints in enumerate(chains):
@@ -176,7 +175,7 @@ def fit_together(
 
 def _fit_chain(
     arm: ChainSimulation, names: Sequence[str], most_held: int, progress: Callable[[float], None]
-) -> dict[str, JointFit]:
+) -> ChainFits:
     """Fit the joints of one chain: first without every fourth block, then to everything."""
     used, limit_hz = trusted(arm)
     times, (short, length) = [log.time for log in arm.logs], BLOCKS_S
@@ -369,7 +368,7 @@ def _joint_fits(
     held: Mapping[str, tuple[str, ...]],
     limit_hz: Mapping[str, float],
     held_out: Mapping[str, Mapping[str, float]],
-) -> dict[str, JointFit]:
+) -> ChainFits:
     """Every joint with the response of the recording that shows most of its band."""
     arm, out = problem.arm, {}
     matched, naive = arm.run([problem.values(solution.x), problem.nominal])
@@ -392,56 +391,27 @@ def _joint_fits(
                 f"used up to {limit_hz[name]:.2g} Hz, where the coherence falls "
                 f"({100 * share:.0f} % of the samples)"
             )
-        simulated = [(one[:, i], other[:, i]) for one, other in zip(matched, naive, strict=True)]
-        out[name] = JointFit.of(
+        compared = compare_recordings(
+            arm.robot,
             name,
-            found,
-            held=held[name],
-            rmse=rms(solution.residual[rows][mask]),
-            published_rmse=rms(naive_residual[rows][mask]),
-            total95=found.ci95,
-            held_out=aside,
-            flags=(*held_out_flags(aside), *flags, *found.flags),
-            **_compared(arm, name, simulated, limit_hz[name]),
+            arm.logs,
+            matched=[positions[:, i] for positions in matched],
+            nominal=[positions[:, i] for positions in naive],
+            highest_hz=limit_hz[name],
         )
+        fit = DriveFit(
+            joint=name,
+            values=found.values,
+            sd=found.sd,
+            ci95=found.ci95,
+            total95=found.ci95,
+            covariance=found.covariance,
+            held=held[name],
+            held_out=aside,
+            rmse=rms(solution.residual[rows][mask]),
+            nominal_rmse=rms(naive_residual[rows][mask]),
+            settled=solution.settled,
+            flags=(*held_out_flags(aside), *flags, *found.flags),
+        )
+        out[name] = (fit, compared)
     return out
-
-
-def _compared(
-    arm: ChainSimulation, joint: str, simulated: Sequence[tuple[Array, Array]], limit_hz: float
-) -> dict[str, Any]:
-    """Fields of `JointFit` that compare responses; none where no recording gives a response.
-
-    `simulated` holds the positions with matched and published parameters for each recording.
-    """
-    low, high = arm.robot.joint(joint).band_hz
-    band = (low, min(high, limit_hz))
-    best: FrequencyResponse | None = None
-    inside, k = np.zeros(0, dtype=bool), 0
-    for number, log in enumerate(arm.logs):
-        try:
-            measured = estimate_response(log, joint)[0]
-        except LogError:
-            continue  # not excited, or stuck, in this recording
-        mine = measured.band(*band, COHERENCE_MIN)
-        if mine.sum() > inside.sum():
-            best, inside, k = measured, mine, number
-    if best is None:
-        return {}
-    responses, errors = [], []
-    for position in simulated[k]:
-        # Through the same estimator as the recording's.
-        positions = arm.logs[k].position.copy()
-        positions[:, arm.logs[k].column(joint)] = position
-        one = estimate_response(replace(arm.logs[k], position=positions), joint)[0]
-        responses.append(one.response)
-        errors.append(rms(DB * np.log(one.gain[inside] / best.gain[inside])))
-    return {
-        "responses": (best,),
-        "band_hz": band,
-        "coherence_min": float(best.coherence[inside].min()),
-        "matched": responses[0],
-        "naive": responses[1],
-        "error_db": errors[0],
-        "naive_error_db": errors[1],
-    }

@@ -22,7 +22,7 @@ import numpy as np
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation
-from pronk.identify.match.measured_joint import DB
+from pronk.identify.match.measured import DB
 from pronk.identify.response.response import FrequencyResponse
 from pronk.robots.robot import Joint, RobotSpec
 

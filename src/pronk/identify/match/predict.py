@@ -21,7 +21,8 @@ from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains
-from pronk.identify.match.measured_joint import DriveGains, gains_on_drive, rms, with_drive_gains
+from pronk.identify.match.measured import rms
+from pronk.identify.match.nominal_gains import DriveGains, gains_on_drive, with_drive_gains
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.chain import (
     ChainSimulation,

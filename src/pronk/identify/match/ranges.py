@@ -28,8 +28,8 @@ from scipy import stats
 from pronk.arrays import Array
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains
-from pronk.identify.match.identifiability import bench_inertia
 from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
 STIFFNESS_STEP = 0.5

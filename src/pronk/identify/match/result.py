@@ -1,214 +1,419 @@
-"""MatchResult: everything a match found.
+"""The result of a match, joint by joint, and its file `match.npz`.
 
-`gains.yaml` holds what training needs, `match.npz` beside it the error maps and responses.
+`gains.yaml` beside it holds what training needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pronk.arrays import Array, ComplexArray
+from pronk.errors import ArtefactError
 from pronk.files import load_artefact, save_artefact
+from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import (
     NAN,
     UNKNOWN,
     FittedValue,
+    GroupGains,
     JointGains,
     MatchedGains,
     MatchQuality,
     TorqueParameter,
 )
-from pronk.identify.match.uncertainty import Estimate
-from pronk.identify.response.response import FrequencyResponse
+from pronk.identify.simulators.simulator import SimulatorInfo
 
-SCHEMA = "pronk/match/3"
-ZERO_ARMATURE = "zero armature: "
-"""Beginning of the flag on the search without rotor inertia; it is no flag on the gains."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCHEMA = "pronk/match/4"
+NO_MATCH = "no match: "
+"""Beginning of the flag on gains with which the simulated response is not the measured one."""
 NOT_BETTER = "not better: "
-"""Beginning of the flag on a match that is no better there than less fitting."""
+"""Beginning of the flag on a match that is no better than less fitting on held-out recordings."""
 _NOT_BETTER = 1.02
-"""Error kept aside over that of the best of the others from which on a match is not better: where
-the model's friction is right all fits are equal but for noise."""
-_OTHERS = {
+"""Held-out error over that of the best of the other drives from which on a match is not better:
+where the model's friction is right all fits are equal but for noise."""
+_LESS_FITTING = {
     "nominal": "the nominal gains",
     "nominal_delayed": "the nominal gains with the best delay",
     "plain": "a plain fit of stiffness, damping and delay",
 }
-HELD_OUT = (*_OTHERS, "matched")
-"""Drives whose errors on what was kept aside are compared."""
+HELD_OUT = (*_LESS_FITTING, "matched")
+"""Drives whose errors on held-out recordings are compared."""
+SPREAD_MAX = 0.05
+"""Relative change of stiffness between amplitudes that is worth a flag; the paper's own
+randomization is 2 N m/rad on 20 (D3), twice that."""
+
+
+def _no_numbers(*shape: int) -> Array:
+    return np.full(shape, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointFit:
-    """How one joint was matched; what has no text here is as of `JointGains`.
-
-    Responses share the frequencies of `responses[0]`.
-    """
+class DriveFit:
+    """Parameters of one joint's drive with what they rest on."""
 
     joint: str
-    responses: tuple[FrequencyResponse, ...] = ()
-    """Measured, one per amplitude; the first (largest amplitude) is the one matched. Empty where
-    several joints moved together and none could be estimated."""
-    stiffness: float
-    damping: float
-    armature: float = NAN
-    frictionloss: float = NAN
-    stribeck: float = 0.0
-    delay_s: float = 0.0
+    """Name of the joint."""
+    values: Mapping[str, float]
+    """Every parameter by name, fitted or held. A delay may be below zero."""
+    sd: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
     ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """95 % interval of each fitted parameter by the repeats alone."""
     total95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """The same with what the model does not explain: the change between amplitudes and between
-    parts of the log."""
-    held_out: Mapping[str, float] = field(default_factory=dict)
-    """RMSE [rad] of `HELD_OUT` on what was kept aside, each octave counting alike."""
-    covariance: Array
-    """Of (stiffness, damping), shape (2, 2)."""
+    """95 % interval of each fitted parameter with what the model does not explain: the change
+    between amplitudes and between parts of the log."""
+    covariance: Array = field(default_factory=lambda: _no_numbers(2, 2))
+    """Covariance of (stiffness, damping), zero for what was held, shape (2, 2)."""
     held: tuple[str, ...] = ()
-    """Parameters that were to be fitted but are held, because the logs do not identify them."""
-    band_hz: tuple[float, float] = (NAN, NAN)
-    error_db: float = NAN
-    naive_error_db: float = NAN
-    coherence_min: float = NAN
-    matched: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
-    """Simulated response with the matched gains, shape (f,)."""
-    naive: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
-    """Simulated response with the real drive's gains put into the simulator, shape (f,)."""
-    grid_stiffness: Array = field(default_factory=lambda: np.empty(0))
-    """Axis of the grid [N m/rad], shape (a,); empty where no grid was searched."""
-    grid_damping: Array = field(default_factory=lambda: np.empty(0))
-    """Axis of the grid [N m s/rad], shape (b,)."""
-    grid_error: Array = field(default_factory=lambda: np.empty((0, 0)))
-    """Mean squared magnitude error in the band [dB^2], shape (a, b)."""
-    zero_armature_error_db: float = NAN
-    """Smallest error over the same grid with no rotor inertia (paper F13)."""
-    zero_armature: ComplexArray | None = None
-    """Simulated response at that point of the grid, shape (f,)."""
-    repeat_gains: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
-    amplitude_gains: Array = field(default_factory=lambda: np.empty((0, 3)))
+    """Parameters held at their nominal value because the logs do not identify them."""
+    at_bound: tuple[str, ...] = ()
+    """Fitted parameters that ended at a bound of the search."""
+    held_out: Mapping[str, float] = field(default_factory=dict)
+    """Root mean square error of the drives `HELD_OUT` on held-out recordings [rad]."""
+    amplitude_gains: Array = field(default_factory=lambda: _no_numbers(0, 3))
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
     rmse: float = NAN
-    """Simulated less recorded position where several joints moved together [rad]."""
-    published_rmse: float = NAN
-    """The same with the robot's published parameters [rad]."""
+    """Root mean square error of the position where several joints moved together [rad]."""
+    nominal_rmse: float = NAN
+    """The same error with the nominal gains [rad]."""
+    settled: bool = True
+    """False if the search ended without reaching its tolerance."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
+    """Parameters of the drive by a torque channel."""
     flags: tuple[str, ...] = ()
+    """Sentences that warn of this fit."""
 
     def __post_init__(self) -> None:
-        """Refuse arrays of contradictory shapes."""
-        axes = len(self.grid_stiffness), len(self.grid_damping)
-        for name, shape in (
-            ("covariance", (2, 2)),
-            ("repeat_gains", (len(self.repeat_gains), 2)),
-            ("amplitude_gains", (len(self.amplitude_gains), 3)),
-            ("grid_error", axes),
-        ):
-            if (found := np.shape(getattr(self, name))) != shape:
-                raise ValueError(f"{name} of {self.joint} has shape {found}; expected {shape}")
+        """Refuse arrays of other shapes."""
+        if np.shape(self.covariance) != (2, 2):
+            raise ValueError(f"covariance of {self.joint} has no shape (2, 2)")
+        if np.ndim(self.amplitude_gains) != 2 or np.shape(self.amplitude_gains)[1] != 3:
+            raise ValueError(f"amplitude_gains of {self.joint} have no shape (m, 3)")
 
-    @classmethod
-    def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:
-        """A fit with the parameters and intervals of an estimate; `more` are the other fields."""
-        names = ("stiffness", "damping", "armature", "frictionloss")
-        more |= {name: found.values[name] for name in names}
-        return cls(
-            joint=joint,
-            stribeck=found.values.get("stribeck", 0.0),
-            delay_s=max(found.values["delay"], 0.0),
-            ci95=found.ci95,
-            covariance=found.covariance,
-            repeat_gains=found.repeat_gains,
-            **more,
-        )
 
-    def gains(self) -> JointGains:
-        """Return the part of the fit that training needs."""
-        stiffness_row, damping_row = self.covariance.tolist()
-        flags = [flag for flag in self.flags if not flag.startswith(ZERO_ARMATURE)]
-        return JointGains(
-            stiffness=self._fitted("stiffness", self.stiffness),
-            damping=self._fitted("damping", self.damping),
-            armature=self._fitted("armature", self.armature),
-            frictionloss=self._fitted("frictionloss", self.frictionloss),
-            stribeck=self._fitted("stribeck", self.stribeck),
-            delay_s=self._fitted("delay", self.delay_s),
-            covariance=(tuple(stiffness_row), tuple(damping_row)),
-            quality=MatchQuality(
-                band_hz=self.band_hz,
-                error_db=self.error_db,
-                nominal_error_db=self.naive_error_db,
-                coherence_min=self.coherence_min,
-                amplitude_spread=amplitude_spread(self.amplitude_gains),
-            ),
-            torque=self.torque,
-            flags=tuple(flags),
-        )
+@dataclass(frozen=True, kw_only=True)
+class GridSearch:
+    """Error over the paper's grid of gains, and its best node."""
 
-    def _fitted(self, name: str, value: float) -> FittedValue:
-        """Return a parameter with its intervals."""
-        return FittedValue(
-            value=value,
-            repeat95=self.ci95.get(name, UNKNOWN),
-            total95=self.total95.get(name, UNKNOWN),
+    stiffness: Array
+    """Axis [N m/rad], shape (a,)."""
+    damping: Array
+    """Axis [N m s/rad], shape (b,)."""
+    error: Array
+    """Mean squared error of the gain in the band [dB^2], shape (a, b)."""
+
+    def __post_init__(self) -> None:
+        """Refuse a map that does not fit its axes."""
+        expected = (len(self.stiffness), len(self.damping))
+        if np.shape(self.error) != expected:
+            raise ValueError(f"error has shape {np.shape(self.error)}; expected {expected}")
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Indices of the best node."""
+        row, column = np.unravel_index(int(np.argmin(self.error)), self.error.shape)
+        return int(row), int(column)
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Stiffness [N m/rad] and damping [N m s/rad] of the best node."""
+        row, column = self.cell
+        return float(self.stiffness[row]), float(self.damping[column])
+
+    @property
+    def error_db(self) -> float:
+        """Root mean square error at the best node [dB]."""
+        return float(np.sqrt(np.min(self.error)))
+
+    @property
+    def at_edge(self) -> bool:
+        """True if the best node lies on the border: the optimum may lie beyond."""
+        row, column = self.cell
+        rows, columns = self.error.shape
+        return row in (0, rows - 1) or column in (0, columns - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ZeroArmature:
+    """Best match without rotor inertia (paper F13)."""
+
+    error_db: float
+    """Smallest root mean square gain error over the grid [dB]."""
+    response: ComplexArray
+    """Simulated response with the gains of that error, shape (f,)."""
+    ruled_out: bool
+    """True if no gains match without rotor inertia. A light rotor on a heavy link is not ruled
+    out: other gains make up for it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointResult:
+    """How one joint was matched."""
+
+    joint: str
+    """Name of the joint."""
+    gains: JointGains
+    """Gains that training needs, with their errors and flags."""
+    fit: DriveFit
+    """Fit of the drive that the gains are from."""
+    responses: ComparedResponses | None = None
+    """Measured and simulated responses; None where no response could be estimated."""
+    grid: GridSearch | None = None
+    """Search of the grid; None but with method `paper`."""
+    zero_armature: ZeroArmature | None = None
+    """Search without rotor inertia; None where it was not searched."""
+
+    def __repr__(self) -> str:
+        """Describe the joint in a line."""
+        return (
+            f"JointResult({self.joint}: {self.gains.stiffness.value:.4g} N m/rad, "
+            f"{self.gains.damping.value:.4g} N m s/rad, "
+            f"error {self.gains.quality.error_db:.2f} dB, "
+            f"{len(self.gains.flags)} flags)"
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchDetails:
-    """What matched gains rest on."""
+class MatchResult:
+    """Result of a match for one simulator."""
 
-    joints: Mapping[str, JointFit]
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    """Wall time of each stage [s]."""
-    grid_steps_per_second: float = NAN
-    """Physics steps per second of the grid search, both cores together."""
+    robot: str
+    """Name of the robot."""
+    simulator: SimulatorInfo
+    """Simulator that the gains hold for."""
+    joints: Mapping[str, JointResult]
+    """Results by joint, in the robot's order."""
+    groups: Mapping[str, GroupGains]
+    """Training gains and ranges by joint group."""
+    logs: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 by file name of every log that went in."""
+    virtual: bool = False
+    """True if a log came from pronk's virtual robot."""
     excluded: Mapping[str, str] = field(default_factory=dict)
-    """Joints that moved and were not matched, and why."""
+    """Reasons by joint for joints that moved and were not matched."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time by stage [s]."""
+
+    @property
+    def gains(self) -> MatchedGains:
+        """Gains as they are saved in `gains.yaml`, exported and predicted with."""
+        return MatchedGains(
+            robot=self.robot,
+            simulator=self.simulator,
+            joints={name: joint.gains for name, joint in self.joints.items()},
+            groups=self.groups,
+            logs=self.logs,
+            virtual=self.virtual,
+        )
+
+    @property
+    def flags(self) -> dict[str, tuple[str, ...]]:
+        """Sentences that warn of a joint, by joint; joints without a warning are left out."""
+        flags = {}
+        for name, joint in self.joints.items():
+            if joint.gains.flags:
+                flags[name] = joint.gains.flags
+        return flags
+
+    @property
+    def matched_joints(self) -> tuple[str, ...]:
+        """Names of the joints whose simulated response is the measured one."""
+        matched = []
+        for name, joint in self.joints.items():
+            if not any(flag.startswith(NO_MATCH) for flag in joint.gains.flags):
+                matched.append(name)
+        return tuple(matched)
+
+    @property
+    def error_db(self) -> float:
+        """Root mean square over the joints of the error with the matched gains [dB]."""
+        qualities = [joint.gains.quality for joint in self.joints.values()]
+        return _rms_of_known([quality.error_db for quality in qualities])
+
+    @property
+    def nominal_error_db(self) -> float:
+        """Root mean square over the joints of the error with the nominal gains [dB]."""
+        return _rms_of_known(
+            [joint.gains.quality.nominal_error_db for joint in self.joints.values()]
+        )
+
+    @property
+    def worst_joint(self) -> str:
+        """Name of the joint with the largest error in its band; empty where none is known."""
+        errors = {}
+        for name, joint in self.joints.items():
+            if np.isfinite(joint.gains.quality.error_db):
+                errors[name] = joint.gains.quality.error_db
+        return max(errors, key=errors.__getitem__, default="")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures of the match as a dictionary of numbers, text and dictionaries.
+
+        The keys are `robot`, `virtual`, `simulator`, `joints`, `groups`, `excluded` and `seconds`;
+        a joint has the fields of `JointGains`, its `held_out` errors and its `grid` optimum.
+        """
+        joints = {}
+        for name, joint in self.joints.items():
+            figures = asdict(joint.gains)
+            figures["held_out"] = dict(joint.fit.held_out)
+            figures["grid"] = None if joint.grid is None else joint.grid.gains
+            figures["zero_armature_error_db"] = None
+            if joint.zero_armature is not None:
+                figures["zero_armature_error_db"] = joint.zero_armature.error_db
+            joints[name] = figures
+        return {
+            "robot": self.robot,
+            "virtual": self.virtual,
+            "simulator": asdict(self.simulator),
+            "joints": joints,
+            "groups": {name: asdict(group) for name, group in self.groups.items()},
+            "excluded": dict(self.excluded),
+            "seconds": dict(self.seconds),
+        }
+
+    def plot(self, joint: str | None = None) -> Figure:
+        """Draw the measured and the simulated gain and phase.
+
+        Args:
+            joint: The joint; all joints if None, their gain alone.
+
+        Returns:
+            A matplotlib figure; `figure.savefig("bode.svg")` writes it.
+
+        Raises:
+            ArtefactError: No response of the joint, or of any joint, was estimated.
+        """
+        from pronk.identify.match.plot import plot_all_gains, plot_response
+
+        responses = {}
+        for name, result in self.joints.items():
+            if result.responses is not None and joint in (None, name):
+                responses[name] = result.responses
+        if not responses:
+            raise ArtefactError(
+                f"no response of {joint or 'any joint'} to draw; the joints of this match are "
+                f"{', '.join(self.joints)}."
+            )
+        if joint is None:
+            return plot_all_gains(responses)
+        return plot_response(responses[joint], title=joint)
+
+    def __repr__(self) -> str:
+        """Describe the match in a line for each joint."""
+        lines = [f"MatchResult of {self.robot} for {self.simulator.engine}:"]
+        lines.extend(f"  {joint!r}" for joint in self.joints.values())
+        return "\n".join(lines)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MatchResult(MatchDetails):
-    """A whole match."""
-
-    gains: MatchedGains
+def _rms_of_known(values: Sequence[float]) -> float:
+    """Return the root mean square of the finite values; NaN without any."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.sqrt(np.mean(np.square(finite)))) if finite else NAN
 
 
 def save(path: Path, result: MatchResult) -> None:
-    """Write `match.npz`; `pronk.identify.match.gains.save_gains` writes the gains."""
-    details = {f.name: getattr(result, f.name) for f in fields(MatchDetails)}
-    save_artefact(path, MatchDetails(**details), SCHEMA)
+    """Write `match.npz`, whole or not at all."""
+    save_artefact(path, result, SCHEMA)
 
 
-def load(path: Path, gains: MatchedGains) -> MatchResult:
-    """Read what `save` wrote, to go with the gains beside it; ArtefactError for another file."""
-    found = load_artefact(path, MatchDetails, SCHEMA, what="a match file", writer="pronk match")
-    return MatchResult(gains=gains, **vars(found))
+def load(path: Path) -> MatchResult:
+    """Read what `save` wrote.
+
+    Raises:
+        ArtefactError: Another file, or one of another schema.
+    """
+    return load_artefact(path, MatchResult, SCHEMA, what="a match file", writer="pronk match")
+
+
+def joint_gains(
+    fit: DriveFit, responses: ComparedResponses | None, flags: tuple[str, ...]
+) -> JointGains:
+    """Return the part of a joint's result that training needs.
+
+    Args:
+        fit: The fit of the drive.
+        responses: Compared responses, if there are any.
+        flags: Every sentence that warns of this joint, those of the fit among them.
+    """
+    spread = amplitude_spread(fit.amplitude_gains)
+    quality = MatchQuality(amplitude_spread=spread)
+    if responses is not None:
+        quality = MatchQuality(
+            band_hz=responses.band_hz,
+            error_db=responses.error_db,
+            nominal_error_db=responses.nominal_error_db,
+            coherence_min=responses.coherence_min,
+            amplitude_spread=spread,
+        )
+    stiffness_row, damping_row = fit.covariance.tolist()
+    return JointGains(
+        stiffness=_fitted_value(fit, "stiffness"),
+        damping=_fitted_value(fit, "damping"),
+        armature=_fitted_value(fit, "armature"),
+        frictionloss=_fitted_value(fit, "frictionloss"),
+        stribeck=_fitted_value(fit, "stribeck"),
+        delay_s=replace(_fitted_value(fit, "delay"), value=max(fit.values["delay"], 0.0)),
+        covariance=(tuple(stiffness_row), tuple(damping_row)),
+        quality=quality,
+        torque=fit.torque,
+        flags=flags,
+    )
+
+
+def _fitted_value(fit: DriveFit, name: str) -> FittedValue:
+    """Return a parameter of a fit with its intervals."""
+    return FittedValue(
+        value=fit.values[name],
+        repeat95=fit.ci95.get(name, UNKNOWN),
+        total95=fit.total95.get(name, UNKNOWN),
+    )
 
 
 def amplitude_spread(gains: Array) -> float:
-    """Largest relative change of stiffness from the first amplitude; NaN with one amplitude.
+    """Return the largest relative change of stiffness from the first amplitude.
 
-    Rows of `gains` are (amplitude, stiffness, damping), the matched amplitude first.
+    Args:
+        gains: Rows of (amplitude, stiffness, damping), the matched amplitude first, shape (m, 3).
+
+    Returns:
+        The change; NaN with one amplitude.
     """
     if len(gains) < 2:
         return NAN
     return float(np.abs(gains[1:, 1] / gains[0, 1] - 1.0).max())
 
 
+def amplitude_flags(gains: Array) -> tuple[str, ...]:
+    """Warn of gains, shape (m, 3), that change with the amplitude, as dry friction makes them."""
+    spread = amplitude_spread(gains)
+    if not spread > SPREAD_MAX:
+        return ()
+    largest = gains[:, 0].max()
+    smallest = gains[:, 0].min()
+    return (
+        f"friction: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
+        f"{largest:.3g} rad; give the simulator the joint's dry friction, or match at the "
+        "amplitude that the policy will use",
+    )
+
+
 def held_out_flags(errors: Mapping[str, float]) -> tuple[str, ...]:
-    """Flag a match that is no better on what was kept aside than with less or no fitting."""
+    """Warn of a match that is no better on held-out recordings than less or no fitting."""
     if not errors:
         return ()
-    best = min(_OTHERS, key=errors.__getitem__)
+    best = min(_LESS_FITTING, key=errors.__getitem__)
     if errors["matched"] <= _NOT_BETTER * errors[best]:
         return ()
     return (
         f"{NOT_BETTER}on what was kept aside it misses by {1e3 * errors['matched']:.2f} mrad, "
-        f"{_OTHERS[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes",
+        f"{_LESS_FITTING[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more "
+        "amplitudes",
     )

@@ -26,8 +26,8 @@ from scipy.interpolate import CubicSpline
 from pronk.arrays import Array, Mask
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.fit import CachedProblem, Solution, solve_together
+from pronk.identify.match.measured import grouped
 from pronk.identify.match.parameters import GAINS, PARAMETERS
-from pronk.identify.match.simulated import grouped
 from pronk.identify.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.simulator import JointRigs

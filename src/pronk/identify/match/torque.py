@@ -37,8 +37,8 @@ from pronk.arrays import Array, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.gains import TorqueParameter
-from pronk.identify.match.result import JointFit
-from pronk.identify.match.simulated import grouped
+from pronk.identify.match.measured import grouped
+from pronk.identify.match.result import DriveFit
 from pronk.identify.match.uncertainty import block_moves, jackknife, time_blocks
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
@@ -331,10 +331,10 @@ def fit_drives(
 
 def joint_fits(
     robot: RobotSpec,
-    fits: Mapping[str, JointFit],
+    fits: Mapping[str, DriveFit],
     drives: Mapping[str, Mapping[str, TorqueParameter]],
     flags: Mapping[str, str],
-) -> dict[str, JointFit]:
+) -> dict[str, DriveFit]:
     """Fits by position with the drives by torque; the arguments are those of `fit_drives`.
 
     Joints that were not fitted by position have the gains of the robot's file, and the armature and
@@ -351,18 +351,22 @@ def joint_fits(
         if fit:
             for term, value in identified.items():
                 name = _BOTH[term]
-                other, (low, high) = getattr(fit, name), own[term].ci95
+                other, (low, high) = fit.values[name], own[term].ci95
                 apart = not low <= other <= high and abs(value - other) > _AGREE * other
                 if name in fit.ci95 and apart:
                     unit = UNITS[term]
                     found.append(f"{name} {other:.3g} {unit} by position, {value:.3g} by torque")
         elif any(one.identified for one in own.values()):
-            fit = JointFit(
+            fit = DriveFit(
                 joint=joint,
-                stiffness=known.stiffness,
-                damping=known.damping,
-                armature=identified.get("armature", known.drive.armature),
-                frictionloss=identified.get("dry", np.nan),
+                values={
+                    "stiffness": known.stiffness,
+                    "damping": known.damping,
+                    "armature": identified.get("armature", known.drive.armature),
+                    "frictionloss": identified.get("dry", np.nan),
+                    "stribeck": 0.0,
+                    "delay": 0.0,
+                },
                 covariance=np.zeros((2, 2)),
             )
             held = ["stiffness", "damping", *["armature"] * ("armature" not in identified)]

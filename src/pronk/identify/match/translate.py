@@ -27,7 +27,8 @@ from pronk.identify.match.gains import (
     JointGains,
     MatchedGains,
 )
-from pronk.identify.match.measured_joint import DB, Pair, rms
+from pronk.identify.match.measured import DB, rms
+from pronk.identify.match.nominal_gains import Pair
 from pronk.identify.simulators.linear import LinearJoint, linearize
 from pronk.identify.simulators.mujoco import JointTestRig
 from pronk.identify.simulators.profiles import Profile

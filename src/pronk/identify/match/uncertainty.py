@@ -9,20 +9,14 @@ Student's t over the blocks, which holds with as few as three.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.arrays import Array
-from pronk.identify.match.fit import Solution
-from pronk.identify.match.measured_joint import FLOOR_DB, MeasuredJoint
 from pronk.identify.match.parameters import GAINS, PARAMETERS
-
-_SHARED = 1.5
-"""Equivalent noise bandwidth of the Hann window in bins (Harris 1978, table 1): how many
-neighbouring frequencies share their noise."""
 
 
 def jackknife(moves: Array) -> Array:
@@ -127,45 +121,3 @@ def estimate(
         sd=dict(zip(fitted, sd.tolist(), strict=True)),
         ci95=ci95,
     )
-
-
-def _repeat_moves(goal: MeasuredJoint, solution: Solution) -> Array:
-    """Where each repeat would move the optimum of a fit by magnitude, shape (repeats, p).
-
-    By one Gauss-Newton step with the simulator's own derivatives at the common optimum,
-    `(J^T J)^-1 J^T` times what the repeat differs from the mean: repeats differ by little.
-    """
-    # Residuals are simulated less measured: a larger response needs larger gains there.
-    change = goal.error_db(goal.measured.repeats[:, goal.fit_mask]) / goal.deviation_db()
-    return np.asarray(change @ np.linalg.pinv(solution.jacobian).T)
-
-
-def gain_interval(
-    goal: MeasuredJoint, solution: Solution, held: Mapping[str, float] | None = None
-) -> Estimate:
-    """Uncertainty of stiffness and damping, from the repeats of the measured response.
-
-    With one repeat there is nothing to compare; the interval is then that of the coherence
-    (Fisher information of the weighted fit, widened by the correlation of neighbouring
-    frequencies and by the misfit), which takes noise for white, and a flag states it.
-    """
-    optimum, count = np.exp(solution.x), len(goal.measured.repeats)
-    freedom: float = count - 1
-    flags: tuple[str, ...] = ()
-    if count < 2:
-        deviation = goal.deviation_db()
-        white = np.maximum(deviation**2 - FLOOR_DB**2, 0.0) / deviation**2
-        influence = np.linalg.pinv(solution.jacobian)
-        free = max(len(solution.residual) - 2, 1)
-        misfit = max(1.0, float(solution.residual @ solution.residual) / free)
-        covariance = _SHARED * misfit * (influence * white) @ influence.T
-        covariance = covariance * np.outer(optimum, optimum)
-        gains, freedom = optimum[None, :], np.inf
-        flags = ("one repeat: the interval assumes white noise",)
-    else:
-        gains = optimum * np.exp(_repeat_moves(goal, solution))
-        covariance = jackknife(gains / (count - 1))
-        if count == 2:
-            flags = ("two repeats: the interval is wide, three or more narrow it",)
-    found = estimate(GAINS, solution.x, covariance, freedom, held or {}, symmetric=True)
-    return replace(found, repeat_gains=gains, flags=flags)

@@ -1,0 +1,346 @@
+"""Measured responses of joints, and simulated ones through the same estimator.
+
+With the command given, the H1 estimate is linear in the position, `response = position @ matrix`.
+The simulated positions of a whole grid of gains therefore become responses in one product, through
+the very windows and segments that the log went through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from pronk.arrays import Array, ComplexArray, Mask
+from pronk.errors import IdentifiabilityError, LogError
+from pronk.identify.logs.joint_log import JointLog, group_repeats
+from pronk.identify.match.settings import MatchSettings
+from pronk.identify.response.estimate import estimate, log_rate, operator
+from pronk.identify.response.h1 import H1Operator
+from pronk.identify.response.response import FrequencyResponse
+from pronk.identify.simulators.command_trace import CommandTrace, command_trace
+from pronk.identify.simulators.simulator import JointRigs
+from pronk.robots.robot import RobotSpec
+
+T = TypeVar("T")
+
+DB = 20.0 / np.log(10.0)
+"""Decibels per neper: `20 log10(gain) = DB * log(gain)`."""
+FLOOR_DB = 0.1
+"""Smallest deviation of a measured gain that is used [dB]. Coherence near 1 would otherwise let a
+few frequencies outvote the band, though the model itself is not better than this."""
+_TAIL = 2e-4
+"""Absolute error of gain that leaving out the end of the log would cause in a joint that follows
+its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
+
+
+def rms(values: Array | ComplexArray) -> float:
+    """Return the root mean square of magnitudes."""
+    return float(np.sqrt(np.mean(np.abs(values) ** 2)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredJoint:
+    """Response of a joint at one amplitude, ready to be compared with simulations."""
+
+    trace: CommandTrace
+    """Command at every physics step of the simulator."""
+    sign: float
+    """1, or -1 where the joint mirrors the joint that is simulated in its place."""
+    measured: FrequencyResponse
+    """Response that was measured, at f frequencies."""
+    operator: H1Operator
+    """Linear map from positions to the response."""
+    fit_mask: Mask
+    """Frequencies that a fit compares: in the band and coherent enough, shape (f,)."""
+    warnings: tuple[str, ...] = ()
+    """Sentences on smaller amplitudes that could not be used."""
+
+    @property
+    def joint(self) -> str:
+        """Name of the excited joint."""
+        return self.trace.joint
+
+    @property
+    def omega(self) -> Array:
+        """Angular frequencies of the fit [rad/s], shape (inside,)."""
+        return self.measured.omega[self.fit_mask]
+
+    @cached_property
+    def fit_matrix(self) -> Array:
+        """Matrix from positions about the pose to the response, shape (steps, 2 inside).
+
+        Real and imaginary columns lie side by side: one real product is faster than a complex one.
+        A chirp leaves the band long before it ends. The rows end where all later positions
+        together move no gain by `_TAIL`, judged by a joint that follows its command perfectly, so
+        that later steps need not be simulated.
+        """
+        matrix = self.operator.matrix(self.trace.time, self.fit_mask)
+        command = self.trace.command - self.trace.command[0]
+        contributions = (matrix * command[:, None])[::-1]
+        remaining = np.abs(np.cumsum(contributions, axis=0)[::-1]).max(axis=1)
+        loud_steps = np.nonzero(remaining > _TAIL)[0]
+        if len(loud_steps):
+            matrix = matrix[: int(loud_steps[-1]) + 2]
+        return np.hstack([matrix.real, matrix.imag])
+
+    @property
+    def steps(self) -> int:
+        """Physics steps that the fit needs."""
+        return len(self.fit_matrix)
+
+    def fit_response(self, position: Array) -> ComplexArray:
+        """Estimate responses at the frequencies of the fit, in this joint's coordinate.
+
+        Args:
+            position: Positions of the simulated joint [rad], shape (..., at least `steps`).
+
+        Returns:
+            Responses, shape (..., inside).
+        """
+        # The mean is removed; without it nothing is cut off where the steps end at rest.
+        moved = position[..., : self.steps] - position[..., :1]
+        pair = moved @ self.fit_matrix
+        half = pair.shape[-1] // 2
+        return np.asarray(self.sign * (pair[..., :half] + 1j * pair[..., half:]))
+
+    def full_response(self, position: Array) -> ComplexArray:
+        """Estimate the response at all frequencies, shape (f,), of positions at all steps [rad]."""
+        time = self.trace.time
+        return np.asarray(self.sign * self.operator.response(time, position[: len(time)]))
+
+    def deviation_db(self) -> Array:
+        """Return the standard deviation of the measured gain by coherence [dB], (inside,)."""
+        return np.asarray(np.hypot(DB * self.measured.deviation()[self.fit_mask], FLOOR_DB))
+
+    def error_db(self, simulated: ComplexArray) -> Array:
+        """Return the gain over the measured one [dB] of responses of shape (..., inside)."""
+        measured_gain = np.abs(self.measured.response[self.fit_mask])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured_gain)))
+
+    def rms_db(self, simulated: ComplexArray) -> float:
+        """Return the root mean square of `error_db`, every frequency counting alike [dB]."""
+        return rms(self.error_db(simulated))
+
+    def measurement_error_db(self) -> float:
+        """Return the RMS half-width of the measured gain's own 95 % interval in the band [dB]."""
+        relative = self.measured.relative_error(0.95)[self.fit_mask]
+        return float(DB * np.sqrt(np.mean(relative**2)))
+
+
+def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[JointLog]]:
+    """Sort logs by the joints that they excite.
+
+    Args:
+        logs: Logs of one robot; a log may excite several joints.
+        robot: The robot.
+
+    Returns:
+        Logs of each excited joint, joints in the robot's order.
+
+    Raises:
+        LogError: No log excites a joint by a commanded position.
+        RobotError: An excited joint is not the robot's.
+    """
+    excited_in: dict[str, list[JointLog]] = {}
+    for log in logs:
+        for name in log.excited_joints:
+            excited_in.setdefault(name, []).append(log)
+    for name in excited_in:
+        robot.joint(name)
+    if not excited_in:
+        message = (
+            f"{len(logs)} logs excite no joint by a commanded position; expected some of "
+            f"{', '.join(robot.joint_names)}"
+        )
+        if any(log.torque is not None for log in logs):
+            raise LogError(f"{message}; --mode drive fits drives to torques.")
+        raise LogError(f"{message}.")
+    return {name: excited_in[name] for name in robot.joint_names if name in excited_in}
+
+
+def measured_joints(
+    logs: Sequence[JointLog], joint_name: str, robot: RobotSpec, settings: MatchSettings
+) -> list[MeasuredJoint]:
+    """Estimate a joint's responses, repeats in several logs put together.
+
+    Sine steps are left out: they are read step by step and have no single matrix.
+
+    Args:
+        logs: Logs that excite the joint.
+        joint_name: The joint.
+        robot: The robot as it is simulated; the commands are sampled at its physics steps.
+        settings: Estimator and lowest coherence.
+
+    Returns:
+        One response an amplitude, the largest amplitude first.
+
+    Raises:
+        LogError: The joint was not excited or did not move, its unit is unknown, or one amplitude
+            has other frequencies in another log.
+        IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
+    """
+    amplitudes: dict[tuple[object, ...], list[MeasuredJoint]] = {}
+    for log in logs:
+        for target in _responses_of_log(log, joint_name, robot, settings):
+            measured = target.measured
+            key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
+            amplitudes.setdefault(key, []).append(target)
+    targets = [merged_repeats(repeats) for repeats in amplitudes.values()]
+    return sorted(targets, key=lambda target: -target.measured.amplitude)
+
+
+def _responses_of_log(
+    log: JointLog, joint_name: str, robot: RobotSpec, settings: MatchSettings
+) -> list[MeasuredJoint]:
+    """Estimate the responses of one joint in one log, the largest amplitude first."""
+    source = log.source or "log"
+    segments = [segment for segment in log.segmented().segments if segment.kind != "sine_steps"]
+    if not any(joint_name in segment.joints for segment in segments):
+        raise LogError(
+            f"{source}: {joint_name} was excited by sine steps only; match a chirp or a multisine, "
+            "and keep the steps to check it."
+        )
+    log = replace(log, segments=tuple(segments))
+    joint = robot.joint(joint_name)
+    excitations = log.excitations(joint_name)
+    rate_hz = log_rate(excitations)
+    responses = estimate(log, joint_name, settings.estimator)
+    targets: list[MeasuredJoint] = []
+    warnings: list[str] = []
+    for repeats, response in zip(group_repeats(excitations), responses, strict=True):
+        try:
+            fit_mask = _compared_frequencies(
+                response, joint.band_hz, settings.coherence_min, source
+            )
+        except IdentifiabilityError as error:
+            # The largest amplitude must be usable; a smaller one only checks it.
+            if not targets:
+                raise
+            warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
+            continue
+        # The commands of all repeats are the same, so that of the first stands for them.
+        targets.append(
+            MeasuredJoint(
+                trace=command_trace(repeats[0], robot),
+                sign=joint.original[1],
+                measured=response,
+                operator=operator(repeats[0], settings.estimator, rate_hz),
+                fit_mask=fit_mask,
+            )
+        )
+    targets[0] = replace(targets[0], warnings=tuple(warnings))
+    return targets
+
+
+def merged_repeats(targets: Sequence[MeasuredJoint]) -> MeasuredJoint:
+    """Put responses of one amplitude from several logs together; each log counts by its repeats.
+
+    Raises:
+        LogError: The responses have different frequencies.
+    """
+    first = targets[0]
+    if len(targets) == 1:
+        return first
+    responses = [target.measured for target in targets]
+    for response in responses:
+        if not np.allclose(response.omega, first.measured.omega):
+            raise LogError(
+                f"{first.joint} was excited at {first.measured.amplitude:.3g} rad in several logs "
+                "whose responses have different frequencies; match them one at a time."
+            )
+    weights = [len(response.repeats) for response in responses]
+    coherence = [response.coherence for response in responses]
+    sources = dict.fromkeys(response.source for response in responses)
+    warnings = [warning for target in targets for warning in target.warnings]
+    measured = replace(
+        first.measured,
+        response=np.average([one.response for one in responses], axis=0, weights=weights),
+        coherence=np.average(coherence, axis=0, weights=weights),
+        averages=np.sum([one.averages for one in responses], axis=0),
+        repeats=np.concatenate([one.repeats for one in responses]),
+        source=", ".join(sources),
+    )
+    return replace(
+        first,
+        measured=measured,
+        # Only frequencies that are coherent in all logs are compared.
+        fit_mask=np.logical_and.reduce([target.fit_mask for target in targets]),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _compared_frequencies(
+    response: FrequencyResponse, band_hz: tuple[float, float], coherence_min: float, source: str
+) -> Mask:
+    """Return the coherent frequencies of the band, shape (f,).
+
+    Raises:
+        IdentifiabilityError: The band has fewer than three frequencies, the joint did not move, or
+            more than half of the band is incoherent.
+    """
+    low_hz, high_hz = band_hz
+    band = response.band(low_hz, high_hz)
+    count = int(band.sum())
+    if count < 3:
+        raise IdentifiabilityError(
+            f"{source}: {response.joint} has a response at {count} frequencies between "
+            f"{low_hz:g} and {high_hz:g} Hz; a match needs 3 or more, so sweep longer or higher."
+        )
+    largest_gain = np.abs(response.response[band]).max()
+    if not largest_gain > 1e-3:
+        raise IdentifiabilityError(
+            f"{source}: {response.joint} did not move (largest gain {largest_gain:.1e} between "
+            f"{low_hz:g} and {high_hz:g} Hz); check that its drive is on and that the column is "
+            "the right one."
+        )
+    coherent = response.band(low_hz, high_hz, coherence_min)
+    if 2 * int(coherent.sum()) < count:
+        raise IdentifiabilityError(
+            f"{source}: {response.joint} is coherent (at least {coherence_min:g}) at only "
+            f"{int(coherent.sum())} of {count} frequencies between {low_hz:g} and {high_hz:g} "
+            "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
+        )
+    return coherent
+
+
+def simulated_response(
+    rigs: JointRigs, target: MeasuredJoint, values: Mapping[str, float]
+) -> ComplexArray:
+    """Simulate the command of a measured response and estimate the response of the simulation.
+
+    Args:
+        rigs: Joints in the simulator.
+        target: The measured response.
+        values: Parameters of the drive by name. Those that the simulator cannot set are left as
+            the simulator has them; the `delay` [s] turns the phase.
+
+    Returns:
+        Response at all frequencies of the measured one, shape (f,); NaN where it diverged.
+    """
+    settable = {}
+    for name, value in values.items():
+        if name in rigs.parameters and name != "delay":
+            settable[name] = np.array([value])
+    response = np.full(len(target.measured.omega), np.nan, dtype=np.complex128)
+    for _, position in rigs.run([target.trace], settable, len(target.trace.command)):
+        response = target.full_response(position[0])
+    delay_s = values.get("delay", 0.0)
+    return np.asarray(response * np.exp(-1j * target.measured.omega * delay_s))
+
+
+def grouped(items: Sequence[T], same: Callable[[T, T], bool]) -> list[list[T]]:
+    """Gather items that are the same as the first item of a group."""
+    groups: list[list[T]] = []
+    for item in items:
+        for group in groups:
+            if same(group[0], item):
+                group.append(item)
+                break
+        else:
+            groups.append([item])
+    return groups

@@ -1,0 +1,127 @@
+"""Nominal gains: those that were on the real drives while a log was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from pronk.errors import LogError, PronkError
+from pronk.identify.logs.joint_log import JointLog
+from pronk.robots.robot import RobotSpec
+
+Pair = tuple[float, float]
+"""Stiffness [N m/rad] and damping [N m s/rad]."""
+DriveGains = Mapping[str, Pair] | Literal["default"]
+"""Gains on the real drives, by joint or joint group, or `default`: those of the robot's file."""
+
+_SAME_GAINS = 0.01
+"""Relative difference between gains of the log and gains of the user that counts as rounding."""
+
+
+def gains_by_joint(robot: RobotSpec, drive_gains: DriveGains) -> dict[str, Pair]:
+    """Spread gains that are named by joint or by joint group over the joints.
+
+    Args:
+        robot: The robot, which knows its joints and joint groups.
+        drive_gains: Stiffness and damping by joint or group, or `default`.
+
+    Returns:
+        Stiffness and damping by joint.
+
+    Raises:
+        PronkError: A name is neither a joint nor a joint group.
+    """
+    if drive_gains == "default":
+        return {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
+    by_joint: dict[str, Pair] = {}
+    for name, pair in drive_gains.items():
+        if name in robot.groups:
+            for joint in robot.group(name):
+                by_joint[joint.name] = pair
+        elif name in robot.joint_names:
+            by_joint[name] = pair
+        else:
+            raise PronkError(
+                f"drive gains of {name!r}; expected a joint ({', '.join(robot.joint_names)}) or a "
+                f"joint group ({', '.join(robot.groups)})."
+            )
+    return by_joint
+
+
+def with_drive_gains(
+    logs: Sequence[JointLog], robot: RobotSpec, drive_gains: DriveGains | None = None
+) -> list[JointLog]:
+    """Give every log the gains that were on the real drives.
+
+    Args:
+        logs: Logs of one robot.
+        robot: The robot; its file has the gains of joints that stood still.
+        drive_gains: Gains where the logs do not have them.
+
+    Returns:
+        The logs with their excitations marked and with gains for every column.
+
+    Raises:
+        LogError: Gains of an excited joint are neither in the log nor given, or the two differ.
+        PronkError: A name of `drive_gains` is neither a joint nor a joint group.
+    """
+    stated: dict[str, Pair] = {}
+    if drive_gains is not None and drive_gains != "default":
+        stated = gains_by_joint(robot, drive_gains)
+    completed = []
+    for plain_log in logs:
+        log = plain_log.segmented()
+        stiffness = np.zeros(len(log.joints))
+        damping = np.zeros(len(log.joints))
+        for column, name in enumerate(log.joints):
+            pair = _column_gains(log, column, stated.get(name))
+            if pair is None and name in log.excited_joints and drive_gains != "default":
+                raise LogError(
+                    f"{log.source or 'log'}: the gains that were on the drive of {name} are not in "
+                    "the log; give --drive-gains JOINT_OR_GROUP=STIFFNESS,DAMPING, or "
+                    "--drive-gains default if they were those of the robot's file."
+                )
+            if pair is None and name in robot.joint_names:
+                joint = robot.joint(name)
+                pair = (joint.stiffness, joint.damping)
+            if pair is not None:
+                stiffness[column] = pair[0]
+                damping[column] = pair[1]
+        completed.append(replace(log, stiffness=stiffness, damping=damping))
+    return completed
+
+
+def _column_gains(log: JointLog, column: int, stated: Pair | None) -> Pair | None:
+    """Return the gains of one column of a log: the stated ones, else the log's, else None.
+
+    Raises:
+        LogError: The log and the user state different gains.
+    """
+    if log.stiffness is None or log.damping is None:
+        return stated
+    logged = (float(log.stiffness[column]), float(log.damping[column]))
+    if stated is None:
+        return logged
+    if not np.allclose(logged, stated, rtol=_SAME_GAINS):
+        raise LogError(
+            f"{log.source or 'log'}: {log.joints[column]} was recorded at {logged[0]:g} N m/rad "
+            f"and {logged[1]:g} N m s/rad by the log, at {stated[0]:g} and {stated[1]:g} by "
+            "--drive-gains; leave the option out, or correct the log."
+        )
+    return stated
+
+
+def gains_on_drive(log: JointLog, joint_name: str, robot: RobotSpec) -> Pair:
+    """Return the gains on a joint's real drive: the log's if it has them, else the robot file's."""
+    joint = robot.joint(joint_name)
+    column = log.column(joint_name)
+    stiffness = joint.stiffness
+    if log.stiffness is not None:
+        stiffness = float(log.stiffness[column])
+    damping = joint.damping
+    if log.damping is not None:
+        damping = float(log.damping[column])
+    return stiffness, damping
