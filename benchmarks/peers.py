@@ -36,13 +36,13 @@ Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Lowest and highest stiffness, lowest and highest damping."""
 
 POPULATION = 32
-"""PACE: as many as simulated environments, 4,096."""
+"""Candidates in a generation; PACE has as many as simulated environments, 4,096."""
 SIGMA = 0.5
 """First step of CMA-ES as a share of half the bounds (PACE)."""
 GENERATIONS = 200
-"""Most generations (PACE)."""
+"""Most generations of CMA-ES (PACE)."""
 SPREAD = 1e-4
-"""Stop when the costs of a generation spread by less than this share of their mean."""
+"""CMA-ES stops when the costs of a generation spread by less than this share of their mean."""
 SAME = 1e-9
 """Commands and sample intervals that differ by less are the same [rad, s]."""
 
@@ -90,7 +90,8 @@ class Replay:
             LogError: It is not sampled at the physics steps, or its repeats differ in their
                 commands.
         """
-        self.robot, self.joint = robot, joint
+        self.robot = robot
+        self.joint = joint
         self.spec = bench_spec(robot, joint)
         self.spec.add_sensor(
             name=joint,
@@ -100,7 +101,10 @@ class Replay:
         )
         self.model = self.spec.compile()
         self.column = int(self.model.joint(joint).qposadr[0])
-        parts = [log.cut(segment) for segment in log.segments if joint in segment.joints]
+        parts = []
+        for segment in log.segments:
+            if joint in segment.joints:
+                parts.append(log.cut(segment))
         if not parts:
             raise LogError(f"{log.source}: no segment excites {joint}.")
         commands = [part.command[:, part.column(joint)] for part in parts]
@@ -113,8 +117,8 @@ class Replay:
             if len(command) != len(commands[0]) or np.abs(command - commands[0]).max() > SAME:
                 raise LogError(f"{log.source}: the repeats of {joint} differ in their commands.")
         names = [self.model.actuator(i).name for i in range(self.model.nu)]
-        held = [robot.joint(name).default_position for name in names]
-        self.control = np.tile(held, (len(commands[0]), 1))
+        pose = [robot.joint(name).default_position for name in names]
+        self.control = np.tile(pose, (len(commands[0]), 1))
         """Command of every drive at each step [rad], shape (steps, drives)."""
         self.control[:, names.index(joint)] = commands[0]
         self.position = np.array([part.position[:, part.column(joint)] for part in parts])
@@ -131,7 +135,7 @@ class Replay:
             data.qpos[self.column] = start
             mujoco.mj_getState(self.model, data, row, full)
         self.time = np.arange(len(self.control)) * robot.timestep_s
-        """Of each step since the first [s], shape (steps,)."""
+        """Time of each step since the first [s], shape (steps,)."""
 
     def with_gains(self, stiffness: float, damping: float) -> Any:
         """Return a copy of the compiled model with other gains on the joint's drive."""
@@ -182,11 +186,13 @@ def fit_sysid(
         [sysid.TimeSeries(replay.time, one[:, None], mapping) for one in replay.position],
     )
     parameters = sysid.ParameterDict()
-    for name, value, (low, high) in zip(("stiffness", "damping"), start, bounds, strict=True):
-        parameters.add(sysid.Parameter(name, value, low, high))
+    parameters.add(sysid.Parameter("stiffness", start[0], *bounds[0]))
+    parameters.add(sysid.Parameter("damping", start[1], *bounds[1]))
 
     def build(values: Any, _spec: Any) -> Any:
-        return replay.with_gains(*(float(values[k].value[0]) for k in ("stiffness", "damping")))
+        stiffness = float(values["stiffness"].value[0])
+        damping = float(values["damping"].value[0])
+        return replay.with_gains(stiffness, damping)
 
     def delayed(
         values: Any, _sensors: Any, measured: Any, _model: Any, _all: bool, *, state: Any, **_: Any
@@ -209,14 +215,18 @@ def fit_sysid(
         arguments["modify_residual"] = delayed
     residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build, **arguments)
     # Its default optimizer writes its progress to standard output.
-    found, result = sysid.optimize(parameters, residual, verbose=False, output=io.StringIO())
-    at_optimum, _, _ = residual(result.x, found)
+    optimum, result = sysid.optimize(parameters, residual, verbose=False, output=io.StringIO())
+    at_optimum, _, _ = residual(result.x, optimum)
     _, half = sysid.calculate_intervals(at_optimum, result.jac)
-    kp, kd = float(result.x[0]), float(result.x[1])
+    stiffness = float(result.x[0])
+    damping = float(result.x[1])
     return Estimate(
-        stiffness=kp,
-        damping=kd,
-        interval=((kp - half[0], kp + half[0]), (kd - half[1], kd + half[1])),
+        stiffness=stiffness,
+        damping=damping,
+        interval=(
+            (stiffness - half[0], stiffness + half[0]),
+            (damping - half[1], damping + half[1]),
+        ),
         seconds=time.perf_counter() - before,
         delay_s=float(result.x[2]) if delay_bounds_s is not None else None,
     )
@@ -247,10 +257,12 @@ def fit_cma(
     mean = replay.position.mean(axis=0)
     constant = float(replay.position.var(axis=0).mean())
     steps = len(mean)
-    lows, highs = (np.array(side) for side in zip(*bounds, strict=True))
+    lows = np.array([low for low, _ in bounds])
+    highs = np.array([high for _, high in bounds])
     first = np.array(start)
     if delay_steps is not None:
-        lows, highs = np.append(lows, 0.0), np.append(highs, delay_steps + 1.0)
+        lows = np.append(lows, 0.0)
+        highs = np.append(highs, delay_steps + 1.0)
         first = np.append(first, 0.5 * (delay_steps + 1.0))
 
     def steps_late(candidates: Array) -> NDArray[np.int64]:
@@ -258,8 +270,13 @@ def fit_cma(
             return np.zeros(len(candidates), dtype=np.int64)
         return np.minimum(candidates[:, 2].astype(np.int64), delay_steps)
 
-    options = {"bounds": [-1.0, 1.0], "popsize": population, "maxiter": GENERATIONS}
-    options |= {"seed": seed, "verbose": -9}
+    options = {
+        "bounds": [-1.0, 1.0],
+        "popsize": population,
+        "maxiter": GENERATIONS,
+        "seed": seed,
+        "verbose": -9,
+    }
     unit_start = list(2.0 * (first - lows) / (highs - lows) - 1.0)
     search = cma.CMAEvolutionStrategy(unit_start, SIGMA, options)
     datas = [mujoco.MjData(replay.model) for _ in range(threads)]
@@ -276,6 +293,12 @@ def fit_cma(
             if np.ptp(costs) < SPREAD * costs.mean():
                 break
     best = lows + 0.5 * (np.clip(search.result.xfavorite, -1.0, 1.0) + 1.0) * (highs - lows)
-    late = None if delay_steps is None else float(steps_late(best[None])[0]) * robot.timestep_s
-    seconds = time.perf_counter() - before
-    return Estimate(stiffness=float(best[0]), damping=float(best[1]), seconds=seconds, delay_s=late)
+    delay_s = None
+    if delay_steps is not None:
+        delay_s = float(steps_late(best[None])[0]) * robot.timestep_s
+    return Estimate(
+        stiffness=float(best[0]),
+        damping=float(best[1]),
+        seconds=time.perf_counter() - before,
+        delay_s=delay_s,
+    )

@@ -42,9 +42,10 @@ ROTOR = (0.7, 1.3)
 ENCODER_BITS = (12, 16)
 
 REPEATS = 3
-"""Of each amplitude, as `pronk sweep`."""
+"""Repeats of each amplitude, as `pronk sweep` makes them."""
 THIRD_AMPLITUDE = 0.18
-"""Of the sweep without noise: about the geometric mean of the two of `pronk sweep` [rad]."""
+"""Amplitude of the sweep without noise: about the geometric mean of the two of `pronk sweep`
+[rad]."""
 HELD_OUT = ("chirp", "multisine", "steps")
 """Signals that no method sees."""
 
@@ -79,10 +80,9 @@ class Steps(Signal):
 
     def _samples(self, rate_hz: float) -> Array:
         levels = np.random.default_rng(self.seed).uniform(-1.0, 1.0, self.steps)
-        out = np.repeat(
-            self.amplitude * levels / np.abs(levels).max(), round(self.hold_s * rate_hz)
-        )
-        return np.concatenate([[0.0], out, [0.0]])
+        positions = self.amplitude * levels / np.abs(levels).max()
+        samples = np.repeat(positions, round(self.hold_s * rate_hz))
+        return np.concatenate([[0.0], samples, [0.0]])
 
     def frequency(self, rate_hz: float = 50.0) -> Array:
         """NaN at the ticks, shape (ticks,)."""
@@ -97,7 +97,8 @@ def held_out_signals() -> dict[str, Signal]:
 
 def draw(seed: int, number: int) -> SimParams:
     """Draw robot `number` of a seed; the same numbers for the same arguments."""
-    rng, shipped = np.random.default_rng([seed, number]), load_sim_params()
+    rng = np.random.default_rng([seed, number])
+    shipped = load_sim_params()
     machine = replace(
         shipped.machine,
         command_delay_s=rng.uniform(*DELAY_S),
@@ -108,8 +109,10 @@ def draw(seed: int, number: int) -> SimParams:
 
 
 def _draw_joint(rng: np.random.Generator, joint: JointParams) -> JointParams:
-    friction, belt = rng.uniform(*FRICTION), np.exp(rng.uniform(*np.log(BELT)))
-    coulomb, rotor = friction * joint.coulomb, rng.uniform(*ROTOR)
+    friction = rng.uniform(*FRICTION)
+    belt = np.exp(rng.uniform(*np.log(BELT)))
+    rotor = rng.uniform(*ROTOR)
+    coulomb = friction * joint.coulomb
     # Bristles break away at the same deflection, and rotor and link stay as damped as they were.
     return replace(
         joint,
@@ -150,30 +153,39 @@ class Recorded:
     """The sweep's chirp at `THIRD_AMPLITUDE` without noise, once."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Plans:
+    """Motions of one robot."""
+
+    noisy: SweepPlan
+    """Sweep, then the held-out signals, with the robot's own sensors."""
+    exact: SweepPlan
+    """Sweep at the third amplitude, once, without noise."""
+
+
 @cache
-def _plans(leg: str, kinds: tuple[str, ...]) -> tuple[SweepPlan, SweepPlan]:
-    """Sweep and held-out signals; sweep at the third amplitude."""
+def plans(leg: str, kinds: tuple[str, ...]) -> Plans:
+    """Plan the motions of some joints of a leg."""
     robot = load_robot(ROBOT)
     joints = [f"{leg}_{kind}" for kind in kinds]
     sweep = make_plan(robot, joints, amplitudes=AMPLITUDES, repeats=REPEATS)
-    extra = [
-        PlannedExcitation(
-            joint=name,
-            signal=signal,
-            clamped=robot.joint(name).clamped,
-            sign=robot.joint(name).original[1],
-        )
-        for name in joints
-        for signal in held_out_signals().values()
-    ]
-    third = [
-        replace(one, signal=replace(one.signal, amplitude=THIRD_AMPLITUDE))
-        for one in sweep.excitations
-        if one.repeat == 0 and one.signal.amplitude == max(AMPLITUDES)
-    ]
-    return (
-        replace(sweep, excitations=(*sweep.excitations, *extra)),
-        replace(sweep, excitations=tuple(third)),
+    held_out = []
+    for name in joints:
+        joint = robot.joint(name)
+        for signal in held_out_signals().values():
+            held_out.append(
+                PlannedExcitation(
+                    joint=name, signal=signal, clamped=joint.clamped, sign=joint.original[1]
+                )
+            )
+    exact = []
+    for planned in sweep.excitations:
+        if planned.repeat == 0 and planned.signal.amplitude == max(AMPLITUDES):
+            signal = replace(planned.signal, amplitude=THIRD_AMPLITUDE)
+            exact.append(replace(planned, signal=signal))
+    return Plans(
+        noisy=replace(sweep, excitations=(*sweep.excitations, *held_out)),
+        exact=replace(sweep, excitations=tuple(exact)),
     )
 
 
@@ -185,32 +197,41 @@ def recorded(
     One leg is excited: FR, FL, HR, HL in turn. Logs lie in `folder`, by default in the system's
     temporary folder, under a hash of parameters, signals and seed.
     """
-    robot, params = load_robot(ROBOT), draw(seed, number)
-    legs = legs_of(robot)
+    params = draw(seed, number)
+    legs = legs_of(load_robot(ROBOT))
     leg = legs[number % len(legs)]
-    noise = 1000 * seed + number
-    logs = []
-    for plan, drawn in zip(_plans(leg, tuple(kinds)), (params, without_noise(params)), strict=True):
-        key = repr((drawn, plan.excitations, plan.settle_s, noise)).encode()
-        name = f"{seed}-{number}-{leg}-{hashlib.sha256(key).hexdigest()[:12]}"
-        out = (folder or Path(tempfile.gettempdir()) / "pronk-bench-match") / name
-        if not out.exists():
-            out.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=out.parent) as partial:
-                task = SweepTask(plan=plan, out_dir=Path(partial) / "logs")
-                record_sweep(VirtualRobot(robot, drawn, seed=noise, legs=(leg,)), task)
-                (Path(partial) / "logs").rename(out)
-        logs.append([read_log(out / f"{joint}.mcap", robot=robot) for joint in plan.joints])
-    found = []
-    for joint, noisy, exact in zip(_plans(leg, tuple(kinds))[0].joints, *logs, strict=True):
-        swept = len(AMPLITUDES) * REPEATS
-        sweep, held_out = noisy.segments[:swept], noisy.segments[swept:]
-        found.append(
+    motions = plans(leg, tuple(kinds))
+    cache_folder = folder or Path(tempfile.gettempdir()) / "pronk-bench-match"
+    robot = f"{seed}-{number}-{leg}"
+    noise_seed = 1000 * seed + number
+    noisy_logs = _record(motions.noisy, params, leg, noise_seed, cache_folder, robot)
+    exact_logs = _record(motions.exact, without_noise(params), leg, noise_seed, cache_folder, robot)
+    swept = len(AMPLITUDES) * REPEATS
+    recordings = []
+    for joint in motions.noisy.joints:
+        noisy = noisy_logs[joint]
+        recordings.append(
             Recorded(
                 joint=joint,
-                sweep=replace(noisy, segments=sweep),
-                held_out=replace(noisy, segments=held_out),
-                exact=exact,
+                sweep=replace(noisy, segments=noisy.segments[:swept]),
+                held_out=replace(noisy, segments=noisy.segments[swept:]),
+                exact=exact_logs[joint],
             )
         )
-    return found
+    return recordings
+
+
+def _record(
+    plan: SweepPlan, params: SimParams, leg: str, noise_seed: int, cache_folder: Path, prefix: str
+) -> dict[str, JointLog]:
+    """Record a plan on the bench into a folder of the cache, if it is not there; read its logs."""
+    robot = load_robot(ROBOT)
+    key = repr((params, plan.excitations, plan.settle_s, noise_seed)).encode()
+    out = cache_folder / f"{prefix}-{hashlib.sha256(key).hexdigest()[:12]}"
+    if not out.exists():
+        cache_folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_folder) as partial:
+            task = SweepTask(plan=plan, out_dir=Path(partial) / "logs")
+            record_sweep(VirtualRobot(robot, params, seed=noise_seed, legs=(leg,)), task)
+            (Path(partial) / "logs").rename(out)
+    return {joint: read_log(out / f"{joint}.mcap", robot=robot) for joint in plan.joints}

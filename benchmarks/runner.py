@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from rich.table import Table
+from rich.table import Table as RichTable
 
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.processes import pool
+from pronk.tables import Table
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -77,7 +78,7 @@ def machine(*packages: str) -> dict[str, str]:
     }
 
 
-def finish(figures: dict[str, Any], *tables: Table) -> console.Outcome:
+def finish(figures: dict[str, Any], *tables: Table | RichTable) -> console.Outcome:
     """Print the tables of a benchmark."""
     for each in tables:
         console.show(each)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -17,11 +18,11 @@ from scipy.optimize import least_squares
 
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.arrays import Array
-from pronk.identify.logs.joint_log import JointLog, group_repeats
+from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.segment import Segment
-from pronk.identify.match.arm import ArmProblem, trusted
-from pronk.identify.match.fit import solve
+from pronk.identify.match.least_squares import DriveVector, Residuals, minimize_residuals
 from pronk.identify.match.parameters import PARAMETERS
+from pronk.identify.match.replay import ChainReplay
 from pronk.identify.simulators.chain import ChainSimulation, DriveValues, published
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.simulator import JointRigs
@@ -30,11 +31,14 @@ from pronk.robots.robot import RobotSpec
 FREE = ("stiffness", "damping", "delay")
 MAX_DELAY_S = 0.04
 BOUNDS = {"stiffness": (2.0, 80.0), "damping": (0.01, 2.0), "delay": (0.0, MAX_DELAY_S)}
-"""Far outside of what 17 N m/rad and .4 N m s/rad respond like [N m/rad, N m s/rad, s]."""
+"""Bounds far outside of what 17 N m/rad and 0.4 N m s/rad respond like [N m/rad, N m s/rad, s]."""
 START_DELAY_S = 0.005
-_STEP = {"stiffness": 0.02, "damping": 0.002, "delay": 1e-4}
-"""Of the forward differences: about a thousandth of each."""
-POPULATION, GENERATIONS = 10, 60
+STEP = {"stiffness": 0.02, "damping": 0.002, "delay": 1e-4}
+"""Steps of the forward differences: about a thousandth of each parameter."""
+POPULATION = 10
+"""Candidates in a generation of CMA-ES."""
+GENERATIONS = 60
+"""Most generations of CMA-ES."""
 SPREAD = 1e-3
 """CMA-ES stops when the costs of a generation spread by less than this share of their mean."""
 
@@ -49,18 +53,23 @@ class Recording:
 
 
 def recordings(log: JointLog, joint: str, robot: RobotSpec) -> list[Recording]:
-    """Excitations of a joint, repeats together."""
-    found = []
-    for repeats in group_repeats(log.excitations(joint)):
-        traces, positions = [], []
-        for repeat in repeats:
-            traces.append(command_trace(repeat, robot))
-            positions.append(np.interp(traces[-1].time, repeat.time, repeat.position))
-        steps = min(len(position) for position in positions)
-        trace = replace(traces[0], command=traces[0].command[:steps])
-        rows = np.array([position[:steps] for position in positions])
-        found.append(Recording(trace=trace, positions=rows))
-    return found
+    """Excitations of a joint in order of time, those of the same kind and amplitude together."""
+    by_signal: dict[tuple[str, float], list[tuple[CommandTrace, Array]]] = {}
+    for excitation in sorted(
+        log.excitations(joint), key=lambda excitation: excitation.segment.start
+    ):
+        trace = command_trace(excitation, robot)
+        position = np.interp(trace.time, excitation.time, excitation.position)
+        signal = (excitation.segment.kind, excitation.amplitude)
+        by_signal.setdefault(signal, []).append((trace, position))
+    grouped = []
+    for repeats in by_signal.values():
+        steps = min(len(position) for _, position in repeats)
+        first = repeats[0][0]
+        trace = replace(first, command=first.command[:steps])
+        positions = np.array([position[:steps] for _, position in repeats])
+        grouped.append(Recording(trace=trace, positions=positions))
+    return grouped
 
 
 def simulated(rigs: JointRigs, recording: Recording, sets: Sequence[Mapping[str, float]]) -> Array:
@@ -71,13 +80,16 @@ def simulated(rigs: JointRigs, recording: Recording, sets: Sequence[Mapping[str,
     through the steps is read that much earlier.
     """
     trace = recording.trace
-    names = ("stiffness", "damping", "armature", "frictionloss")
-    undelayed = rigs.play(trace, {name: np.array([one[name] for one in sets]) for name in names})
-    earlier = [np.maximum(trace.time - one["delay"], trace.time[0]) for one in sets]
+    values = {}
+    for name in ("stiffness", "damping", "armature", "frictionloss"):
+        values[name] = np.array([drive[name] for drive in sets])
     # A cubic spline needs finite positions; a run that diverged is as wrong as a joint can be.
-    finite = np.nan_to_num(undelayed, nan=np.pi)
-    rows = [CubicSpline(trace.time, row)(at) for row, at in zip(finite, earlier, strict=True)]
-    return np.array(rows)
+    undelayed = np.nan_to_num(rigs.play(trace, values), nan=np.pi)
+    positions = np.empty_like(undelayed)
+    for row, drive in enumerate(sets):
+        earlier = np.maximum(trace.time - drive["delay"], trace.time[0])
+        positions[row] = CubicSpline(trace.time, undelayed[row])(earlier)
+    return positions
 
 
 class Residual:
@@ -91,9 +103,13 @@ class Residual:
         start: Mapping[str, float],
     ) -> None:
         """Fit the parameters `free` of `start`; the others stay."""
-        self.rigs, self.parts, self.free, self.start = rigs, parts, tuple(free), dict(start)
-        self.low, self.high = np.array([BOUNDS[name] for name in self.free]).T
-        self.steps = np.array([_STEP[name] for name in self.free])
+        self.rigs = rigs
+        self.parts = parts
+        self.free = tuple(free)
+        self.start = dict(start)
+        self.low = np.array([BOUNDS[name][0] for name in self.free])
+        self.high = np.array([BOUNDS[name][1] for name in self.free])
+        self.steps = np.array([STEP[name] for name in self.free])
 
     def values(self, x: Array) -> dict[str, float]:
         """All parameters with these free ones."""
@@ -102,8 +118,10 @@ class Residual:
     def __call__(self, sets: Array) -> Array:
         """Residuals [rad] of free parameters of shape (b, p), shape (b, rows)."""
         named = [self.values(x) for x in sets]
-        rows = [simulated(self.rigs, p, named) - p.positions.mean(axis=0) for p in self.parts]
-        return np.asarray(np.clip(np.concatenate(rows, axis=1), -np.pi, np.pi))
+        differences = []
+        for part in self.parts:
+            differences.append(simulated(self.rigs, part, named) - part.positions.mean(axis=0))
+        return np.asarray(np.clip(np.concatenate(differences, axis=1), -np.pi, np.pi))
 
     def jacobian(self, x: Array) -> Array:
         """Forward differences, shape (rows, p)."""
@@ -114,9 +132,9 @@ class Residual:
 
 def start_values(robot: RobotSpec, joint: str) -> dict[str, float]:
     """Nominal gains with a delay to begin with, and the model's armature and dry friction."""
-    known = published(robot, joint) | {"delay": START_DELAY_S}
-    del known["offset"]
-    return known
+    drive = published(robot, joint) | {"delay": START_DELAY_S}
+    del drive["offset"]
+    return drive
 
 
 def fit_plain(
@@ -130,7 +148,7 @@ def fit_plain(
     def residual(x: Array) -> Array:
         return np.asarray(problem(x[None])[0])
 
-    found = least_squares(
+    result = least_squares(
         residual,
         first,
         jac=problem.jacobian,
@@ -139,19 +157,45 @@ def fit_plain(
         xtol=1e-6,
         ftol=1e-6,
     )
-    return problem.values(found.x)
+    return problem.values(result.x)
 
 
-def arm_problem(arm: ChainSimulation, free: Sequence[str], start: DriveValues) -> ArmProblem:
+def arm_residuals(arm: ChainSimulation, free: Sequence[str], start: DriveValues) -> Residuals:
     """Residuals of a whole arm in time, over the samples that pronk uses."""
-    fitted = dict.fromkeys(arm.joints, tuple(free))
-    return ArmProblem(arm, trusted(arm)[0], fitted, start, start, lambda _: None)
+    replay = ChainReplay(arm)
+    samples = [np.ones(len(recording.time), dtype=bool) for recording in replay.recordings]
+    vector = DriveVector(dict.fromkeys(arm.joints, tuple(free)), start)
+    return Residuals(replay, samples, vector)
 
 
 def fit_arm(arm: ChainSimulation, free: Sequence[str], start: DriveValues) -> DriveValues:
     """Nonlinear least squares over parameters of all joints of an arm."""
-    problem = arm_problem(arm, free, start)
-    return problem.values(solve(problem, tolerance=1e-4, rounds=30).x)
+    residuals = arm_residuals(arm, free, start)
+    return minimize_residuals(residuals, tolerance=1e-4, evaluations=30).drives()
+
+
+class UnitBounds:
+    """Searched numbers of a drive between -1 and 1, as CMA-ES wants them."""
+
+    def __init__(self, free: Sequence[str]) -> None:
+        """Map the bounds of some parameters to -1 and 1."""
+        self.free = free
+        self.low = np.array([PARAMETERS[name].scaled(PARAMETERS[name].low) for name in free])
+        self.high = np.array([PARAMETERS[name].scaled(PARAMETERS[name].high) for name in free])
+
+    def unit(self, drive: Mapping[str, float]) -> Array:
+        """Numbers of a drive, shape (p,)."""
+        scaled = np.array([PARAMETERS[name].scaled(drive[name]) for name in self.free])
+        return np.asarray(2.0 * (scaled - self.low) / (self.high - self.low) - 1.0)
+
+    def values(self, unit: Array) -> dict[str, float]:
+        """Parameters that some numbers stand for."""
+        share = 0.5 * (np.clip(unit, -1.0, 1.0) + 1.0)
+        scaled = self.low + share * (self.high - self.low)
+        values = {}
+        for name, number in zip(self.free, scaled, strict=True):
+            values[name] = PARAMETERS[name].unscaled(float(number))
+        return values
 
 
 def search_cma_arm(
@@ -159,48 +203,54 @@ def search_cma_arm(
 ) -> DriveValues:
     """CMA-ES of each joint of an arm with its own residuals, all joints changed at once."""
     _, cma = import_peers()
-    problem, kinds = arm_problem(arm, free, start), [PARAMETERS[name] for name in free]
-    low, high = (np.array([k.scaled(getattr(k, end)) for k in kinds]) for end in ("low", "high"))
+    residuals = arm_residuals(arm, free, start)
+    bounds = UnitBounds(free)
+    searches: dict[str, Any] = {}
+    for number, joint in enumerate(arm.joints):
+        options = {"bounds": [-1.0, 1.0], "popsize": POPULATION, "verbose": -9}
+        options["seed"] = seed + 1 + number
+        unit = bounds.unit(start[joint])
+        searches[joint] = cma.CMAEvolutionStrategy(unit, SIGMA, options)
 
-    def drives(units: Sequence[Array]) -> dict[str, dict[str, float]]:
-        points = [low + 0.5 * (high - low) * (np.clip(unit, -1.0, 1.0) + 1.0) for unit in units]
-        return {
-            joint: {
-                **start[joint],
-                **{n: k.unscaled(v) for n, k, v in zip(free, kinds, at, strict=True)},
-            }
-            for joint, at in zip(arm.joints, points, strict=True)
-        }
+    def drives(units: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+        changed = {}
+        for joint, unit in units.items():
+            changed[joint] = {**start[joint], **bounds.values(unit)}
+        return changed
 
-    options = {"bounds": [-1.0, 1.0], "popsize": POPULATION, "verbose": -9}
-    searches = []
-    for k, joint in enumerate(arm.joints):
-        first = np.array([one.scaled(start[joint][n]) for n, one in zip(free, kinds, strict=True)])
-        unit = 2.0 * (first - low) / (high - low) - 1.0
-        searches.append(cma.CMAEvolutionStrategy(unit, SIGMA, options | {"seed": seed + 1 + k}))
     for _ in range(GENERATIONS):
-        candidates = [search.ask() for search in searches]
-        costs = []
-        for units in zip(*candidates, strict=True):
-            residual = problem.residuals(arm.run([drives(units)])[0])
-            costs.append([float(np.mean(residual[problem.block(j)] ** 2)) for j in arm.joints])
-        for search, units, column in zip(searches, candidates, np.transpose(costs), strict=True):
-            search.tell(units, column.tolist())
-        if all(np.ptp(column) < SPREAD * np.mean(column) for column in np.transpose(costs)):
+        candidates = {joint: search.ask() for joint, search in searches.items()}
+        costs: dict[str, list[float]] = {joint: [] for joint in searches}
+        for number in range(POPULATION):
+            units = {joint: candidates[joint][number] for joint in searches}
+            (positions,) = residuals.replay.positions([drives(units)])
+            residual = residuals.compared(positions)
+            for joint in searches:
+                costs[joint].append(float(np.mean(residual[residuals.rows(joint)] ** 2)))
+        settled = True
+        for joint, search in searches.items():
+            search.tell(candidates[joint], costs[joint])
+            if np.ptp(costs[joint]) >= SPREAD * np.mean(costs[joint]):
+                settled = False
+        if settled:
             break
-    return drives([search.result.xfavorite for search in searches])
+    return drives({joint: search.result.xfavorite for joint, search in searches.items()})
 
 
 def search_cma(rigs: JointRigs, log: JointLog, joint: str, *, seed: int) -> dict[str, float]:
     """CMA-ES over the parameters and residuals of `fit_plain`, bounds mapped to -1 to 1."""
     _, cma = import_peers()
-    problem = Residual(
-        rigs, recordings(log, joint, rigs.robot), FREE, start_values(rigs.robot, joint)
-    )
+    parts = recordings(log, joint, rigs.robot)
+    problem = Residual(rigs, parts, FREE, start_values(rigs.robot, joint))
     half = 0.5 * (problem.high - problem.low)
     first = np.array([problem.start[name] for name in FREE])
-    options = {"bounds": [-1.0, 1.0], "popsize": POPULATION, "maxiter": GENERATIONS}
-    options |= {"seed": seed + 1, "verbose": -9}
+    options = {
+        "bounds": [-1.0, 1.0],
+        "popsize": POPULATION,
+        "maxiter": GENERATIONS,
+        "seed": seed + 1,
+        "verbose": -9,
+    }
     search = cma.CMAEvolutionStrategy((first - problem.low) / half - 1.0, SIGMA, options)
     while not search.stop():
         unit = search.ask()
@@ -219,20 +269,21 @@ def fit_mujoco_sysid(log: JointLog, joint: str, robot: RobotSpec) -> Estimate:
     Its sequences have one command each, so the smaller amplitude would be another call.
     """
     begin = time.perf_counter()
-    largest = max(recordings(log, joint, robot), key=lambda one: one.trace.amplitude)
+    largest = max(recordings(log, joint, robot), key=lambda recording: recording.trace.amplitude)
     repeats, steps = largest.positions.shape
     span = steps * robot.timestep_s
-    segments = [
-        Segment(
-            kind="chirp",
-            joints=(joint,),
-            start=k * span,
-            stop=(k + 1) * span - robot.timestep_s,
-            amplitude=largest.trace.amplitude,
-            repeat=k,
+    segments = []
+    for repeat in range(repeats):
+        segments.append(
+            Segment(
+                kind="chirp",
+                joints=(joint,),
+                start=repeat * span,
+                stop=(repeat + 1) * span - robot.timestep_s,
+                amplitude=largest.trace.amplitude,
+                repeat=repeat,
+            )
         )
-        for k in range(repeats)
-    ]
     at_steps = JointLog(
         robot=robot.name,
         joints=(joint,),
@@ -242,7 +293,7 @@ def fit_mujoco_sysid(log: JointLog, joint: str, robot: RobotSpec) -> Estimate:
         segments=tuple(segments),
     )
     start = start_values(robot, joint)
-    found = fit_sysid(
+    estimate = fit_sysid(
         at_steps,
         joint,
         robot,
@@ -251,4 +302,4 @@ def fit_mujoco_sysid(log: JointLog, joint: str, robot: RobotSpec) -> Estimate:
         delay_bounds_s=BOUNDS["delay"],
         threads=1,
     )
-    return replace(found, seconds=time.perf_counter() - begin)
+    return replace(estimate, seconds=time.perf_counter() - begin)

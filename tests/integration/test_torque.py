@@ -9,43 +9,56 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, rig, run
+from ak80_pendulum import DATA, FITTED, JOINTS, RIG, compare, fitted, rig
 from command_line import accepted, refused
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
-from pronk.identify.match import gains
+from pronk.identify.match.gains import load_gains, save_gains
 from pronk.identify.match.match import match
-from pronk.identify.match.torque import fit_drives, fit_torque
+from pronk.identify.match.torque_fit import fit_torque, fit_torque_drives, with_torque
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 
 recorded = pytest.mark.skipif(not DATA.is_dir(), reason="the AK80-6 recordings are not here")
 
-ARMATURE, VISCOUS, DRY = 0.003, (0.03, 0.02), (0.15, 0.1)
+ARMATURE = 0.003
+VISCOUS = (0.03, 0.02)
+DRY = (0.15, 0.1)
 SCALE = 1.2
-"""Of the simulated torque sensor."""
+"""Scale of the simulated torque sensor."""
 NOISE_NM = 0.02
 
 
 def simulated(seed: int) -> JointLog:
     """Ten seconds of the rig with known drives, driven by sums of sines of torque."""
-    model, off = rig().build_spec().compile(), mujoco.mjtDisableBit
-    model.opt.timestep, steps = 0.0005, 20000
-    model.opt.disableflags |= int(off.mjDSBL_ACTUATION | off.mjDSBL_LIMIT)
-    model.dof_armature[:], model.dof_damping[:] = ARMATURE, VISCOUS
+    model = rig().build_spec().compile()
+    steps = 20000
+    model.opt.timestep = 0.0005
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    model.dof_armature[:] = ARMATURE
+    model.dof_damping[:] = VISCOUS
     model.dof_frictionloss[:] = 0.0
-    data, random = mujoco.MjData(model), np.random.default_rng(seed)
-    hz, phase = random.uniform(0.5, 2.5, (5, 2)), random.uniform(0.0, 2.0 * np.pi, (5, 2))
-    position, velocity, torque = (np.empty((steps, 2)) for _ in range(3))
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(seed)
+    frequency_hz = random.uniform(0.5, 2.5, (5, 2))
+    phase = random.uniform(0.0, 2.0 * np.pi, (5, 2))
+    position = np.empty((steps, 2))
+    velocity = np.empty((steps, 2))
+    torque = np.empty((steps, 2))
     for k in range(steps):
-        drive = np.sin(2.0 * np.pi * hz * data.time + phase).sum(axis=0) * (0.5, 0.4)
-        position[k], velocity[k], torque[k] = data.qpos, data.qvel, drive
+        sines = np.sin(2.0 * np.pi * frequency_hz * data.time + phase)
+        drive = sines.sum(axis=0) * (0.5, 0.4)
+        position[k] = data.qpos
+        velocity[k] = data.qvel
+        torque[k] = drive
         data.qfrc_applied[:] = drive - np.array(DRY) * np.tanh(data.qvel / 0.05)
         mujoco.mj_step(model, data)
     every = slice(0, None, 4)
+    noise = NOISE_NM * random.standard_normal((steps // 4, 2))
     return JointLog(
         robot="ak80_double_pendulum",
         joints=JOINTS,
@@ -53,7 +66,7 @@ def simulated(seed: int) -> JointLog:
         command=position[every],
         position=position[every],
         velocity=velocity[every],
-        torque=SCALE * torque[every] + NOISE_NM * random.standard_normal((steps // 4, 2)),
+        torque=SCALE * torque[every] + noise,
     )
 
 
@@ -65,18 +78,18 @@ def logs() -> list[JointLog]:
 def test_unknown_links_leave_the_scale_open(logs: list[JointLog]) -> None:
     """Known drives are found in units of a torque sensor that is off by its scale."""
     fit = fit_torque(logs, rig(), JOINTS[0], links_known=False, shared=(JOINTS,))
-    for j, joint in enumerate(JOINTS):
-        found = fit.joints[joint]
-        assert found["armature"].value == pytest.approx(SCALE * ARMATURE, rel=0.1)
-        assert found["dry"].value == pytest.approx(SCALE * DRY[j], rel=0.1)
-        assert found["viscous"].value == pytest.approx(SCALE * VISCOUS[j], rel=0.15)
-        low, high = found["armature"].ci95
-        assert found["armature"].identified
-        assert low < found["armature"].value < high
+    for number, joint in enumerate(JOINTS):
+        drive = fit.joints[joint]
+        assert drive["armature"].value == pytest.approx(SCALE * ARMATURE, rel=0.1)
+        assert drive["dry"].value == pytest.approx(SCALE * DRY[number], rel=0.1)
+        assert drive["viscous"].value == pytest.approx(SCALE * VISCOUS[number], rel=0.15)
+        low, high = drive["armature"].ci95
+        assert drive["armature"].identified
+        assert low < drive["armature"].value < high
     assert not fit.joints["elbow"]["scale"].identified
     # The pendulum that the fit stands for has its torque.
-    q, v, a = np.random.default_rng(0).normal(size=(3, 40, 2))
-    assert fitted(fit).torque(q, v, a) == pytest.approx(fit.torque(q, v, a), abs=1e-6)
+    states = np.random.default_rng(0).normal(size=(3, 40, 2))
+    assert fitted(fit).torque(*states) == pytest.approx(fit.torque(*states), abs=1e-6)
 
 
 def test_armature_of_the_first_joint_is_not_separated_from_its_link(logs: list[JointLog]) -> None:
@@ -87,20 +100,24 @@ def test_armature_of_the_first_joint_is_not_separated_from_its_link(logs: list[J
 
 
 def test_torque_that_cannot_be_used_is_named(logs: list[JointLog]) -> None:
-    log, size = logs[0], np.abs(logs[0].torque)  # type: ignore[arg-type]
+    log = logs[0]
+    assert log.torque is not None
     short = Segment(kind="unknown", joints=JOINTS, start=0.0, stop=7.0, amplitude=np.nan)
-    for bad, reason in (
-        (replace(log, torque=size), "magnitudes"),
-        (replace(log, origin=LogOrigin(metadata={"torque": "computed"})), "not measured"),
-        (replace(log, time=5.0 * log.time), "Hz, fewer than 160"),
-        (replace(log, position=0.0 * log.position), "no joint moves"),
-        (log.cut(short), "less than 7.5"),
-    ):
-        drives, flags = fit_drives([bad], rig())
-        assert drives == {}
-        assert reason in flags["elbow"]
+    magnitudes = replace(log, torque=np.abs(log.torque))
+    unusable = {
+        "magnitudes": magnitudes,
+        "not measured": replace(log, origin=LogOrigin(metadata={"torque": "computed"})),
+        "Hz, fewer than 160": replace(log, time=5.0 * log.time),
+        "no joint moves": replace(log, position=0.0 * log.position),
+        "less than 7.5": log.cut(short),
+    }
+    for reason, bad_log in unusable.items():
+        fits = fit_torque_drives([bad_log], rig())
+        assert fits["elbow"].torque == {}
+        assert reason in " ".join(fits["elbow"].flags)
+        assert with_torque({}, fits, rig()) == {}
     with pytest.raises(IdentifiabilityError, match="magnitudes"):
-        match([replace(log, command=0.0 * log.command, torque=size)], rig(), mode="drive")
+        match([replace(magnitudes, command=0.0 * log.command)], rig(), mode="drive")
     with pytest.raises(LogError, match="no torque channel"):
         fit_torque([replace(log, torque=None)], rig(), JOINTS[0], links_known=True)
 
@@ -111,7 +128,8 @@ def heavier(factor: float) -> RobotSpec:
     def build() -> mujoco.MjSpec:
         spec = rig().build_spec()
         body = spec.body("lower")
-        body.mass, body.inertia = factor * body.mass, factor * np.array(body.inertia)
+        body.mass = factor * body.mass
+        body.inertia = factor * np.array(body.inertia)
         return spec
 
     return replace(rig(), build_spec=build)
@@ -122,28 +140,43 @@ def test_mode_drive_fits_torque_and_keeps_it(logs: list[JointLog], tmp_path: Pat
     with pytest.raises(LogError, match="--mode drive"):
         match(still, rig())
     result = match(still, rig(), mode="drive")
-    gains.save_gains(tmp_path / "gains.yaml", result.gains)
-    kept = gains.load_gains(tmp_path / "gains.yaml")
-    for j, joint in enumerate(JOINTS):
-        viscous = kept.joints[joint].torque["viscous"].value
-        assert viscous == pytest.approx(VISCOUS[j], rel=0.15)
-        for found in (result.gains.joints[joint], kept.joints[joint]):
-            scale, (low, high) = found.torque["scale"].value, found.torque["scale"].ci95
-            assert low < scale < high
-            assert scale == pytest.approx(SCALE, rel=0.03)
-            assert found.armature.value == pytest.approx(ARMATURE, rel=0.1)
-            assert found.frictionloss.value == pytest.approx(DRY[j], rel=0.1)
+    save_gains(tmp_path / "gains.yaml", result.gains)
+    read = load_gains(tmp_path / "gains.yaml")
+    for number, joint in enumerate(JOINTS):
+        viscous = read.joints[joint].torque["viscous"].value
+        assert viscous == pytest.approx(VISCOUS[number], rel=0.15)
+        for gains in (result.gains.joints[joint], read.joints[joint]):
+            scale = gains.torque["scale"]
+            assert scale.ci95[0] < scale.value < scale.ci95[1]
+            assert scale.value == pytest.approx(SCALE, rel=0.03)
+            assert gains.armature.value == pytest.approx(ARMATURE, rel=0.1)
+            assert gains.frictionloss.value == pytest.approx(DRY[number], rel=0.1)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.03, 1.1])
 def test_links_that_do_not_hold_are_fitted(logs: list[JointLog], factor: float) -> None:
-    drives, _ = fit_drives(logs, heavier(factor))
+    fits = fit_torque_drives(logs, heavier(factor))
     for joint in JOINTS:
-        assert not drives[joint]["scale"].identified
-    elbow = drives["elbow"]["armature"]
-    assert elbow.value == pytest.approx(SCALE * ARMATURE, rel=0.05)
+        assert not fits[joint].torque["scale"].identified
+    armature = fits["elbow"].torque["armature"]
+    assert armature.value == pytest.approx(SCALE * ARMATURE, rel=0.05)
+    assert fits["elbow"].values["armature"] == armature.value
     # Both drives are alike in the model but for their friction.
-    assert not drives["shoulder"]["armature"].identified
+    assert not fits["shoulder"].torque["armature"].identified
+
+
+def test_a_contradiction_between_position_and_torque_is_flagged(logs: list[JointLog]) -> None:
+    by_torque = fit_torque_drives(logs, rig())
+    elbow = by_torque["elbow"]
+    agreeing = replace(elbow, torque={}, flags=())
+    joined = with_torque({"elbow": agreeing}, by_torque, rig())["elbow"]
+    assert joined.flags == ()
+    assert joined.torque == elbow.torque
+    values = {**elbow.values, "armature": 2.0 * elbow.values["armature"]}
+    contradicting = replace(agreeing, values=values)
+    (flag,) = with_torque({"elbow": contradicting}, by_torque, rig())["elbow"].flags
+    assert flag.startswith("armature")
+    assert "by torque" in flag
 
 
 def test_friction_of_a_swept_leg_in_units_of_its_sensor(tmp_path: Path) -> None:
@@ -151,70 +184,64 @@ def test_friction_of_a_swept_leg_in_units_of_its_sensor(tmp_path: Path) -> None:
     robot = load_robot("mini_cheetah")
     words = ["sweep", robot.name, "--joints", "FR_knee", "--repeats", "1", "--amplitude", "0.25"]
     accepted(*words, "--out", tmp_path)
-    drives, flags = fit_drives([read_log(tmp_path / "FR_knee.mcap")], robot)
-    assert (list(drives), flags) == (["FR_knee"], {})
-    own, true = drives["FR_knee"], load_sim_params(None, robot).joints["FR_knee"]
-    assert not own["scale"].identified
-    assert not own["armature"].identified
-    assert own["dry"].value == pytest.approx(true.coulomb / true.torque_scale, rel=0.05)
-    low, high = own["viscous"].ci95
+    fits = fit_torque_drives([read_log(tmp_path / "FR_knee.mcap")], robot)
+    assert list(fits) == ["FR_knee"]
+    assert fits["FR_knee"].flags == ()
+    torque = fits["FR_knee"].torque
+    true = load_sim_params(None, robot).joints["FR_knee"]
+    assert not torque["scale"].identified
+    assert not torque["armature"].identified
+    assert torque["dry"].value == pytest.approx(true.coulomb / true.torque_scale, rel=0.05)
+    low, high = torque["viscous"].ci95
     assert low < true.viscous / true.torque_scale < high
 
 
-COLUMNS = [
-    word
-    for i, joint in enumerate(JOINTS)
-    for column in (f"position.{joint}=pos_meas{i + 1}", f"torque.{joint}=tau_meas{i + 1}")
-    for word in ("--columns", column)
-]
+def column_options() -> list[str]:
+    """Options that name the columns of the AK80-6 recordings."""
+    words = []
+    for number, joint in enumerate(JOINTS, 1):
+        words += ["--columns", f"position.{joint}=pos_meas{number}"]
+        words += ["--columns", f"torque.{joint}=tau_meas{number}"]
+    return words
 
 
 @recorded
 def test_recordings_of_torque_are_fitted_from_the_command_line(tmp_path: Path) -> None:
     (tmp_path / RIG.name).write_text(RIG.read_text())
     accepted("robot", "new", tmp_path / RIG.name)
-    robot, out = tmp_path / "robot.yaml", tmp_path / "out" / "gains.yaml"
+    robot = tmp_path / "robot.yaml"
+    out = tmp_path / "out" / "gains.yaml"
     logs = [DATA / f"{name}.csv" for name in FITTED]
-    words = ["match", *logs, "--robot", robot, "--unit", "rad", *COLUMNS, "--out", out]
+    words = ["match", *logs, "--robot", robot, "--unit", "rad", *column_options(), "--out", out]
     assert "--mode drive" in refused(*words)
     assert not out.exists()
     shown = accepted(*words, "--mode", "drive")
-    expected, found = run()["fit"].joints, gains.load_gains(out).joints
-    assert found["elbow"].armature.value == pytest.approx(
-        expected["elbow"]["armature"].value, rel=1e-4
-    )
-    assert not found["shoulder"].torque["armature"].identified
+    expected = compare()[0].joints
+    gains = load_gains(out).joints
+    armature = gains["elbow"].armature.value
+    assert armature == pytest.approx(expected["elbow"]["armature"].value, rel=1e-4)
+    assert not gains["shoulder"].torque["armature"].identified
     for joint in JOINTS:
-        assert found[joint].frictionloss.value == pytest.approx(
-            expected[joint]["dry"].value, rel=1e-4
-        )
-        low, high = found[joint].torque["dry"].ci95
-        assert low < found[joint].frictionloss.value < high
-        assert "the robot's file" in " ".join(found[joint].flags)
-    interval = "{:.4g} to {:.4g}".format(*found["elbow"].torque["armature"].ci95)
-    page = (out.parent / "match.html").read_text()
-    for part in (f"{found['elbow'].armature.value:.4g}", interval, "armature [kg m^2]"):
-        assert part in shown
-        assert part in page
+        friction = gains[joint].frictionloss.value
+        assert friction == pytest.approx(expected[joint]["dry"].value, rel=1e-4)
+        low, high = gains[joint].torque["dry"].ci95
+        assert low < friction < high
+        assert "the robot's file" in " ".join(gains[joint].flags)
+    assert "armature" in shown
+    assert (out.parent / "match.html").is_file()
     # One drive for both actuators, as their builder may state.
     robot.write_text(robot.read_text().replace("drive: elbow", "drive: shoulder"))
     accepted(*words, "--mode", "drive")
-    found = gains.load_gains(out).joints
-    assert found["shoulder"].armature == found["elbow"].armature
+    gains = load_gains(out).joints
+    assert gains["shoulder"].armature.value == gains["elbow"].armature.value
 
 
 @recorded
 def test_fit_of_three_recordings_holds_on_the_others() -> None:
-    found = run()
-    armature = found["fit"].joints["elbow"]["armature"]
+    fit, comparisons = compare()
+    armature = fit.joints["elbow"]["armature"]
     assert armature.identified
     assert 0.0 < armature.ci95[0] < armature.ci95[1]
-    lost = [
-        (log, kind, JOINTS[j], name)
-        for log in HELD_OUT
-        for kind in ("torque", "position")
-        for name, other in found["errors"][log].items()
-        for j in range(2)
-        if name != "fit" and found["errors"][log]["fit"][kind][j] >= other[kind][j]
-    ]
-    assert not lost
+    for comparison in comparisons:
+        others = [name for name in comparison.errors if name != "fit"]
+        assert comparison.lower_than == others, comparison

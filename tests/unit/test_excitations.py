@@ -12,10 +12,12 @@ from log_files import write_mcap
 from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.measured import measured_joints
+from pronk.identify.match.replay import JointReplay
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.match.time_fit import recorded
 from pronk.identify.response.estimate import estimate
 from pronk.identify.simulators.chain import moves_together
+from pronk.identify.simulators.command_trace import command_trace
+from pronk.identify.simulators.load import joint_rigs
 from pronk.robots import load_robot
 from synthetic_joint import KNEE, chirp_command, multisine_command, simulate_second_order
 
@@ -58,7 +60,9 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
         assert 21.0 * k - 0.6 < one.start <= 21.0 * k + 0.03
         assert 21.0 * k + 20.3 < one.stop < 21.0 * k + 21.03
     assert [len(repeats) for repeats in group_repeats(log.excitations("FR_knee"))] == [3, 1]
-    assert [one.excitation for one in recorded([log], "FR_knee", ROBOT)] == [0, 0, 0, 1]
+    with joint_rigs("mujoco", ROBOT) as rigs:
+        replay = JointReplay(rigs, log.excitations("FR_knee"))
+    assert [recording.command for recording in replay.recordings] == [0, 0, 0, 1]
     loud, quiet = estimate(log, "FR_knee")
     assert (len(loud.repeats), len(quiet.repeats)) == (3, 1)
     # The same as of the first chirp alone, which a file of its own would hold.
@@ -77,9 +81,11 @@ def test_joints_after_one_another_do_not_move_together() -> None:
     assert log.pose is not None
     np.testing.assert_allclose(log.pose, POSE, atol=1e-9)
     for name in LEG:
-        first, second = recorded([log], name, ROBOT)
-        assert first.excitation == second.excitation
-        np.testing.assert_allclose(first.trace.command[0], ROBOT.joint(name).default_position)
+        with joint_rigs("mujoco", ROBOT) as rigs:
+            replay = JointReplay(rigs, log.excitations(name))
+        assert [recording.command for recording in replay.recordings] == [0, 0]
+        trace = command_trace(log.excitations(name)[0], ROBOT)
+        np.testing.assert_allclose(trace.command[0], ROBOT.joint(name).default_position)
 
 
 def test_a_change_of_pose_between_excitations_is_not_left_out() -> None:

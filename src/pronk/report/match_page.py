@@ -16,7 +16,7 @@ from pronk.identify.match.gains import Interval, MatchedGains
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.predict import Prediction, load_prediction
 from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult
-from pronk.identify.match.torque import UNITS
+from pronk.identify.match.torque_fit import UNITS
 from pronk.jump.trial.tables import Sheet, table
 from pronk.report import figures
 from pronk.report.page import Part, page

@@ -71,7 +71,7 @@ class TorqueParameter:
     """A parameter of a joint's drive, identified by a torque channel."""
 
     value: float
-    """Value in the unit of `match.torque.UNITS`; NaN if the recordings leave it open."""
+    """Value in the unit of `match.torque_fit.UNITS`; NaN if the recordings leave it open."""
     ci95: Interval
     """95 % interval by blocks of the recordings; NaN where they leave it open."""
     reason: str = ""
@@ -120,7 +120,7 @@ class JointGains:
     quality: MatchQuality = MatchQuality()
     """Agreement of the simulated with the measured response."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
-    """The drive by a torque channel (mode `drive`), by the names of `match.torque.UNITS`."""
+    """The drive by a torque channel (mode `drive`), by the names of `match.torque_fit.UNITS`."""
     flags: tuple[str, ...] = ()
     """Warnings about this match, one sentence each."""
 

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from pronk.errors import IdentifiabilityError, PronkError
-from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.arm import fit_together
+from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.checks import check_recordings, check_response
-from pronk.identify.match.compared import compare
-from pronk.identify.match.gains import TorqueParameter
+from pronk.identify.match.compared import ComparedResponses, compare, compare_recordings
+from pronk.identify.match.drive_fit import fit_drives, nominal_drives
 from pronk.identify.match.magnitude import (
     fit_magnitude,
     grid_axes,
@@ -27,28 +26,20 @@ from pronk.identify.match.measured import (
     measured_joints,
     simulated_response,
 )
-from pronk.identify.match.nominal_gains import DriveGains, gains_on_drive, with_drive_gains
-from pronk.identify.match.parameters import (
-    DRIVE_MODE,
-    FREE,
-    GAINS_MODE,
-    PARAMETERS,
-    checked_names,
-)
+from pronk.identify.match.nominal_gains import DriveGains, with_drive_gains
+from pronk.identify.match.parameters import DRIVE_MODE, FREE, GAINS_MODE, checked_names
 from pronk.identify.match.ranges import group_gains
+from pronk.identify.match.replay import ChainReplay, JointReplay
 from pronk.identify.match.result import (
     DriveFit,
     GridSearch,
     JointResult,
     MatchResult,
-    amplitude_flags,
-    held_out_flags,
     joint_gains,
 )
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.match.time_fit import fit_joint, recorded
-from pronk.identify.match.torque import fit_drives, joint_fits
-from pronk.identify.simulators.chain import moves_together, published
+from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
+from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.load import joint_rigs
 from pronk.identify.simulators.mujoco import mujoco_info
 from pronk.identify.simulators.profiles import Profile, load_profiles, profile
@@ -65,8 +56,6 @@ NO_MATCH_DB = 1.0
 of a good log stays below."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
-_START_S = 0.005
-"""Delay from which the fit in time begins [s]: one physics step of the training simulator."""
 
 
 def no_progress(stage: str, share: float) -> None:
@@ -128,12 +117,11 @@ def match(
     parameters = fitted_parameters(mode, settings, framework)
     all_logs = with_drive_gains(logs, robot, drive_gains)
     excited_logs = [log for log in all_logs if log.excited_joints]
-    torque_drives: Mapping[str, Mapping[str, TorqueParameter]] = {}
-    torque_remarks: Mapping[str, str] = {}
+    torque_fits: dict[str, DriveFit] = {}
     if mode == "drive":
-        torque_drives, torque_remarks = fit_drives(all_logs, robot)
-        if not excited_logs and (torque_drives or torque_remarks):
-            return match_by_torque(robot, all_logs, torque_drives, torque_remarks)
+        torque_fits = fit_torque_drives(all_logs, robot)
+        if torque_fits and not excited_logs:
+            return match_by_torque(robot, all_logs, torque_fits)
     sources = logs_by_joint(excited_logs or all_logs, robot)
     recording_flags: dict[str, tuple[str, ...]] = {}
     for name, joint_logs in sources.items():
@@ -146,18 +134,17 @@ def match(
         require_mujoco(simulator, framework)
         simulated_robot = robot if framework is None else framework.robot(robot)
         with timed("fit", seconds, progress) as report:
-            chains, excluded = fit_together(
-                excited_logs, simulated_robot, parameters, threads=settings.threads, progress=report
-            )
-        fits = {name: fit for name, (fit, _) in chains.items()}
-        for name, fit in joint_fits(robot, fits, torque_drives, torque_remarks).items():
-            responses = chains[name][1] if name in chains else None
+            chains = fit_chains(excited_logs, simulated_robot, parameters, settings, report)
+        for name, fit in with_torque(chains.fits, torque_fits, robot).items():
+            responses = chains.responses.get(name)
             flags = (*fit.flags, *recording_flags.get(name, ()))
             joints[name] = JointResult(
                 joint=name, gains=joint_gains(fit, responses, flags), fit=fit, responses=responses
             )
         info = simulator_info(mujoco_info(robot), framework, simulated_robot)
-        result = match_result(robot, info, joints, all_logs, excluded=excluded, seconds=seconds)
+        result = match_result(
+            robot, info, joints, all_logs, excluded=chains.excluded, seconds=seconds
+        )
         require_stable_gains(result, framework, simulated_robot)
         return result
 
@@ -184,7 +171,7 @@ def match(
                 else:
                     fits[name] = fit_in_time(rigs, sources[name], name, parameters, mode)
                 report(len(fits) / len(measured))
-        fits = joint_fits(robot, fits, torque_drives, torque_remarks)
+        fits = with_torque(fits, torque_fits, robot)
 
         with timed("responses", seconds, progress) as report:
             for name, fit in fits.items():
@@ -198,7 +185,7 @@ def match(
                     measured[name],
                     matched=simulated_response(rigs, target, compared_values(fit, method)),
                     nominal=simulated_response(
-                        rigs, target, nominal_drive(sources[name][0], name, rigs.robot)
+                        rigs, target, nominal_drives(sources[name], [name], rigs.robot)[name]
                     ),
                 )
                 zero_armature = None
@@ -357,13 +344,6 @@ def timed(
     report(1.0)
 
 
-def nominal_drive(log: JointLog, joint_name: str, robot: RobotSpec) -> dict[str, float]:
-    """Return the drive as published, with the gains that were on it while a log was recorded."""
-    drive = published(robot, joint_name)
-    drive["stiffness"], drive["damping"] = gains_on_drive(log, joint_name, robot)
-    return drive
-
-
 def fit_in_time(
     rigs: JointRigs,
     logs: Sequence[JointLog],
@@ -371,7 +351,7 @@ def fit_in_time(
     parameters: Sequence[str],
     mode: Mode,
 ) -> DriveFit:
-    """Fit the drive of one joint in time.
+    """Fit the drive of one joint that moved alone.
 
     Args:
         rigs: Joints in the simulator.
@@ -383,42 +363,87 @@ def fit_in_time(
     Raises:
         IdentifiabilityError: The logs do not identify a parameter, in mode `drive`.
     """
-    nominal = nominal_drive(logs[0], joint_name, rigs.robot)
-    start = nominal | {"delay": _START_S}
-    fit = fit_joint(rigs, recorded(logs, joint_name, rigs.robot), parameters, start, nominal)
-    values = fit.estimate.values
-    flags = [*held_out_flags(fit.held_out)]
-    for name in fit.at_bound:
-        if name not in ("delay", "frictionloss"):  # none is a possible result
-            unit = PARAMETERS[name].unit
-            flags.append(f"{name} at the bound of the search, {values[name]:.3g} {unit}")
-    for name in fit.estimate.unidentified:
-        deviation = fit.estimate.sd[name]
-        remedy = PARAMETERS[name].remedy
-        if mode == "drive":
-            raise IdentifiabilityError(
-                f"{joint_name}: these logs do not identify the {name} (deviation "
-                f"{deviation:.2g}); {remedy}; or hold it at a known value."
-            )
-        if name not in fit.at_bound:
-            flags.append(f"{name} is not identified (deviation {deviation:.2g}); {remedy}")
-    if not fit.solution.settled:
-        flags.append("the fit in time did not settle")
-    flags.extend(amplitude_flags(fit.amplitude_gains))
-    flags.extend(fit.estimate.flags)
-    return DriveFit(
-        joint=joint_name,
-        values=values,
-        sd=fit.estimate.sd,
-        ci95=fit.estimate.ci95,
-        total95=fit.total95,
-        covariance=fit.estimate.covariance,
-        at_bound=fit.at_bound,
-        held_out=fit.held_out,
-        amplitude_gains=fit.amplitude_gains,
-        settled=fit.solution.settled,
-        flags=tuple(flags),
+    excitations: list[Excitation] = []
+    for log in logs:
+        excitations += log.excitations(joint_name)
+    fits = fit_drives(
+        JointReplay(rigs, excitations),
+        parameters=parameters,
+        nominal=nominal_drives(logs, [joint_name], rigs.robot),
+        unidentified="refuse" if mode == "drive" else "flag",
     )
+    return fits[joint_name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainFits:
+    """Drives of legs or arms whose joints moved together."""
+
+    fits: Mapping[str, DriveFit]
+    """Drive of each joint."""
+    responses: Mapping[str, ComparedResponses]
+    """Responses of each joint of which a recording gives one."""
+    excluded: Mapping[str, str]
+    """Reason why a joint that moved was not fitted, by joint."""
+
+
+def fit_chains(
+    logs: Sequence[JointLog],
+    robot: RobotSpec,
+    parameters: Sequence[str],
+    settings: MatchSettings,
+    report: Callable[[float], None],
+) -> ChainFits:
+    """Fit the drives of every chain that moves in some logs, one chain after the other.
+
+    With a fixed base chains (legs) do not move each other.
+
+    Args:
+        logs: Logs in which several joints move at once.
+        robot: The robot as it is simulated.
+        parameters: Names of the parameters to fit; those of a joint that the logs do not identify
+            are held at the nominal value.
+        settings: Threads of the simulator.
+        report: Called with the share that is done.
+
+    Raises:
+        IdentifiabilityError: The logs identify too few parameters of a joint.
+    """
+    fits: dict[str, DriveFit] = {}
+    responses: dict[str, ComparedResponses] = {}
+    excluded: dict[str, str] = {}
+    chains = branches(logs, robot)
+    for number, joints in enumerate(chains):
+
+        def report_chain(share: float, number: int = number) -> None:
+            report((number + share) / len(chains))
+
+        with ChainSimulation(robot, logs, joints=joints, threads=settings.threads) as simulation:
+            replay = ChainReplay(simulation)
+            nominal = nominal_drives(simulation.logs, simulation.joints, robot)
+            chain_fits = fit_drives(
+                replay,
+                parameters=parameters,
+                nominal=nominal,
+                unidentified="hold",
+                progress=report_chain,
+            )
+            matched = {name: fit.values for name, fit in chain_fits.items()}
+            matched_positions, nominal_positions = simulation.run([matched, nominal])
+            for column, name in enumerate(simulation.joints):
+                compared = compare_recordings(
+                    robot,
+                    name,
+                    simulation.logs,
+                    matched=[positions[:, column] for positions in matched_positions],
+                    nominal=[positions[:, column] for positions in nominal_positions],
+                    highest_hz=replay.trusted_hz[name],
+                )
+                if compared is not None:
+                    responses[name] = compared
+            fits.update(chain_fits)
+            excluded.update(simulation.excluded)
+    return ChainFits(fits=fits, responses=responses, excluded=excluded)
 
 
 def compared_values(fit: DriveFit, method: Method) -> Mapping[str, float]:
@@ -448,10 +473,7 @@ def unused_flags(target: MeasuredJoint, robot: RobotSpec) -> list[str]:
 
 
 def match_by_torque(
-    robot: RobotSpec,
-    logs: Sequence[JointLog],
-    drives: Mapping[str, Mapping[str, TorqueParameter]],
-    remarks: Mapping[str, str],
+    robot: RobotSpec, logs: Sequence[JointLog], torque_fits: Mapping[str, DriveFit]
 ) -> MatchResult:
     """Return the result of logs that excite no joint by a commanded position.
 
@@ -459,14 +481,16 @@ def match_by_torque(
         IdentifiabilityError: The torques identify no drive.
     """
     joints = {}
-    for name, fit in joint_fits(robot, {}, drives, remarks).items():
+    for name, fit in with_torque({}, torque_fits, robot).items():
         gains = joint_gains(fit, None, fit.flags)
         joints[name] = JointResult(joint=name, gains=gains, fit=fit)
     if not joints:
-        reasons = "; ".join(dict.fromkeys(remarks.values()))
+        reasons: dict[str, None] = {}
+        for fit in torque_fits.values():
+            reasons.update(dict.fromkeys(fit.flags))
         raise IdentifiabilityError(
             f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
-            f"by torque: {reasons or 'record larger or faster motions'}."
+            f"by torque: {'; '.join(reasons) or 'record larger or faster motions'}."
         )
     return match_result(robot, mujoco_info(robot), joints, logs)
 

@@ -9,7 +9,7 @@ import numpy as np
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.result import MatchResult
-from pronk.identify.match.torque import UNITS
+from pronk.identify.match.torque_fit import UNITS
 from pronk.tables import Cell, Column, Table
 
 

@@ -1,15 +1,15 @@
 """Confidence intervals of fitted parameters.
 
-The unit of uncertainty is a block: a repeat of a sweep, or 20 s of a recording in time. Noise on a
-robot is coloured and neighbouring frequencies and samples share it, so intervals that take them for
-independent are several times too narrow; blocks are independent whatever the colour. Intervals are
-Student's t over the blocks, which holds with as few as three.
+The unit of uncertainty is a block: a repeat of an excitation, or a piece of a recording in time.
+Noise on a robot is coloured and neighbouring frequencies and samples share it, so intervals that
+take them for independent are several times too narrow; blocks are independent whatever the colour.
+Intervals are Student's t over the blocks, which holds with as few as three.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,45 +18,105 @@ from scipy import stats
 from pronk.arrays import Array
 from pronk.identify.match.parameters import GAINS, PARAMETERS
 
+WIDEST = 20.0
+"""Widest half-width of an interval of a searched number: e^20 is as good as infinite, and does not
+overflow."""
+
 
 def jackknife(moves: Array) -> Array:
-    """Covariance of an optimum that moves by `moves` when one block is left out, shape (p, p).
+    """Covariance of an optimum that moves when one block is left out, shape (p, p).
 
-    `(n - 1) / n sum (move - mean) (move - mean)^T` for moves of shape (n, p); where the optimum is
-    the mean of n repeats, `moves = repeats / (n - 1)` gives their sample covariance over n.
+    It is `(n - 1) / n sum (move - mean) (move - mean)^T`. Where the optimum is the mean of n
+    repeats, `moves = repeats / (n - 1)` gives their sample covariance over n.
+
+    Args:
+        moves: Where the optimum moves without each block, shape (n, p).
     """
-    about = moves - np.mean(moves, axis=0)
+    about_mean = moves - np.mean(moves, axis=0)
     count = len(moves)
-    return np.asarray((count - 1) / count * about.T @ about)
+    return np.asarray((count - 1) / count * about_mean.T @ about_mean)
 
 
 def block_moves(jacobian: Array, residual: Array, blocks: NDArray[np.int64]) -> Array:
-    """Where the optimum moves when one block of residuals is left out, shape (blocks, p).
+    """Find where the optimum moves when one block of residuals is left out.
 
-    To first order `(A - A_b)^-1 J_b^T r_b` with A = J^T J and A_b = J_b^T J_b; `blocks` holds the
-    number of the block of each residual, shape (m,).
+    To first order it is `(A - A_b)^-1 J_b^T r_b` with A = J^T J and A_b = J_b^T J_b.
+
+    Args:
+        jacobian: Derivative of the residuals, shape (m, p).
+        residual: Residuals at the optimum, shape (m,).
+        blocks: Number of the block of each residual, shape (m,).
+
+    Returns:
+        The moves, shape (blocks, p).
     """
-    whole = jacobian.T @ jacobian
+    normal = jacobian.T @ jacobian
     # A parameter without effect must come out as very uncertain, not as an error.
-    whole = whole + 1e-12 * np.trace(whole) * np.eye(len(whole))
-    moves = []
-    for number in np.unique(blocks):
-        own = jacobian[blocks == number]
-        left = whole - own.T @ own
-        moves.append(np.linalg.lstsq(left, own.T @ residual[blocks == number], rcond=None)[0])
-    return np.array(moves)
+    normal = normal + 1e-12 * np.trace(normal) * np.eye(len(normal))
+    numbers = np.unique(blocks)
+    moves = np.empty((len(numbers), jacobian.shape[1]))
+    for row, number in enumerate(numbers):
+        inside = blocks == number
+        block_jacobian = jacobian[inside]
+        remaining = normal - block_jacobian.T @ block_jacobian
+        gradient = block_jacobian.T @ residual[inside]
+        moves[row] = np.linalg.lstsq(remaining, gradient, rcond=None)[0]
+    return moves
+
+
+def repeat_moves(
+    jacobian: Array,
+    residual: Array,
+    commands: NDArray[np.int64],
+    recordings: NDArray[np.int64],
+) -> list[Array]:
+    """Find where the optimum moves when one repeat of a command is left out.
+
+    To first order, by one Gauss-Newton step from the common optimum.
+
+    Args:
+        jacobian: Derivative of the residuals, shape (m, p).
+        residual: Residuals at the optimum, shape (m,).
+        commands: Number of the command of each residual, shape (m,).
+        recordings: Number of the recording of each residual, shape (m,).
+
+    Returns:
+        The moves of each command that was repeated, shape (repeats, p), one array a command.
+    """
+    inverse = np.linalg.pinv(jacobian)
+    moves_by_command = []
+    for command in np.unique(commands):
+        repeats = np.unique(recordings[commands == command])
+        count = len(repeats)
+        if count < 2:
+            continue
+        moves = np.empty((count, jacobian.shape[1]))
+        for row, repeat in enumerate(repeats):
+            inside = recordings == repeat
+            moves[row] = inverse[:, inside] @ residual[inside]
+        moves_by_command.append(moves * count / (count - 1))
+    return moves_by_command
 
 
 def time_blocks(times: Sequence[Array], length_s: float) -> list[NDArray[np.int64]]:
-    """Number of the block of each timestamp of some recordings [s], blocks of about `length_s`."""
-    out, first = [], 0
+    """Cut recordings into blocks of about the same length.
+
+    Args:
+        times: Timestamps of each recording [s], shape (n,) each.
+        length_s: Length of a block [s].
+
+    Returns:
+        Number of the block of each timestamp, counted through all recordings.
+    """
+    numbers = []
+    first = 0
     for time in times:
         span = time[-1] - time[0]
         count = max(round(span / length_s), 1)
-        share = ((time - time[0]) / span * count).astype(np.int64)
-        out.append(first + np.minimum(share, count - 1))
+        block = ((time - time[0]) / span * count).astype(np.int64)
+        numbers.append(first + np.minimum(block, count - 1))
         first += count
-    return out
+    return numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,58 +126,101 @@ class Estimate:
     values: Mapping[str, float]
     """Every parameter, fitted or held."""
     covariance: Array
-    """Of (stiffness, damping), zero for what was held, shape (2, 2)."""
+    """Covariance of (stiffness, damping), zero for what was held, shape (2, 2)."""
     sd: Mapping[str, float]
     """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
     ci95: Mapping[str, tuple[float, float]]
-    """95 % interval of each fitted parameter; empty without repeats."""
-    repeat_gains: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
-    flags: tuple[str, ...] = ()
+    """95 % interval of each fitted parameter."""
 
     @property
     def unidentified(self) -> tuple[str, ...]:
         """Fitted parameters whose deviation is beyond the limit of `PARAMETERS`."""
-        return tuple(n for n, sd in self.sd.items() if not sd <= PARAMETERS[n].sd_max)
+        return tuple(name for name, sd in self.sd.items() if not sd <= PARAMETERS[name].sd_max)
 
 
 def estimate(
     fitted: Sequence[str],
     x: Array,
     covariance: Array,
-    freedom: float,
-    held: Mapping[str, float],
-    *,
-    symmetric: bool = False,
+    freedom: int,
+    values: Mapping[str, float],
 ) -> Estimate:
-    """Turn searched numbers `x`, shape (p,), into parameters with intervals.
+    """Turn searched numbers into parameters with intervals.
 
-    The covariance, shape (p, p), is that of the searched numbers, or of the parameters if
-    `symmetric`: intervals are then symmetric about the parameters. With 0 degrees of `freedom`
-    there are no intervals. `held` are the values of what was not fitted.
+    Args:
+        fitted: Names of the fitted parameters.
+        x: Their searched numbers, shape (p,).
+        covariance: Covariance of the searched numbers, shape (p, p).
+        freedom: Degrees of freedom of the covariance, 1 or more.
+        values: Value of every parameter, fitted or held.
+
+    Returns:
+        The parameters; intervals are symmetric about the searched numbers.
     """
-    best = {name: PARAMETERS[name].unscaled(float(at)) for name, at in zip(fitted, x, strict=True)}
-    sd, ci95 = np.sqrt(np.diag(covariance)), {}
-    quantile = stats.t.ppf(0.975, freedom) if freedom else np.nan
-    for name, at, half in zip(fitted, x, quantile * sd, strict=True):
-        if symmetric:
-            low, high = best[name] - half, best[name] + half
-        else:
-            # e^20 is as good as infinite and does not overflow.
-            low, high = (PARAMETERS[name].unscaled(at + s * min(half, 20.0)) for s in (-1, 1))
-        if freedom:
-            ci95[name] = (float(max(low, 0.0) if PARAMETERS[name].log else low), float(high))
-    scale = np.array([best[name] if PARAMETERS[name].log else 1.0 for name in fitted])
-    if symmetric:
-        sd = sd / scale
-    else:
-        covariance = covariance * np.outer(scale, scale)
-    own, rows = np.zeros((2, 2)), [k for k, name in enumerate(GAINS) if name in fitted]
-    columns = [fitted.index(GAINS[k]) for k in rows]
-    own[np.ix_(rows, rows)] = covariance[np.ix_(columns, columns)]
-    return Estimate(
-        values={**held, **best},
-        covariance=own,
-        sd=dict(zip(fitted, sd.tolist(), strict=True)),
-        ci95=ci95,
-    )
+    quantile = float(stats.t.ppf(0.975, freedom))
+    deviation = np.sqrt(np.diag(covariance))
+    sd = {}
+    ci95 = {}
+    scale = np.ones(len(fitted))
+    for column, name in enumerate(fitted):
+        parameter = PARAMETERS[name]
+        half_width = min(quantile * float(deviation[column]), WIDEST)
+        low = parameter.unscaled(x[column] - half_width)
+        high = parameter.unscaled(x[column] + half_width)
+        ci95[name] = (low, high)
+        sd[name] = float(deviation[column])
+        if parameter.log:
+            scale[column] = values[name]
+    of_values = covariance * np.outer(scale, scale)
+    gain_covariance = np.zeros((2, 2))
+    for row, row_name in enumerate(GAINS):
+        for column, column_name in enumerate(GAINS):
+            if row_name in fitted and column_name in fitted:
+                entry = of_values[fitted.index(row_name), fitted.index(column_name)]
+                gain_covariance[row, column] = entry
+    return Estimate(values=values, covariance=gain_covariance, sd=sd, ci95=ci95)
+
+
+def total_intervals(
+    fitted: Sequence[str],
+    x: Array,
+    ci95: Mapping[str, tuple[float, float]],
+    part_moves: Array,
+    gains_by_amplitude: Array,
+) -> dict[str, tuple[float, float]]:
+    """Widen intervals by repeats so that they cover what the model does not explain.
+
+    Repeats and parts of the excitations count in quadrature. The gains of several amplitudes show
+    what the model lacks better than the parts, which then count with their deviation alone; no
+    interval of a gain is narrower than its change between amplitudes.
+
+    Args:
+        fitted: Names of the fitted parameters.
+        x: Searched numbers at the optimum, shape (p,).
+        ci95: Their intervals by repeats.
+        part_moves: Where the optimum moves without each part of the excitations, shape (n, p).
+        gains_by_amplitude: Amplitude, stiffness and damping of each amplitude, shape (m, 3).
+
+    Returns:
+        95 % interval of each fitted parameter.
+    """
+    deviation = np.sqrt(np.diag(jackknife(part_moves)))
+    quantile = float(stats.t.ppf(0.975, len(part_moves) - 1))
+    intervals = {}
+    for name, center, part_deviation in zip(fitted, x, deviation, strict=True):
+        parameter = PARAMETERS[name]
+        part_width = quantile * part_deviation
+        change = 0.0
+        if name in GAINS and len(gains_by_amplitude) > 1:
+            part_width = part_deviation
+            for gain in gains_by_amplitude[:, 1 + GAINS.index(name)]:
+                change = max(change, abs(parameter.scaled(gain) - center))
+        widths = []
+        for end in ci95[name]:
+            number = parameter.scaled(max(end, 1e-9) if parameter.log else end)
+            width = max(float(np.hypot(number - center, part_width)), change)
+            widths.append(min(width, WIDEST))
+        low = parameter.unscaled(center - widths[0])
+        high = parameter.unscaled(center + widths[1])
+        intervals[name] = (low, high)
+    return intervals

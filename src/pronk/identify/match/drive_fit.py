@@ -1,0 +1,476 @@
+"""The fit of drives in time: of a joint that moved alone, a leg or an arm, by one function.
+
+The simulator itself is the model. Residuals are weighted differences between simulated and measured
+positions at the timestamps of the log, and `scipy.optimize.least_squares` minimizes their squares.
+Dry friction, which changes the response with the amplitude, and the delay are fitted with the
+gains, so that neither passes for stiffness or damping.
+
+`fit_drives` takes these steps:
+
+1. Fit everything, from the nominal gains, and from two more points where that settles badly.
+2. Find how well each parameter is known, from repeats, or from blocks of time where nothing was
+   repeated. Parameters that are not known are flagged, held at their nominal value, or refused.
+3. Fit again without the samples that `training_samples` keeps out, and compare there with the
+   nominal gains, the nominal gains with the best delay, and a plain fit of three parameters.
+
+Several joints of a chain are fitted together. The parameters of a joint move its own position far
+more than its neighbours', so the Jacobian is taken block-diagonal: one simulation for each
+parameter, in which that of every joint is changed at once. The delay is one for the chain: its
+commands go out together, and a joint without gravity cannot separate a delay from stiffer gains.
+
+What differs between a joint that moved alone and joints that moved together (weights, the mean,
+repeats or blocks) is a matter of their recordings: `pronk.identify.match.recordings` says why. A
+torque channel gives the same parameters by another equation, which is linear in them and needs no
+simulation: `pronk.identify.match.torque_fit`, with the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from pronk.arrays import Array, Mask
+from pronk.errors import IdentifiabilityError
+from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.least_squares import (
+    EVALUATIONS,
+    DriveVector,
+    Optimum,
+    Residuals,
+    minimize_residuals,
+)
+from pronk.identify.match.nominal_gains import gains_on_drive
+from pronk.identify.match.parameters import GAINS, PARAMETERS, checked_names
+from pronk.identify.match.recordings import training_samples
+from pronk.identify.match.replay import Replay
+from pronk.identify.match.result import HELD_OUT, DriveFit, amplitude_flags, held_out_flags
+from pronk.identify.match.uncertainty import (
+    Estimate,
+    block_moves,
+    estimate,
+    jackknife,
+    repeat_moves,
+    total_intervals,
+)
+from pronk.identify.simulators.chain import DriveValues, published
+from pronk.robots.robot import RobotSpec
+
+PLAIN = ("stiffness", "damping", "delay")
+"""Parameters of the plain fit that the match is compared with."""
+OTHER_STARTS = (0.5, 2.0)
+"""Factors on the nominal gains from which a fit begins again where it settled badly."""
+SETTLED_WELL = 0.9
+"""Error in time, over that of the nominal gains with the best delay, below which a fit settled
+well. On virtual robots drawn at random it is 0.1 to 0.8."""
+MOST_HELD = 2
+"""Most parameters of a joint, the delay apart, that are held at their nominal value."""
+HOLD_FIRST = ("stribeck", "armature", "stiffness", "delay", "offset", "frictionloss", "damping")
+"""Of several parameters that cannot be distinguished, the first of these is held."""
+BLIND_RATIO = 0.07
+"""Singular value of the scaled Jacobian, over its largest, below which its parameters only move
+together. Finite differences of 2 to 3 % leave about as much of a direction without any effect: on
+sweeps of the virtual robot it is 0.02 where stiffness, damping and armature are fitted together,
+and 0.1 to 0.3 where one of them is known."""
+BLIND_SHARE = 0.3
+"""Component of such a direction from which on a parameter takes part in it."""
+
+Progress = Callable[[float], None]
+Unidentified = Literal["flag", "hold", "refuse"]
+
+
+def fit_drives(
+    replay: Replay,
+    *,
+    parameters: Sequence[str],
+    nominal: DriveValues,
+    unidentified: Unidentified = "flag",
+    progress: Progress | None = None,
+) -> dict[str, DriveFit]:
+    """Fit parameters of the drives of all joints of some recordings.
+
+    Args:
+        replay: Recordings of a joint that moved alone, or of a chain whose joints moved together.
+        parameters: Names out of `PARAMETERS`; those that the simulator cannot set are left out.
+            `stribeck` is fitted with `frictionloss` where the drive has a Stribeck speed.
+        nominal: All parameters of each joint, as published, with the gains that were on its drive.
+        unidentified: What becomes of a parameter that the recordings do not identify. `flag`: its
+            value stays with a flag. `hold`: it is held at the nominal value, up to `MOST_HELD` of a
+            joint. `refuse`: it is an error.
+        progress: Called with the share that is done, 0 to 1.
+
+    Returns:
+        The drive of each joint.
+
+    Raises:
+        PronkError: A parameter is unknown, or there is none.
+        IdentifiabilityError: A parameter is not identified and cannot be held; the message says
+            which, and what to record.
+    """
+    parameters = checked_names(parameters, [name for name in PARAMETERS if name != "stribeck"])
+    if progress is not None:
+        replay = CountedReplay(replay, 2 * EVALUATIONS * (1 + len(parameters)), progress)
+    free = {joint: replay.fittable(joint, parameters) for joint in replay.joints}
+    held: dict[str, tuple[str, ...]] = dict.fromkeys(replay.joints, ())
+    everything = [np.ones(len(recording.time), dtype=bool) for recording in replay.recordings]
+
+    best = _fit_from_nominal(replay, everything, free, nominal)
+    while True:
+        estimates = _estimates(best)
+        not_known = _parameters_to_hold(best, estimates, held, unidentified)
+        if not not_known:
+            break
+        start = best.drives()
+        fitted = dict(best.vector.fitted)
+        for joint, name in not_known:
+            held[joint] = (*held[joint], name)
+            start[joint][name] = nominal[joint][name]
+            fitted[joint] = tuple(other for other in fitted[joint] if other != name)
+        best = minimize_residuals(Residuals(replay, everything, DriveVector(fitted, start)))
+
+    held_out = _held_out_errors(replay, best, nominal)
+    fits = {}
+    for joint in replay.joints:
+        fits[joint] = _drive_fit(
+            joint, best, estimates[joint], nominal, held[joint], held_out.get(joint, {})
+        )
+    return fits
+
+
+def nominal_drives(
+    logs: Sequence[JointLog], joints: Sequence[str], robot: RobotSpec
+) -> dict[str, dict[str, float]]:
+    """Give the published drive of some joints the gains that were on it when it was recorded."""
+    drives = {}
+    for joint in joints:
+        log = next(log for log in logs if joint in log.joints)
+        stiffness, damping = gains_on_drive(log, joint, robot)
+        drives[joint] = published(robot, joint) | {"stiffness": stiffness, "damping": damping}
+    return drives
+
+
+class CountedReplay(Replay):
+    """A replay that reports the share of its simulations that is done."""
+
+    def __init__(self, replay: Replay, expected: int, progress: Progress) -> None:
+        self.joints = replay.joints
+        self.recordings = replay.recordings
+        self.delay_step_s = replay.delay_step_s
+        self._replay = replay
+        self._expected = expected
+        self._progress = progress
+        self._done = 0
+
+    def fittable(self, joint: str, parameters: Sequence[str]) -> tuple[str, ...]:
+        """Choose the parameters that a joint's simulation can be given."""
+        return self._replay.fittable(joint, parameters)
+
+    def remarks(self, joint: str) -> tuple[str, ...]:
+        """Say what of a joint's recordings is not used."""
+        return self._replay.remarks(joint)
+
+    def positions(self, sets: Sequence[DriveValues]) -> list[list[Array]]:
+        """Simulate all recordings, and report."""
+        positions = self._replay.positions(sets)
+        self._done += len(sets)
+        self._progress(min(self._done / self._expected, 0.99))
+        return positions
+
+
+def _fit_from_nominal(
+    replay: Replay,
+    samples: Sequence[Mask],
+    fitted: Mapping[str, Sequence[str]],
+    nominal: DriveValues,
+) -> Optimum:
+    """Fit from the nominal gains with the best delay, and again where that settles badly.
+
+    A fit settles badly if it runs out of evaluations, ends at a bound of the search, or is hardly
+    better than where it began. It then begins at `OTHER_STARTS` too, and the best counts.
+    """
+    delay = {}
+    others = {}
+    for joint, names in fitted.items():
+        delay[joint] = tuple(name for name in names if name == "delay")
+        others[joint] = tuple(name for name in names if name != "delay")
+    vector = DriveVector(delay, _raised(nominal, delay))
+    delayed = minimize_residuals(Residuals(replay, samples, vector))
+    start = _raised(delayed.drives(), others)
+    best = minimize_residuals(Residuals(replay, samples, DriveVector(fitted, start)))
+    at_bound = any(best.at_bound(joint) for joint in fitted)
+    if best.settled and not at_bound and best.cost < SETTLED_WELL**2 * delayed.cost:
+        return best
+    for factor in OTHER_STARTS:
+        other_start = {joint: dict(values) for joint, values in start.items()}
+        for joint, names in fitted.items():
+            for name in GAINS:
+                if name in names:
+                    other_start[joint][name] *= factor
+        vector = DriveVector(fitted, other_start)
+        optimum = minimize_residuals(Residuals(replay, samples, vector))
+        if optimum.cost < best.cost:
+            best = optimum
+    return best
+
+
+def _raised(
+    drives: DriveValues, fitted: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, float]]:
+    """Raise fitted parameters to where a search may begin (`Parameter.start`)."""
+    raised = {joint: dict(values) for joint, values in drives.items()}
+    for joint, names in fitted.items():
+        for name in names:
+            raised[joint][name] = max(raised[joint][name], PARAMETERS[name].start)
+    return raised
+
+
+def _estimates(optimum: Optimum) -> dict[str, Estimate]:
+    """How well the parameters of each joint are known.
+
+    The unit is a repeat where commands were repeated, and a block of time where none was.
+    """
+    residuals = optimum.residuals
+    repeats = repeat_moves(
+        optimum.jacobian, optimum.residual, residuals.command, residuals.recording
+    )
+    covariance = np.zeros((len(optimum.x), len(optimum.x)))
+    freedom = 0
+    for moves in repeats:
+        covariance += jackknife(moves)
+        freedom += len(moves) - 1
+    if not repeats:
+        moves = block_moves(optimum.jacobian, optimum.residual, residuals.block)
+        covariance = jackknife(moves)
+        freedom = len(moves) - 1
+    estimates = {}
+    for joint, values in optimum.drives().items():
+        columns = optimum.vector.columns[joint]
+        estimates[joint] = estimate(
+            optimum.vector.fitted[joint],
+            optimum.x[columns],
+            covariance[np.ix_(columns, columns)],
+            freedom,
+            values,
+        )
+    return estimates
+
+
+def _parameters_to_hold(
+    optimum: Optimum,
+    estimates: Mapping[str, Estimate],
+    held: Mapping[str, Sequence[str]],
+    unidentified: Unidentified,
+) -> list[tuple[str, str]]:
+    """Joints and parameters to hold at the nominal value, because they are not identified.
+
+    The delay is held for all joints at once. It is also held where it would be below zero by no
+    more than its interval: no simulator has such a delay.
+
+    Raises:
+        IdentifiabilityError: Parameters are not identified and cannot be held: none may be, more
+            than `MOST_HELD` of a joint would be, or all would be.
+    """
+    if unidentified == "flag":
+        return []
+    fitted = optimum.vector.fitted
+    unknown: dict[str, list[str]] = {}
+    early = False
+    for joint, known in estimates.items():
+        names = list(known.unidentified)
+        if unidentified == "refuse":
+            names += _confused_parameters(optimum, joint)
+        if names:
+            unknown[joint] = [name for name in fitted[joint] if name in names]
+        if "delay" in known.ci95:
+            low, high = known.ci95["delay"]
+            early = early or low < known.values["delay"] < 0.0 < high
+    if unidentified == "hold":
+        delayed = [joint for joint, names in fitted.items() if "delay" in names]
+        delay_unknown = any("delay" in names for names in unknown.values())
+        others_remain = all(len(fitted[joint]) > 1 for joint in delayed)
+        if (delay_unknown or early) and others_remain:
+            return [(joint, "delay") for joint in delayed]
+    if not unknown:
+        return []
+    cannot_hold = unidentified == "refuse"
+    for joint in unknown:
+        count = len({*held[joint]} - {"delay"})
+        if count >= MOST_HELD or len(fitted[joint]) == 1:
+            cannot_hold = True
+    if cannot_hold:
+        raise _not_identified(unknown)
+    return [(joint, min(names, key=HOLD_FIRST.index)) for joint, names in unknown.items()]
+
+
+def _not_identified(unknown: Mapping[str, Sequence[str]]) -> IdentifiabilityError:
+    """The error that names parameters by joint, and what to record."""
+    joints = []
+    remedies: dict[str, str] = {}
+    for joint, names in unknown.items():
+        joints.append(f"{joint}: {', '.join(names)}")
+        for name in names:
+            remedies[name] = PARAMETERS[name].remedy
+    return IdentifiabilityError(
+        f"these recordings do not identify {'; '.join(joints)}; fit fewer parameters, hold one "
+        f"at a known value, or record more: {'; '.join(remedies.values())}."
+    )
+
+
+def _confused_parameters(optimum: Optimum, joint: str) -> list[str]:
+    """Fitted parameters of a joint that moved alone and that its recordings cannot distinguish.
+
+    Repeats of a sweep say how well it is repeated, not that other parameters would give it as well:
+    stiffness, damping, armature and friction of a joint without gravity may all be twice as large.
+    The Jacobian has no effect along such a direction, whatever the noise. Blocks of time of joints
+    that moved together differ in pose and load, and show it in the deviation.
+    """
+    if np.isnan(optimum.residuals.amplitude).any():
+        return []
+    columns = optimum.jacobian[:, optimum.vector.columns[joint]]
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    _, singular, directions = np.linalg.svd(columns / size, full_matrices=False)
+    blind = np.abs(directions[singular < BLIND_RATIO * singular[0]])
+    confused = []
+    for column, name in enumerate(optimum.vector.fitted[joint]):
+        if (blind[:, column] > BLIND_SHARE).any():
+            confused.append(name)
+    return confused
+
+
+def _held_out_errors(
+    replay: Replay, best: Optimum, nominal: DriveValues
+) -> dict[str, dict[str, float]]:
+    """Errors of each joint on the samples that are kept out of the fit [rad], by `HELD_OUT`.
+
+    Each drive is fitted to the training samples, from where the fit to everything ended.
+    """
+    training = training_samples(replay.recordings)
+    judging = [~mask for mask in training]
+    fitted = best.vector.fitted
+    best_drives = best.drives()
+    drives: list[DriveValues] = [nominal]
+    for allowed in (("delay",), PLAIN, tuple(PARAMETERS)):
+        chosen = {}
+        start = {}
+        for joint, names in fitted.items():
+            chosen[joint] = tuple(name for name in names if name in allowed)
+            start[joint] = dict(nominal[joint])
+            for name in chosen[joint]:
+                start[joint][name] = best_drives[joint][name]
+        residuals = Residuals(replay, training, DriveVector(chosen, start))
+        drives.append(minimize_residuals(residuals).drives())
+    judge = Residuals(replay, judging, best.vector)
+    errors: dict[str, dict[str, float]] = {}
+    for name, positions in zip(HELD_OUT, replay.positions(drives), strict=True):
+        residual = judge.compared(positions)
+        for joint in fitted:
+            if judge.rows(joint).any():
+                errors.setdefault(joint, {})[name] = judge.rmse(residual, joint)
+    return errors
+
+
+def _drive_fit(
+    joint: str,
+    best: Optimum,
+    known: Estimate,
+    nominal: DriveValues,
+    held: tuple[str, ...],
+    held_out: Mapping[str, float],
+) -> DriveFit:
+    """Put the findings of one joint together."""
+    residuals = best.residuals
+    (nominal_positions,) = residuals.replay.positions([nominal])
+    nominal_residual = residuals.compared(nominal_positions)
+    by_amplitude = _gains_by_amplitude(joint, best)
+    return DriveFit(
+        joint=joint,
+        values=known.values,
+        sd=known.sd,
+        ci95=known.ci95,
+        total95=_total95(joint, best, known, by_amplitude),
+        covariance=known.covariance,
+        held=held,
+        at_bound=best.at_bound(joint),
+        held_out=held_out,
+        amplitude_gains=by_amplitude,
+        rmse=residuals.rmse(best.residual, joint),
+        nominal_rmse=residuals.rmse(nominal_residual, joint),
+        settled=best.settled,
+        flags=(
+            *held_out_flags(held_out),
+            *_parameter_flags(joint, best, known, held),
+            *residuals.replay.remarks(joint),
+            *amplitude_flags(by_amplitude),
+        ),
+    )
+
+
+def _parameter_flags(joint: str, best: Optimum, known: Estimate, held: Sequence[str]) -> list[str]:
+    """Say which parameters of a joint were held, are at a bound, uncertain or impossible."""
+    flags = []
+    for name in held:
+        flags.append(
+            f"{name} held at {known.values[name]:.4g}: these recordings do not identify it; "
+            f"{PARAMETERS[name].remedy}"
+        )
+    at_bound = best.at_bound(joint)
+    for name in at_bound:
+        unit = PARAMETERS[name].unit
+        flags.append(f"{name} at the bound of the search, {known.values[name]:.3g} {unit}")
+    for name in known.unidentified:
+        if name not in at_bound:
+            flags.append(
+                f"{name} is not identified (deviation {known.sd[name]:.2g}); "
+                f"{PARAMETERS[name].remedy}"
+            )
+    if "delay" in known.ci95 and known.ci95["delay"][1] < 0.0:
+        flags.append(
+            f"delay {1e3 * known.values['delay']:.1f} ms: the log has the command later than the "
+            "drive had it; 0 in the gains, which hold for earlier commands"
+        )
+    if not best.settled:
+        flags.append("the fit in time did not settle")
+    return flags
+
+
+def _gains_by_amplitude(joint: str, best: Optimum) -> Array:
+    """Amplitude, stiffness and damping of each amplitude by itself, shape (m, 3).
+
+    To first order about the common optimum, friction and delay held. Empty for joints that moved
+    together.
+    """
+    amplitudes = best.residuals.amplitude
+    if np.isnan(amplitudes).any():
+        return np.empty((0, 3))
+    columns = []
+    for name in GAINS:
+        if name in best.vector.fitted[joint]:
+            columns.append(best.vector.column(joint, name))
+    gains = []
+    for amplitude in dict.fromkeys(amplitudes.tolist()):
+        rows = amplitudes == amplitude
+        x = best.x.copy()
+        inverse = np.linalg.pinv(best.jacobian[rows][:, columns])
+        x[columns] -= inverse @ best.residual[rows]
+        drive = best.vector.drives(x)[joint]
+        gains.append((amplitude, drive["stiffness"], drive["damping"]))
+    return np.array(gains)
+
+
+def _total95(
+    joint: str, best: Optimum, known: Estimate, by_amplitude: Array
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of a joint that cover what the model does not explain.
+
+    Those of joints that moved together are by blocks of time, and total already.
+    """
+    residuals = best.residuals
+    if len(by_amplitude) == 0:
+        return dict(known.ci95)
+    columns = best.vector.columns[joint]
+    moves = block_moves(best.jacobian, best.residual, residuals.block)
+    return total_intervals(
+        best.vector.fitted[joint], best.x[columns], known.ci95, moves[:, columns], by_amplitude
+    )
