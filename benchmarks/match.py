@@ -22,13 +22,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks.random_robots import HELD_OUT, ROBOT, Recorded, recorded
 from benchmarks.runner import Progress, finish, in_parallel, machine
@@ -43,6 +42,7 @@ from benchmarks.time_fit import (
     simulated,
     start_values,
 )
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.logs.joint_log import JointLog
@@ -55,6 +55,8 @@ from pronk.identify.simulators.chain import ChainSimulation, DriveValues
 from pronk.identify.simulators.load import joint_rigs
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.tables import Cell, Column, Table
 
 Kind = Literal["hip_roll", "hip_pitch", "knee"]
 JOINTS: tuple[Kind, ...] = ("hip_roll", "hip_pitch", "knee")
@@ -63,13 +65,24 @@ NOMINAL = "nominal with delay"
 PLAIN = "plain fit"
 PRONK = "pronk"
 PAPER = "pronk, paper's method"
-DRY, CMA = "plain fit, friction free", "CMA-ES, friction free"
+DRY = "plain fit, friction free"
+CMA = "CMA-ES, friction free"
 ON_ARM = (PRONK, NOMINAL, PLAIN, DRY, CMA)
 """Methods for joints that move together."""
+DRY_FREE = ("stiffness", "damping", "frictionloss", "delay")
+"""Parameters of the methods with the friction free."""
 FITTED = ("chirp_sweep", "multisine", "backlash_detection")
+"""Recordings of the SO-101 that give the drives."""
 RECORDED = ("step_response", "sinusoidal_sweep")
-"""Recordings of the SO-101 that give the drives, and that judge them."""
+"""Recordings of the SO-101 that judge the drives."""
+NAN = float("nan")
+
 Intervals = Mapping[str, tuple[float, float]]
+Row = dict[str, Any]
+"""Figures of one method on one joint: robot, joint, method, seconds, those of `Found`, `rmse` and
+`moving` by signal, `exact`; or `refused` with the reason."""
+Rows = Mapping[tuple[int, str], Mapping[str, Any]]
+"""Rows of one method by robot and joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,18 +90,30 @@ class Found:
     """Result of one method for one log."""
 
     values: Mapping[str, float]
-    """stiffness, damping, armature, frictionloss, delay."""
+    """Stiffness, damping, armature, frictionloss and delay."""
     repeat: Intervals = field(default_factory=dict)
     """95 % intervals from repeats, or of the tool's own kind."""
     total: Intervals = field(default_factory=dict)
     """95 % intervals with everything that the tool takes for uncertain."""
     flags: tuple[str, ...] = ()
+    """Warnings of the tool."""
 
 
 Fit = Callable[[JointRigs, JointLog, str], Found]
 
 
-def _pronk(method: Method, rigs: JointRigs, log: JointLog, joint: str) -> Found:
+def fit_nominal(rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    """Nominal gains with the best delay."""
+    return Found(values=fit_plain(rigs, log, joint, ("delay",)))
+
+
+def fit_plainly(rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    """Stiffness, damping and delay by nonlinear least squares."""
+    return Found(values=fit_plain(rigs, log, joint))
+
+
+def fit_by_pronk(method: Method, rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    """The match of pronk."""
     settings = MatchSettings(zero_armature=False, threads=1)
     result = match_logs([log], rigs.robot, method=method, settings=settings)
     joint_result = result.joints[joint]
@@ -100,41 +125,54 @@ def _pronk(method: Method, rigs: JointRigs, log: JointLog, joint: str) -> Found:
     )
 
 
-def _sysid(rigs: JointRigs, log: JointLog, joint: str) -> Found:
-    found = fit_mujoco_sysid(log, joint, rigs.robot)
-    fitted = {"stiffness": found.stiffness, "damping": found.damping, "delay": found.delay_s or 0.0}
-    own = dict(zip(GAINS, found.interval or (), strict=False))
-    return Found(values=start_values(rigs.robot, joint) | fitted, repeat=own)
+def fit_by_sysid(rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    """The least squares of mujoco.sysid."""
+    estimate = fit_mujoco_sysid(log, joint, rigs.robot)
+    values = start_values(rigs.robot, joint)
+    values["stiffness"] = estimate.stiffness
+    values["damping"] = estimate.damping
+    values["delay"] = estimate.delay_s or 0.0
+    intervals = {}
+    if estimate.interval is not None:
+        intervals["stiffness"], intervals["damping"] = estimate.interval
+    return Found(values=values, repeat=intervals)
+
+
+def fit_by_cma(rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    """CMA-ES over the parameters of the plain fit."""
+    return Found(values=search_cma(rigs, log, joint, seed=0))
 
 
 def methods() -> dict[str, Fit]:
     """Methods by name; that of the nominal gains first, for the others are related to it."""
     return {
-        NOMINAL: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint, ("delay",))),
-        PLAIN: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint)),
-        PRONK: partial(_pronk, "time"),
-        PAPER: partial(_pronk, "paper"),
-        "mujoco.sysid": _sysid,
-        "CMA-ES": lambda rigs, log, joint: Found(values=search_cma(rigs, log, joint, seed=0)),
+        NOMINAL: fit_nominal,
+        PLAIN: fit_plainly,
+        PRONK: partial(fit_by_pronk, "time"),
+        PAPER: partial(fit_by_pronk, "paper"),
+        "mujoco.sysid": fit_by_sysid,
+        "CMA-ES": fit_by_cma,
     }
 
 
-def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Iterator[dict[str, Any]]:
+def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Iterator[Row]:
     """Yield a row for each method on one joint; `refused` has the reason where it gave none."""
     held_out = recordings(logs.held_out, logs.joint, rigs.robot)
     for name, fit in chosen.items():
-        row: dict[str, Any] = {"joint": logs.joint, "method": name}
+        row: Row = {"joint": logs.joint, "method": name}
         begin = time.perf_counter()
         try:
-            found = fit(rigs, logs.sweep, logs.joint)
+            result = fit(rigs, logs.sweep, logs.joint)
         except PronkError as error:
             yield row | {"refused": str(error)}
             continue
-        row |= {"seconds": time.perf_counter() - begin, **vars(found)}
-        errors = [simulated(rigs, one, [found.values])[0] - one.positions[0] for one in held_out]
-        rmse = [float(np.sqrt(np.mean(error**2))) for error in errors]
-        row["rmse"] = dict(zip(HELD_OUT, rmse, strict=True))
-        row["moving"] = dict(zip(HELD_OUT, [float(e.std()) for e in errors], strict=True))
+        row |= {"seconds": time.perf_counter() - begin, **asdict(result)}
+        row["rmse"] = {}
+        row["moving"] = {}
+        for signal, recording in zip(HELD_OUT, held_out, strict=True):
+            error = simulated(rigs, recording, [result.values])[0] - recording.positions[0]
+            row["rmse"][signal] = float(np.sqrt(np.mean(error**2)))
+            row["moving"][signal] = float(error.std())
         if name != NOMINAL:
             try:
                 row["exact"] = dict(fit(rigs, logs.exact, logs.joint).values)
@@ -152,7 +190,7 @@ def run(
     names: Collection[str] = (),
     folder: Path | None = None,
     jobs: int = 1,
-) -> Iterator[list[dict[str, Any]]]:
+) -> Iterator[list[Row]]:
     """Yield the rows of one robot after the other, of the methods `names` or all.
 
     Raises:
@@ -163,86 +201,102 @@ def run(
             f"{robots} robots, joints {', '.join(joints)}; expected 1 or more of each, joints out "
             f"of {', '.join(JOINTS)}."
         )
-    work = partial(_robot, seed=seed, joints=joints, names=names or methods(), folder=folder)
+    work = partial(
+        compare_on_robot, seed=seed, joints=joints, names=names or methods(), folder=folder
+    )
     for done, rows in enumerate(in_parallel(work, range(robots), jobs)):
         progress("match", (done + 1) / robots)
         yield rows
 
 
-def _robot(
+def compare_on_robot(
     number: int, *, seed: int, joints: Sequence[str], names: Collection[str], folder: Path | None
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Rows of one robot."""
     chosen = {name: fit for name, fit in methods().items() if name in names}
+    rows = []
     with joint_rigs("mujoco", load_robot(ROBOT), threads=1) as rigs:
-        return [
-            {"robot": number} | row
-            for logs in recorded(seed, number, joints, folder)
-            for row in compare(rigs, logs, chosen)
-        ]
+        for logs in recorded(seed, number, joints, folder):
+            for row in compare(rigs, logs, chosen):
+                rows.append({"robot": number} | row)
+    return rows
 
 
-def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> list[dict[str, Any]]:
+def read_recordings(folder: Path, names: Sequence[str], robot: RobotSpec) -> list[JointLog]:
+    """Read some recordings of the SO-101."""
+    return [read_log(folder / name, robot=robot) for name in names]
+
+
+def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> list[Row]:
     """Rows of the SO-101: `FITTED` give the drives, `RECORDED` judge them.
 
     Raises:
         LogError: A recording is missing.
     """
     robot = load_robot("so101")
-    logs, held_out = (
-        [read_log(folder / name, robot=robot) for name in names] for names in (FITTED, RECORDED)
-    )
-    rows: list[dict[str, Any]] = []
+    logs = read_recordings(folder, FITTED, robot)
+    held_out = read_recordings(folder, RECORDED, robot)
+    rows: list[Row] = []
     with (
         ChainSimulation(robot, logs, threads=1) as arm,
         ChainSimulation(robot, held_out, joints=arm.joints, threads=1) as judge,
     ):
         nominal = {name: start_values(robot, name) for name in arm.joints}
-        found: DriveValues = {}
-
-        def pronk(_: DriveValues) -> DriveValues:
-            result = match_logs(
-                logs, robot, settings=MatchSettings(threads=1), drive_gains="default"
-            )
-            return drives_of(robot, result.gains)
-
-        def given(pronks: DriveValues) -> DriveValues:
-            return {
-                name: drive | {"frictionloss": pronks[name]["frictionloss"]}
-                for name, drive in nominal.items()
-            }
-
-        dry = ("stiffness", "damping", "frictionloss", "delay")
-        chosen: dict[str, Callable[[DriveValues], DriveValues]] = {
-            PRONK: pronk,
-            NOMINAL: lambda _: fit_arm(arm, ("delay",), nominal),
-            PLAIN: lambda pronks: fit_arm(arm, FREE, given(pronks)),
-            DRY: lambda pronks: fit_arm(arm, dry, given(pronks)),
-            CMA: lambda pronks: search_cma_arm(arm, dry, given(pronks), 0),
-        }
-        chosen = {name: fit for name, fit in chosen.items() if name in {PRONK, *wanted}}
-        for k, (method, fit) in enumerate(chosen.items()):
+        dry_start: DriveValues = {}
+        chosen = [name for name in ON_ARM if name == PRONK or name in wanted]
+        for number, method in enumerate(chosen, 1):
             begin = time.perf_counter()
-            drives = fit(found)
+            drives: DriveValues
+            if method == PRONK:
+                settings = MatchSettings(threads=1)
+                result = match_logs(logs, robot, settings=settings, drive_gains="default")
+                drives = drives_of(robot, result.gains)
+                dry_start = with_friction(nominal, drives)
+            elif method == NOMINAL:
+                drives = fit_arm(arm, ("delay",), nominal)
+            elif method == PLAIN:
+                drives = fit_arm(arm, FREE, dry_start)
+            elif method == DRY:
+                drives = fit_arm(arm, DRY_FREE, dry_start)
+            else:
+                drives = search_cma_arm(arm, DRY_FREE, dry_start, 0)
             seconds = time.perf_counter() - begin
-            found = found or drives
-            report("fit", (k + 1) / len(chosen))
-            errors = [
-                simulated - measured
-                for simulated, measured in zip(
-                    judge.run([drives])[0], judge.measured(), strict=True
-                )
-            ]
-            for i, joint in enumerate(arm.joints):
-                own = {
-                    name: error[:, i]
-                    for name, error in zip(RECORDED, errors, strict=True)
-                    if np.isfinite(error[:, i]).all()
-                }
-                row = {"robot": 0, "joint": joint, "method": method, "seconds": seconds}
-                row |= {"values": drives[joint]}
-                row |= {"rmse": {s: float(np.sqrt(np.mean(e**2))) for s, e in own.items()}}
-                rows.append(row | {"moving": {s: float(e.std()) for s, e in own.items()}})
+            report("fit", number / len(chosen))
+            rows += arm_rows(judge, drives, method, seconds)
+    return rows
+
+
+def with_friction(drives: DriveValues, source: DriveValues) -> dict[str, dict[str, float]]:
+    """Some drives with the dry friction at rest of others."""
+    changed = {}
+    for name, values in drives.items():
+        changed[name] = {**values, "frictionloss": source[name]["frictionloss"]}
+    return changed
+
+
+def arm_rows(judge: ChainSimulation, drives: DriveValues, method: str, seconds: float) -> list[Row]:
+    """Errors of one method on the recordings that judge it, a row a joint."""
+    (positions,) = judge.run([drives])
+    rows = []
+    for column, joint in enumerate(judge.joints):
+        rmse = {}
+        moving = {}
+        for signal, position, measured in zip(RECORDED, positions, judge.measured(), strict=True):
+            error = position[:, column] - measured[:, column]
+            if np.isfinite(error).all():
+                rmse[signal] = float(np.sqrt(np.mean(error**2)))
+                moving[signal] = float(error.std())
+        rows.append(
+            {
+                "robot": 0,
+                "joint": joint,
+                "method": method,
+                "seconds": seconds,
+                "values": dict(drives[joint]),
+                "rmse": rmse,
+                "moving": moving,
+            }
+        )
     return rows
 
 
@@ -252,104 +306,149 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     `ratio` of a joint is the geometric mean over the held-out signals of its RMSE over that of the
     nominal gains with delay.
     """
-    by: dict[str, dict[tuple[int, str], Mapping[str, Any]]] = {}
+    by_method: dict[str, dict[tuple[int, str], Mapping[str, Any]]] = {}
+    signals: dict[str, None] = {}
     for row in rows:
-        by.setdefault(row["method"], {})[row["robot"], row["joint"]] = row
-    signals = tuple(dict.fromkeys(s for row in rows for s in row.get("rmse", ())))
-    out = []
-    for name, mine in by.items():
-        good = {key: row for key, row in mine.items() if "rmse" in row}
-        ratios = _ratios(good, by.get(NOMINAL, {}), signals)
-        plain, moving = (
-            _ratios(good, by.get(PLAIN, {}), signals, kind) for kind in ("rmse", "moving")
-        )
-        joint = np.exp(np.nanmean(np.log(ratios), axis=1)) if len(ratios) else np.array([np.nan])
-        both = [row for row in good.values() if "exact" in row]
-        bias = [[100.0 * (r["values"][g] / r["exact"][g] - 1.0) for g in GAINS] for r in both]
-        one: dict[str, Any] = {
-            "method": name,
-            "joints": len(good),
-            "refused": len(mine) - len(good),
-            "below": int((joint < 1.0).sum()),
-            "cells_below": int((ratios < 1.0).sum()),
-            "median": float(np.median(joint)),
-            "signals": dict(zip(signals, np.nanmedian(ratios, axis=0).tolist(), strict=True))
-            if len(ratios)
-            else {},
-            "over_plain": float(np.exp(np.nanmean(np.log(plain)))) if len(plain) else float("nan"),
-            "moving": float(np.exp(np.nanmean(np.log(moving)))) if len(moving) else float("nan"),
-            "bias": np.mean(bias, axis=0).tolist() if bias else [float("nan")] * 2,
-            "absolute": np.median(np.abs(bias), axis=0).tolist() if bias else [float("nan")] * 2,
-            "seconds": float(np.mean([r["seconds"] for r in good.values()] or [float("nan")])),
-        }
-        for kind in ("repeat", "total"):
-            pairs = [
-                (r[kind][g], r["exact"][g], r["values"][g])
-                for r in both
-                for g in GAINS
-                if g in r[kind]
-            ]
-            one[kind] = {
-                "intervals": len(pairs),
-                "covered": sum(low <= exact <= high for (low, high), exact, _ in pairs),
-                "half_width": float(
-                    np.median([50.0 * (high - low) / value for (low, high), _, value in pairs])
-                )
-                if pairs
-                else float("nan"),
+        by_method.setdefault(row["method"], {})[row["robot"], row["joint"]] = row
+        signals.update(dict.fromkeys(row.get("rmse", ())))
+    summaries = []
+    for name, method_rows in by_method.items():
+        results = {key: row for key, row in method_rows.items() if "rmse" in row}
+        ratios = error_ratios(results, by_method.get(NOMINAL, {}), tuple(signals))
+        over_plain = error_ratios(results, by_method.get(PLAIN, {}), tuple(signals))
+        moving = error_ratios(results, by_method.get(PLAIN, {}), tuple(signals), "moving")
+        by_joint = np.array([NAN])
+        by_signal = {}
+        if len(ratios):
+            by_joint = np.exp(np.nanmean(np.log(ratios), axis=1))
+            by_signal = dict(zip(signals, np.nanmedian(ratios, axis=0).tolist(), strict=True))
+        compared = [row for row in results.values() if "exact" in row]
+        bias = gain_bias(compared)
+        summaries.append(
+            {
+                "method": name,
+                "joints": len(results),
+                "refused": len(method_rows) - len(results),
+                "below": int((by_joint < 1.0).sum()),
+                "cells_below": int((ratios < 1.0).sum()),
+                "median": float(np.median(by_joint)),
+                "signals": by_signal,
+                "over_plain": geometric_mean(over_plain),
+                "moving": geometric_mean(moving),
+                "bias": np.mean(bias, axis=0).tolist(),
+                "absolute": np.median(np.abs(bias), axis=0).tolist(),
+                "seconds": float(np.mean([row["seconds"] for row in results.values()] or [NAN])),
+                "repeat": coverage(compared, "repeat"),
+                "total": coverage(compared, "total"),
             }
-        out.append(one)
-    return out
+        )
+    return summaries
 
 
-def _ratios(
-    mine: Mapping[Any, Mapping[str, Any]],
-    other: Mapping[Any, Mapping[str, Any]],
-    signals: Sequence[str],
-    kind: str = "rmse",
-) -> Any:
-    """RMSE over that of another method, shape (joints that both have, signals).
+def geometric_mean(ratios: Array) -> float:
+    """Geometric mean of ratios, those that are NaN left out; NaN of none."""
+    return float(np.exp(np.nanmean(np.log(ratios)))) if len(ratios) else NAN
+
+
+def gain_bias(rows: Sequence[Mapping[str, Any]]) -> Array:
+    """Gains of the sweep over those without noise, less 1 [%], shape (rows, 2); NaN of none."""
+    if not rows:
+        return np.full((1, len(GAINS)), NAN)
+    bias = np.empty((len(rows), len(GAINS)))
+    for number, row in enumerate(rows):
+        for column, gain in enumerate(GAINS):
+            bias[number, column] = 100.0 * (row["values"][gain] / row["exact"][gain] - 1.0)
+    return bias
+
+
+def coverage(rows: Sequence[Mapping[str, Any]], kind: str) -> dict[str, Any]:
+    """How many intervals of one kind hold the gains without noise, and how wide they are."""
+    covered = 0
+    half_widths = []
+    for row in rows:
+        for gain in GAINS:
+            if gain not in row[kind]:
+                continue
+            low, high = row[kind][gain]
+            covered += low <= row["exact"][gain] <= high
+            half_widths.append(50.0 * (high - low) / row["values"][gain])
+    return {
+        "intervals": len(half_widths),
+        "covered": covered,
+        "half_width": float(np.median(half_widths)) if half_widths else NAN,
+    }
+
+
+def error_ratios(rows: Rows, others: Rows, signals: Sequence[str], kind: str = "rmse") -> Array:
+    """Errors over those of another method, shape (joints that both have, signals).
 
     NaN where a signal does not excite a joint.
     """
-    both = [key for key in mine if kind in other.get(key, {})]
-    ratios = [
-        [mine[k][kind].get(s, np.nan) / other[k][kind].get(s, np.nan) for s in signals]
-        for k in both
-    ]
+    ratios = []
+    for key, row in rows.items():
+        other = others.get(key, {})
+        if kind in other:
+            ratios.append([row[kind].get(s, NAN) / other[kind].get(s, NAN) for s in signals])
     return np.array(ratios).reshape(-1, len(signals))
 
 
-def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Table:
+def summary_table(
+    summaries: Sequence[Mapping[str, Any]], title: str, notes: Sequence[str]
+) -> Table:
     """Make the table of `summary`."""
-    signals = next((one["signals"] for one in summaries if one["signals"]), HELD_OUT)
-    columns = ["method", "joints", "below", "median", *signals, "over plain", "moving", "bias [%]"]
-    columns += ["|bias| [%]", "repeat 95 %", "total 95 %", "fit [s]"]
-    made = console.table(title, columns, caption=caption)
-
-    def coverage(one: Mapping[str, Any]) -> str:
-        if not one["intervals"]:
-            return "none"
-        return f"{one['covered']} of {one['intervals']} (+-{one['half_width']:.2f} %)"
-
-    for one in summaries:
-        known = np.isfinite(one["bias"]).all()
-        refused = f", {one['refused']} refused" if one["refused"] else ""
-        made.add_row(
-            one["method"],
-            f"{one['joints']}{refused}",
-            f"{one['below']}",
-            f"{one['median']:.2f}",
-            *(f"{one['signals'].get(name, float('nan')):.2f}" for name in signals),
-            f"{one['over_plain']:.3f}",
-            f"{one['moving']:.3f}",
-            "{:+.1f} / {:+.1f}".format(*one["bias"]) if known else "none",
-            "{:.1f} / {:.1f}".format(*one["absolute"]) if known else "none",
-            coverage(one["repeat"]),
-            coverage(one["total"]),
-            f"{one['seconds']:.1f}",
+    signals: Sequence[str] = HELD_OUT
+    for entry in summaries:
+        if entry["signals"]:
+            signals = tuple(entry["signals"])
+            break
+    columns = [
+        Column(heading="method"),
+        Column(heading="joints"),
+        Column(heading="refused"),
+        Column(heading="below"),
+        Column(heading="median", digits=2),
+    ]
+    columns += [Column(heading=name, digits=2) for name in signals]
+    columns += [
+        Column(heading="over plain"),
+        Column(heading="moving"),
+        Column(heading="bias, stiffness", unit="%", digits=1),
+        Column(heading="bias, damping", unit="%", digits=1),
+        Column(heading="|bias|, stiffness", unit="%", digits=1),
+        Column(heading="|bias|, damping", unit="%", digits=1),
+        Column(heading="repeat 95 %"),
+        Column(heading="total 95 %"),
+        Column(heading="fit", unit="s", digits=1),
+    ]
+    rows: list[tuple[Cell, ...]] = []
+    for entry in summaries:
+        by_signal = [entry["signals"].get(name, NAN) for name in signals]
+        rows.append(
+            (
+                entry["method"],
+                entry["joints"],
+                entry["refused"],
+                entry["below"],
+                entry["median"],
+                *by_signal,
+                entry["over_plain"],
+                entry["moving"],
+                *entry["bias"],
+                *entry["absolute"],
+                coverage_text(entry["repeat"]),
+                coverage_text(entry["total"]),
+                entry["seconds"],
+            )
         )
-    return made
+    return Table(title=title, columns=tuple(columns), rows=tuple(rows), notes=tuple(notes))
+
+
+def coverage_text(covered: Mapping[str, Any]) -> str:
+    """Text of a coverage, with the half-width of the intervals."""
+    if not covered["intervals"]:
+        return "none"
+    half_width = covered["half_width"]
+    return f"{covered['covered']} of {covered['intervals']} (+-{half_width:.2f} %)"
 
 
 def match(
@@ -373,41 +472,51 @@ def match(
             but mujoco.sysid, whose rig here is one joint.
         jobs: Processes, a robot each.
     """
-    begin, known = time.perf_counter(), methods()
+    begin = time.perf_counter()
     joints = joints or JOINTS
-    names = ON_ARM if arm else tuple(known)
-    if unknown := set(method) - set(names):
+    names = ON_ARM if arm else tuple(methods())
+    unknown = set(method) - set(names)
+    if unknown:
         raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(names)}.")
     wanted = {NOMINAL, PLAIN, *(method or names)}
-    names = tuple(name for name in known if name in wanted)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     with console.progress() as report:
         try:
-            virtual = run(robots, seed, report, joints=joints, names=names, folder=cache, jobs=jobs)
-            for more in [on_recordings(arm, report, wanted)] if arm else virtual:
-                rows += more
+            if arm:
+                rows = on_recordings(arm, report, wanted)
+            else:
+                chosen = [name for name in names if name in wanted]
+                for robot_rows in run(
+                    robots, seed, report, joints=joints, names=chosen, folder=cache, jobs=jobs
+                ):
+                    rows += robot_rows
         except KeyboardInterrupt:
             console.warn("interrupted")
-    found = {
+    summaries = summary(rows)
+    computer = machine("mujoco")
+    seconds = time.perf_counter() - begin
+    count = len({row["robot"] for row in rows})
+    figures = {
         "schema": "pronk/bench-match/4",
         "seed": seed,
-        "robots": len({row["robot"] for row in rows}),
-        "summary": (summaries := summary(rows)),
+        "robots": count,
+        "summary": summaries,
         "rows": rows,
-        "machine": (computer := machine("mujoco")),
-        "seconds": time.perf_counter() - begin,
+        "machine": computer,
+        "seconds": seconds,
     }
-    title = "a real SO-101, fitted to " + ", ".join(FITTED)
-    if not arm:
-        title = f"{found['robots']} virtual robots, seed {seed}, {', '.join(joints)} of one leg"
-    caption = (
+    title = f"{count} virtual robots, seed {seed}, {', '.join(joints)} of one leg"
+    if arm:
+        title = "a real SO-101, fitted to " + ", ".join(FITTED)
+    notes = (
         "joints: with a result. below: joints whose held-out RMSE (geometric mean over the "
         "signals) is below that of the nominal gains with delay; median and medians of each "
-        "signal: of that ratio. over plain: geometric mean of the RMSE over the plain fit's; "
-        "moving: the same without the mean error of each signal, which is sag under gravity. "
-        "bias, |bias|: mean, median of the absolute value, of stiffness / damping, against the "
-        "same method on a noise-free chirp of a third amplitude. repeat, total: intervals of both "
-        "gains that contain those; in brackets the median half-width. One thread; "
-        f"{computer['processor']}, MuJoCo {computer['mujoco']}; {found['seconds']:.0f} s in all."
+        "signal: of that ratio.",
+        "over plain: geometric mean of the RMSE over the plain fit's; moving: the same without the "
+        "mean error of each signal, which is sag under gravity.",
+        "bias, |bias|: mean and median of the absolute value, against the same method on a "
+        "noise-free chirp of a third amplitude. repeat, total: intervals of both gains that "
+        "contain those; in brackets the median half-width.",
+        f"One thread; {computer['processor']}, MuJoCo {computer['mujoco']}; {seconds:.0f} s.",
     )
-    return finish(found, show(summaries, title, caption))
+    return finish(figures, summary_table(summaries, title, notes))
