@@ -170,9 +170,10 @@ def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Itera
         row["rmse"] = {}
         row["moving"] = {}
         for signal, recording in zip(HELD_OUT, held_out, strict=True):
-            error = simulated(rigs, recording, [result.values])[0] - recording.positions[0]
-            row["rmse"][signal] = float(np.sqrt(np.mean(error**2)))
-            row["moving"][signal] = float(error.std())
+            position = simulated(rigs, recording, [result.values])[0]
+            difference = position - recording.positions[0]
+            row["rmse"][signal] = float(np.sqrt(np.mean(difference**2)))
+            row["moving"][signal] = float(difference.std())
         if name != NOMINAL:
             try:
                 row["exact"] = dict(fit(rigs, logs.exact, logs.joint).values)
