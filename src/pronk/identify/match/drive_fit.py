@@ -26,7 +26,8 @@ simulation: `pronk.identify.match.torque_fit`, with the same result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import copy
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -112,19 +113,19 @@ def fit_drives(
     if progress is not None:
         replay = CountedReplay(replay, 2 * EVALUATIONS * (1 + len(parameters)), progress)
     free = {joint: replay.fittable(joint, parameters) for joint in replay.joints}
-    held: dict[str, tuple[str, ...]] = dict.fromkeys(replay.joints, ())
+    held_names: dict[str, tuple[str, ...]] = dict.fromkeys(replay.joints, ())
     everything = [np.ones(len(recording.time), dtype=bool) for recording in replay.recordings]
 
     best = _fit_from_nominal(replay, everything, free, nominal)
     while True:
         estimates = _estimates(best)
-        not_known = _parameters_to_hold(best, estimates, held, unidentified)
+        not_known = _parameters_to_hold(best, estimates, held_names, unidentified)
         if not not_known:
             break
         start = best.drives()
         fitted = dict(best.vector.fitted)
         for joint, name in not_known:
-            held[joint] = (*held[joint], name)
+            held_names[joint] = (*held_names[joint], name)
             start[joint][name] = nominal[joint][name]
             fitted[joint] = tuple(other for other in fitted[joint] if other != name)
         best = minimize_residuals(Residuals(replay, everything, DriveVector(fitted, start)))
@@ -133,7 +134,7 @@ def fit_drives(
     fits = {}
     for joint in replay.joints:
         fits[joint] = _drive_fit(
-            joint, best, estimates[joint], nominal, held[joint], held_out.get(joint, {})
+            joint, best, estimates[joint], nominal, held_names[joint], held_out.get(joint, {})
         )
     return fits
 
@@ -189,24 +190,20 @@ def _fit_from_nominal(
     A fit settles badly if it runs out of evaluations, ends at a bound of the search, or is hardly
     better than where it began. It then begins at `OTHER_STARTS` too, and the best counts.
     """
-    delay = {}
-    others = {}
-    for joint, names in fitted.items():
-        delay[joint] = tuple(name for name in names if name == "delay")
-        others[joint] = tuple(name for name in names if name != "delay")
+    delay = _restricted(fitted, ["delay"])
     vector = DriveVector(delay, _raised(nominal, delay))
     delayed = minimize_residuals(Residuals(replay, samples, vector))
+    others = _restricted(fitted, [name for name in PARAMETERS if name != "delay"])
     start = _raised(delayed.drives(), others)
     best = minimize_residuals(Residuals(replay, samples, DriveVector(fitted, start)))
     at_bound = any(best.at_bound(joint) for joint in fitted)
     if best.settled and not at_bound and best.cost < SETTLED_WELL**2 * delayed.cost:
         return best
     for factor in OTHER_STARTS:
-        other_start = {joint: dict(values) for joint, values in start.items()}
-        for joint, names in fitted.items():
-            for name in GAINS:
-                if name in names:
-                    other_start[joint][name] *= factor
+        other_start = copy.deepcopy(start)
+        for joint, names in _restricted(fitted, GAINS).items():
+            for name in names:
+                other_start[joint][name] *= factor
         vector = DriveVector(fitted, other_start)
         optimum = minimize_residuals(Residuals(replay, samples, vector))
         if optimum.cost < best.cost:
@@ -214,13 +211,24 @@ def _fit_from_nominal(
     return best
 
 
+def _restricted(
+    fitted: Mapping[str, Sequence[str]], allowed: Collection[str]
+) -> dict[str, tuple[str, ...]]:
+    """Choose of the fitted parameters of each joint those that are allowed."""
+    restricted = {}
+    for joint, names in fitted.items():
+        restricted[joint] = tuple(name for name in names if name in allowed)
+    return restricted
+
+
 def _raised(
     drives: DriveValues, fitted: Mapping[str, Sequence[str]]
 ) -> dict[str, dict[str, float]]:
     """Raise fitted parameters to where a search may begin (`Parameter.start`)."""
-    raised = {joint: dict(values) for joint, values in drives.items()}
-    for joint, names in fitted.items():
-        for name in names:
+    raised = {}
+    for joint, values in drives.items():
+        raised[joint] = dict(values)
+        for name in fitted.get(joint, ()):
             raised[joint][name] = max(raised[joint][name], PARAMETERS[name].start)
     return raised
 
@@ -259,7 +267,7 @@ def _estimates(optimum: Optimum) -> dict[str, Estimate]:
 def _parameters_to_hold(
     optimum: Optimum,
     estimates: Mapping[str, Estimate],
-    held: Mapping[str, Sequence[str]],
+    held_names: Mapping[str, Sequence[str]],
     unidentified: Unidentified,
 ) -> list[tuple[str, str]]:
     """Joints and parameters to hold at the nominal value, because they are not identified.
@@ -276,31 +284,36 @@ def _parameters_to_hold(
     fitted = optimum.vector.fitted
     unknown: dict[str, list[str]] = {}
     early = False
-    for joint, known in estimates.items():
-        names = list(known.unidentified)
+    for joint, joint_estimate in estimates.items():
+        names = list(joint_estimate.unidentified)
         if unidentified == "refuse":
-            names += _confused_parameters(optimum, joint)
+            for name in _confused_parameters(optimum, joint):
+                if name not in names:
+                    names.append(name)
         if names:
-            unknown[joint] = [name for name in fitted[joint] if name in names]
-        if "delay" in known.ci95:
-            low, high = known.ci95["delay"]
-            early = early or low < known.values["delay"] < 0.0 < high
+            unknown[joint] = sorted(names, key=fitted[joint].index)
+        if "delay" in joint_estimate.ci95:
+            low, high = joint_estimate.ci95["delay"]
+            early = early or low < joint_estimate.values["delay"] < 0.0 < high
     if unidentified == "hold":
-        delayed = [joint for joint, names in fitted.items() if "delay" in names]
+        delay = [(joint, "delay") for joint, names in fitted.items() if "delay" in names]
         delay_unknown = any("delay" in names for names in unknown.values())
-        others_remain = all(len(fitted[joint]) > 1 for joint in delayed)
+        others_remain = all(len(fitted[joint]) > 1 for joint, _ in delay)
         if (delay_unknown or early) and others_remain:
-            return [(joint, "delay") for joint in delayed]
+            return delay
     if not unknown:
         return []
     cannot_hold = unidentified == "refuse"
     for joint in unknown:
-        count = len({*held[joint]} - {"delay"})
+        count = len({*held_names[joint]} - {"delay"})
         if count >= MOST_HELD or len(fitted[joint]) == 1:
             cannot_hold = True
     if cannot_hold:
         raise _not_identified(unknown)
-    return [(joint, min(names, key=HOLD_FIRST.index)) for joint, names in unknown.items()]
+    to_hold = []
+    for joint, names in unknown.items():
+        to_hold.append((joint, min(names, key=HOLD_FIRST.index)))
+    return to_hold
 
 
 def _not_identified(unknown: Mapping[str, Sequence[str]]) -> IdentifiabilityError:
@@ -352,12 +365,11 @@ def _held_out_errors(
     best_drives = best.drives()
     drives: list[DriveValues] = [nominal]
     for allowed in (("delay",), PLAIN, tuple(PARAMETERS)):
-        chosen = {}
+        chosen = _restricted(fitted, allowed)
         start = {}
-        for joint, names in fitted.items():
-            chosen[joint] = tuple(name for name in names if name in allowed)
+        for joint, names in chosen.items():
             start[joint] = dict(nominal[joint])
-            for name in chosen[joint]:
+            for name in names:
                 start[joint][name] = best_drives[joint][name]
         residuals = Residuals(replay, training, DriveVector(chosen, start))
         drives.append(minimize_residuals(residuals).drives())
@@ -374,9 +386,9 @@ def _held_out_errors(
 def _drive_fit(
     joint: str,
     best: Optimum,
-    known: Estimate,
+    joint_estimate: Estimate,
     nominal: DriveValues,
-    held: tuple[str, ...],
+    held_names: tuple[str, ...],
     held_out: Mapping[str, float],
 ) -> DriveFit:
     """Put the findings of one joint together."""
@@ -386,12 +398,12 @@ def _drive_fit(
     by_amplitude = _gains_by_amplitude(joint, best)
     return DriveFit(
         joint=joint,
-        values=known.values,
-        sd=known.sd,
-        ci95=known.ci95,
-        total95=_total95(joint, best, known, by_amplitude),
-        covariance=known.covariance,
-        held=held,
+        values=joint_estimate.values,
+        sd=joint_estimate.sd,
+        ci95=joint_estimate.ci95,
+        total95=_total95(joint, best, joint_estimate, by_amplitude),
+        covariance=joint_estimate.covariance,
+        held=held_names,
         at_bound=best.at_bound(joint),
         held_out=held_out,
         amplitude_gains=by_amplitude,
@@ -400,35 +412,38 @@ def _drive_fit(
         settled=best.settled,
         flags=(
             *held_out_flags(held_out),
-            *_parameter_flags(joint, best, known, held),
+            *_parameter_flags(joint, best, joint_estimate, held_names),
             *residuals.replay.remarks(joint),
             *amplitude_flags(by_amplitude),
         ),
     )
 
 
-def _parameter_flags(joint: str, best: Optimum, known: Estimate, held: Sequence[str]) -> list[str]:
+def _parameter_flags(
+    joint: str, best: Optimum, joint_estimate: Estimate, held_names: Sequence[str]
+) -> list[str]:
     """Say which parameters of a joint were held, are at a bound, uncertain or impossible."""
+    values = joint_estimate.values
     flags = []
-    for name in held:
+    for name in held_names:
         flags.append(
-            f"{name} held at {known.values[name]:.4g}: these recordings do not identify it; "
+            f"{name} held at {values[name]:.4g}: these recordings do not identify it; "
             f"{PARAMETERS[name].remedy}"
         )
     at_bound = best.at_bound(joint)
     for name in at_bound:
         unit = PARAMETERS[name].unit
-        flags.append(f"{name} at the bound of the search, {known.values[name]:.3g} {unit}")
-    for name in known.unidentified:
+        flags.append(f"{name} at the bound of the search, {values[name]:.3g} {unit}")
+    for name in joint_estimate.unidentified:
         if name not in at_bound:
             flags.append(
-                f"{name} is not identified (deviation {known.sd[name]:.2g}); "
+                f"{name} is not identified (deviation {joint_estimate.sd[name]:.2g}); "
                 f"{PARAMETERS[name].remedy}"
             )
-    if "delay" in known.ci95 and known.ci95["delay"][1] < 0.0:
+    if "delay" in joint_estimate.ci95 and joint_estimate.ci95["delay"][1] < 0.0:
         flags.append(
-            f"delay {1e3 * known.values['delay']:.1f} ms: the log has the command later than the "
-            "drive had it; 0 in the gains, which hold for earlier commands"
+            f"delay {1e3 * values['delay']:.1f} ms: the log has the command later than the drive "
+            "had it; 0 in the gains, which hold for earlier commands"
         )
     if not best.settled:
         flags.append("the fit in time did not settle")
@@ -460,7 +475,7 @@ def _gains_by_amplitude(joint: str, best: Optimum) -> Array:
 
 
 def _total95(
-    joint: str, best: Optimum, known: Estimate, by_amplitude: Array
+    joint: str, best: Optimum, joint_estimate: Estimate, by_amplitude: Array
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of a joint that cover what the model does not explain.
 
@@ -468,9 +483,13 @@ def _total95(
     """
     residuals = best.residuals
     if len(by_amplitude) == 0:
-        return dict(known.ci95)
+        return dict(joint_estimate.ci95)
     columns = best.vector.columns[joint]
     moves = block_moves(best.jacobian, best.residual, residuals.block)
     return total_intervals(
-        best.vector.fitted[joint], best.x[columns], known.ci95, moves[:, columns], by_amplitude
+        best.vector.fitted[joint],
+        best.x[columns],
+        joint_estimate.ci95,
+        moves[:, columns],
+        by_amplitude,
     )

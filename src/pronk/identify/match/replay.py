@@ -96,16 +96,23 @@ class JointReplay(Replay):
 
     def positions(self, sets: Sequence[DriveValues]) -> list[list[Array]]:
         """Simulate all recordings with several drives; see `Replay.positions`."""
-        drives = [drives[self.joints[0]] for drives in sets]
-        keys = [tuple(drive[name] for name in self._names) for drive in drives]
-        self._simulate([key for key in dict.fromkeys(keys) if key not in self._tracks])
+        keys = []
+        new_keys = []
+        for drives in sets:
+            drive = drives[self.joints[0]]
+            key = tuple(drive[name] for name in self._names)
+            keys.append(key)
+            if key not in self._tracks and key not in new_keys:
+                new_keys.append(key)
+        self._simulate(new_keys)
         results = []
-        for drive, key in zip(drives, keys, strict=True):
+        for drives, key in zip(sets, keys, strict=True):
+            delay = drives[self.joints[0]]["delay"]
             positions = []
             for recording in self.recordings:
                 trace = self._traces[recording.command]
                 end = (len(trace.command) - 1) * trace.timestep
-                instants = np.clip(recording.time - drive["delay"], 0.0, end)
+                instants = np.clip(recording.time - delay, 0.0, end)
                 positions.append(self._tracks[key][recording.command](instants))
             results.append(positions)
         return results
