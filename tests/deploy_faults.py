@@ -14,7 +14,7 @@ import numpy as np
 from pronk.deploy.links.address import Address
 from pronk.deploy.runtime.plan import Link
 from pronk.errors import HardwareError
-from pronk.robots.machine import Command, State
+from pronk.robots.machine import Command, Machine, State, TorqueKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,40 +38,53 @@ class FaultyLink(Link):
 class Faulty:
     """The virtual robot behind a bad link. Implements `Machine`."""
 
-    def __init__(self, inner: Any, link: FaultyLink) -> None:
-        self.inner, self.link = inner, link
-        self.robot, self.virtual, self.torque_kind = inner.robot, True, inner.torque_kind
-        self.state_rate_hz, self.now, self.clamp = inner.state_rate_hz, inner.now, inner.clamp
+    virtual = True
+
+    def __init__(self, inner: Machine, link: FaultyLink) -> None:
+        self.inner = inner
+        self.link = link
+        self.robot = inner.robot
+        self.torque_kind: TorqueKind = inner.torque_kind
+        self.state_rate_hz = inner.state_rate_hz
         self._rng = np.random.default_rng(0)
-        self._last: State | None = None
+        self._newest: State | None = None
 
     def connect(self) -> None:
         self.inner.connect()
         self._wire = self.link.wire.open("w", buffering=1)
 
+    def now(self) -> float:
+        return self.inner.now()
+
     def latest(self) -> State:
-        return self._last or self.inner.latest()
+        return self._newest or self.inner.latest()
 
     def wait(self, until: float) -> list[State]:
-        on = {name for name, event in self.link.faults.items() if event.is_set()}
-        if "broken" in on:
+        active = {name for name, event in self.link.faults.items() if event.is_set()}
+        if "broken" in active:
             raise HardwareError("the cable was pulled out.")
-        met = [state for state in self.inner.wait(until) if self._rng.random() >= self.link.loss]
-        if "freeze" in on:
-            met = []
-        if "nan" in on:
-            wrong = np.where(np.arange(12) == 3, math.nan, 0.0)
-            met = [replace(state, velocity=state.velocity + wrong) for state in met]
-        if "stuck" in on and self._last is not None:
-            old = self._last
-            met = [replace(old, time=state.time, sequence=state.sequence) for state in met]
-        if met:
-            self._last = met[-1]
-        return met
+        states = []
+        for state in self.inner.wait(until):
+            if self._rng.random() >= self.link.loss:
+                states.append(state)
+        if "freeze" in active:
+            states = []
+        if "nan" in active:
+            spoilt = np.where(np.arange(12) == 3, math.nan, 0.0)
+            states = [replace(state, velocity=state.velocity + spoilt) for state in states]
+        if "stuck" in active and self._newest is not None:
+            newest = self._newest
+            states = [replace(newest, time=s.time, sequence=s.sequence) for s in states]
+        if states:
+            self._newest = states[-1]
+        return states
 
     def send(self, command: Command) -> None:
         self._write("send")
         self.inner.send(command)
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        self.inner.clamp(joints)
 
     def damp(self) -> None:
         self._write("damp")
@@ -81,11 +94,18 @@ class Faulty:
         self.inner.close()
         self._wire.close()
 
-    def _write(self, what: str) -> None:
-        self._wire.write(f"{time.monotonic():.6f} {what}\n")
+    def _write(self, action: str) -> None:
+        self._wire.write(f"{time.monotonic():.6f} {action}\n")
 
 
 def writes(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """When something was written [s], and whether it was damping."""
-    rows = [line.split() for line in path.read_text().splitlines() if line[-4:] in ("send", "damp")]
-    return np.array([float(row[0]) for row in rows]), np.array([row[1] == "damp" for row in rows])
+    times = []
+    damps = []
+    for line in path.read_text().splitlines():
+        # The last line may be cut.
+        if line.endswith((" send", " damp")):
+            time_text, action = line.split()
+            times.append(float(time_text))
+            damps.append(action == "damp")
+    return np.array(times), np.array(damps)

@@ -34,14 +34,14 @@ def met(
     seconds: float,
     modes: tuple[Mode, ...],
     *requests: OperatorRequest,
-    **more: Any,
+    **inputs: Any,
 ) -> bool:
     """Hold the dead-man button until one of some modes comes, or for a time; whether it came."""
-    left = list(requests)
+    waiting = list(requests)
     until = time.monotonic() + seconds
     while time.monotonic() < until:
-        request = left.pop(0) if left else OperatorRequest.NONE
-        deployment.write(OperatorCommand(request=request, dead_man=True, **more))
+        request = waiting.pop(0) if waiting else OperatorRequest.NONE
+        deployment.write(OperatorCommand(request=request, dead_man=True, **inputs))
         if deployment.mode in modes:
             return True
         time.sleep(0.01)
@@ -53,11 +53,14 @@ def hold(
     seconds: float,
     mode: Mode | None = None,
     *requests: OperatorRequest,
-    **more: Any,
+    **inputs: Any,
 ) -> None:
     """Hold the dead-man button until a mode comes, or for a time."""
-    found = met(deployment, seconds, () if mode is None else (mode,), *requests, **more)
-    assert mode is None or found, f"{mode.name} did not come: {notified(deployment)}"
+    if mode is None:
+        met(deployment, seconds, (), *requests, **inputs)
+        return
+    came = met(deployment, seconds, (mode,), *requests, **inputs)
+    assert came, f"{mode.name} did not come: {notified(deployment)}"
 
 
 def notified(deployment: Deployment) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from command_line import accepted
+from deploy_records import set_fields
 from pronk.deploy.runtime.deploy_log import read_deploy_log
 from pronk.deploy.runtime.log import DeployLogWriter
 from pronk.deploy.runtime.modes import Mode
@@ -34,18 +35,34 @@ TICK_S = 0.002
 
 def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
     """A tick in which all goes well; the joints do not move."""
-    one, begun = np.zeros((), dtype=TICK), number * TICK_S
-    measured = {n: changes.pop(n) for n in ("torque", "orientation", "temperature") if n in changes}
-    put_state(one, still(time=begun, sequence=number, **measured))
-    usual = {"tick": number, "deadline": begun, "begun": begun + 1e-4, "done": begun + 4e-4}
-    usual |= {"mode": Mode.POLICY, "latency": np.nan, "desired": target, "sent": target}
-    for name, value in (usual | changes).items():
-        one[name] = value
-    return np.frombuffer(one.tobytes(), dtype=TICK)[0]
+    tick = np.zeros((), dtype=TICK)
+    begun = number * TICK_S
+    put_state(tick, still(time=begun, sequence=number))
+    tick["temperature"] = np.nan
+    tick["tick"] = number
+    tick["deadline"] = begun
+    tick["begun"] = begun + 1e-4
+    tick["done"] = begun + 4e-4
+    tick["mode"] = Mode.POLICY
+    tick["latency"] = np.nan
+    tick["desired"] = target
+    tick["sent"] = target
+    set_fields(tick, **changes)
+    return np.frombuffer(tick.tobytes(), dtype=TICK)[0]
 
 
-def say(writer: DeployLogWriter, at: float, kind: str, text: str, **more: int) -> None:
-    writer.write(np.frombuffer(event_record(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
+def say(
+    writer: DeployLogWriter,
+    at: float,
+    event_kind: str,
+    text: str,
+    *,
+    reason: int = 0,
+    level: int = 0,
+) -> None:
+    """Write an event."""
+    event = event_record(at, event_kind, text, reason=reason, level=level)
+    writer.write(np.frombuffer(event.tobytes(), dtype=EVENT)[0])
 
 
 def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
@@ -55,13 +72,18 @@ def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
     writer = DeployLogWriter(path, HEADER)
     say(writer, 0.0, "robot", VIRTUAL)
     for k in range(count):
-        known = {"torque": KP * (desired[max(k - lag, 0)] - POSE)}
-        known |= {"latency": 0.003} if k % 10 == 0 else {}
-        writer.write(record(k, desired[k], **(known | changes)))
+        fields: dict[str, Any] = {"torque": KP * (desired[max(k - lag, 0)] - POSE)}
+        if k % 10 == 0:
+            fields["latency"] = 0.003
+        fields.update(changes)
+        writer.write(record(k, desired[k], **fields))
         if k % 10 == 0:
             step = np.zeros((), dtype=STEP)
-            step["sequence"], step["begun"], step["live"] = k // 10, k * TICK_S, 1
-            step["deadline"], step["inferred"] = k * TICK_S, 1e-4
+            step["sequence"] = k // 10
+            step["begun"] = k * TICK_S
+            step["deadline"] = k * TICK_S
+            step["inferred"] = 1e-4
+            step["live"] = 1
             step["jump"] = 100 <= k < 200
             writer.write(np.frombuffer(step.tobytes(), dtype=STEP)[0])
     writer.end(complete=True, figures={})
@@ -72,17 +94,26 @@ def faulted(path: Path, *, end: bool = True) -> Path:
     """0.2 s standing, 0.2 s policy with moved targets, then a fault of the tilt."""
     writer = DeployLogWriter(path, HEADER)
     say(writer, 0.0, "robot", REAL)
-    moved = POSE + np.eye(12)[5] * 0.25
-    limited = {"level": FilterAction.LIMIT, "reason": Reason.POSITION, "sent": POSE}
-    damped = {"sent": np.nan, "desired": np.nan, "damped": 1, "mode": Mode.FAULT}
-    damped |= {"level": FilterAction.LATCH, "reason": Reason.TILT, "orientation": rolled(1.0)}
     for k in range(100):
         writer.write(record(k, POSE + 0.01, mode=Mode.STAND))
+    moved = POSE + np.eye(12)[5] * 0.25
     for k in range(100, 200):
-        writer.write(record(k, moved, **limited))
+        limited = record(k, moved, level=FilterAction.LIMIT, reason=Reason.POSITION, sent=POSE)
+        writer.write(limited)
     say(writer, 0.4, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)
     for k in range(200, 300):
-        writer.write(record(k, POSE, **damped))
+        damped = record(
+            k,
+            POSE,
+            mode=Mode.FAULT,
+            level=FilterAction.LATCH,
+            reason=Reason.TILT,
+            orientation=rolled(1.0),
+            desired=np.nan,
+            sent=np.nan,
+            damped=1,
+        )
+        writer.write(damped)
     if end:
         writer.end(complete=True, figures={})
     else:
@@ -91,8 +122,8 @@ def faulted(path: Path, *, end: bool = True) -> Path:
 
 
 def test_quantiles_are_those_of_the_sorted_values() -> None:
-    found = quantiles(np.r_[np.arange(1000, 0, -1), np.nan])
-    assert list(found.values()) == [1000, 500.0, 950.0, 990.0, 999.0, 1000.0]
+    thousand = quantiles(np.r_[np.arange(1000, 0, -1), np.nan])
+    assert list(thousand.values()) == [1000, 500.0, 950.0, 990.0, 999.0, 1000.0]
     few = quantiles(np.arange(50.0))
     assert math.isnan(few["p99"])
     assert few["p95"] == 47.0
@@ -102,29 +133,32 @@ def test_quantiles_are_those_of_the_sorted_values() -> None:
 @pytest.mark.parametrize("lag", [1, 2, 4])
 def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
     path = flown(tmp_path / "run.mcap", lag=lag)
-    log, made = read_deploy_log(path), deploy_part(path)
+    log = read_deploy_log(path)
+    page_part = deploy_part(path)
     # A state at tick k sees the target sent at tick k - lag, on the wire 0.4 ms after the tick:
     # right for every shift between (lag - 1) ticks and lag ticks, less 0.4 ms.
     latest = lag * TICK_S - 4e-4
-    found = drive_delay(log, ROBOT)
-    np.testing.assert_allclose(found, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
-    assert measured_delay(log, ROBOT).longest == pytest.approx(0.003 + found[1])
+    drives = drive_delay(log, ROBOT)
+    np.testing.assert_allclose(drives, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
+    assert measured_delay(log, ROBOT).longest == pytest.approx(0.003 + drives[1])
     # A delay beyond that of training is a warning.
-    assert (made.figures["delay"]["within"], made.warning) == (lag < 4, lag >= 4)
+    assert page_part.figures["delay"]["within"] is (lag < 4)
+    assert page_part.warning is (lag >= 4)
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
     path = flown(tmp_path / "run.mcap", torque=np.full(12, np.nan))
-    found = measured_delay(read_deploy_log(path), ROBOT)
-    assert np.isnan(found.drives).all()
-    assert (found.longest, found.within) == (pytest.approx(0.003), True)
+    delay = measured_delay(read_deploy_log(path), ROBOT)
+    assert np.isnan(delay.drives).all()
+    assert delay.longest == pytest.approx(0.003)
+    assert delay.within
 
 
 def test_measures_of_a_fault(tmp_path: Path) -> None:
     log = read_deploy_log(faulted(tmp_path / "run.mcap"))
-    found = deploy_run.stretches(log)
-    assert [stretch.mode for stretch in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
-    np.testing.assert_allclose([stretch.seconds for stretch in found], 0.2, atol=1e-9)
+    stretches = deploy_run.stretches(log)
+    assert [stretch.mode for stretch in stretches] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
+    np.testing.assert_allclose([stretch.seconds for stretch in stretches], 0.2, atol=1e-9)
     moved, latched = deploy_run.interventions(log)
     assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
     assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
@@ -156,24 +190,32 @@ def test_the_hottest_motor_is_named(tmp_path: Path) -> None:
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
     path = faulted(tmp_path / "run.mcap", end=False)
     path.write_bytes(path.read_bytes()[:-20])
-    made = deploy_part(path)
-    assert made.figures["complete"] is False
-    assert made.warning
-    assert "The log was cut" in build.page("cut", [made])
+    page_part = deploy_part(path)
+    assert page_part.figures["complete"] is False
+    assert page_part.warning
+    assert "The log was cut" in build.page("cut", [page_part])
 
 
 def test_the_page_of_a_refusal_with_missed_ticks(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     writer = DeployLogWriter(path, HEADER | {"robot": "unheard_of"})
-    nothing = {"desired": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
     for k in (0, 1, 2, 5, 6, 10):
-        writer.write(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
+        tick = record(
+            k,
+            POSE,
+            mode=Mode.PREFLIGHT,
+            desired=np.nan,
+            sent=np.nan,
+            bus_voltage=np.nan,
+            orientation=np.zeros(4),
+        )
+        writer.write(tick)
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
-    made = deploy_part(path)
-    assert made.summary.endswith("the battery gives 12.0 V; charge it.")
-    assert made.figures["delay"]["within"] is None
-    assert made.figures["missed_ticks"] == 5
+    page_part = deploy_part(path)
+    assert page_part.summary.endswith("the battery gives 12.0 V; charge it.")
+    assert page_part.figures["delay"]["within"] is None
+    assert page_part.figures["missed_ticks"] == 5
 
 
 def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
@@ -184,11 +226,9 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     flown(tmp_path / "deep" / "b.mcap")
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
-    _, found = build.write_report(tmp_path)
-    assert [(one.source, one.virtual) for one in found] == [
-        ("a.mcap", False),
-        ("deep/b.mcap", True),
-    ]
-    assert found[1].figures["delay"]["within"] is True
+    _, (upper, deep) = build.write_report(tmp_path)
+    assert (upper.source, upper.virtual) == ("a.mcap", False)
+    assert (deep.source, deep.virtual) == ("deep/b.mcap", True)
+    assert deep.figures["delay"]["within"] is True
     with pytest.raises(LogError, match="not a log of a deployment"):
         build.write_report(tmp_path / "other.mcap")

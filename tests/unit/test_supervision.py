@@ -25,7 +25,8 @@ def moving(seconds: float, seed: int = 0) -> Iterator[State]:
     """A trunk that rolls by 0.1 rad at 2 Hz and joints that swing at 2.5 Hz, each by its own."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * math.pi, 12)
-    w, u = 2.0 * math.pi * 2.0, 2.0 * math.pi * 2.5
+    w = 2.0 * math.pi * 2.0
+    u = 2.0 * math.pi * 2.5
     for k in range(round(seconds / DT)):
         t = k * DT
         roll = 0.1 * math.sin(w * t)
@@ -43,7 +44,7 @@ def moving(seconds: float, seed: int = 0) -> Iterator[State]:
         )
 
 
-def wanted(position: np.ndarray, t: float) -> Command:
+def targeted(position: np.ndarray, t: float) -> Command:
     return Command(position=position, stiffness=KP, damping=KD, made=t, valid_for=0.05)
 
 
@@ -54,7 +55,7 @@ def judged(
     safety = SafetyFilter(limits=limits)
     for state in states:
         target = POSE + swing * math.sin(2.0 * math.pi * 2.5 * state.time)
-        sent, decision = safety.judge([state], wanted(target, state.time), state.time)
+        sent, decision = safety.judge([state], targeted(target, state.time), state.time)
         if sent is None:
             assert decision.reason.level >= FilterAction.DAMP
             return decision.reason, state.time
@@ -110,9 +111,11 @@ def test_a_faulty_sensor_is_found(fault: str) -> None:
 
 def stopped(sound: State, state: State) -> State:
     """A joint's encoder is constant, and its velocity nearly zero."""
-    q, v = state.position.copy(), state.velocity.copy()
-    q[3], v[3] = sound.position[3], 0.01
-    return replace(state, position=q, velocity=v)
+    position = state.position.copy()
+    velocity = state.velocity.copy()
+    position[3] = sound.position[3]
+    velocity[3] = 0.01
+    return replace(state, position=position, velocity=velocity)
 
 
 def drifting(_: State, state: State) -> State:
@@ -135,8 +138,8 @@ def lying(_: State, state: State) -> State:
 def test_a_sensor_that_others_contradict_is_found(
     change: Callable[[State, State], State], reason: Reason, within: float
 ) -> None:
-    found, when = judged(spoil(change), swing=0.0)
-    assert found is reason
+    found_reason, when = judged(spoil(change), swing=0.0)
+    assert found_reason is reason
     assert when - BEGINS <= within
 
 
@@ -152,12 +155,14 @@ def test_on_a_stand_other_legs_may_be_clamped_and_no_inertial_unit_is_needed() -
 def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> None:
     safety = SafetyFilter(limits=LIMITS)
     for state in moving(0.28):
-        q, v = state.position.copy(), state.velocity.copy()
-        q[4], v[4] = POSE[4] + speed * (state.time - 0.1), speed + 0.01 * state.gyro[1]
+        position = state.position.copy()
+        velocity = state.velocity.copy()
+        position[4] = POSE[4] + speed * (state.time - 0.1)
+        velocity[4] = speed + 0.01 * state.gyro[1]
         far = POSE.copy()
-        far[4] = q[4] + 2.0 * ROBOT.joints[4].drive.effort_limit / KP[4]
-        state = replace(state, position=q, velocity=v)
-        sent, decision = safety.judge([state], wanted(far, state.time), state.time)
+        far[4] = position[4] + 2.0 * ROBOT.joints[4].drive.effort_limit / KP[4]
+        state = replace(state, position=position, velocity=velocity)
+        sent, decision = safety.judge([state], targeted(far, state.time), state.time)
         if sent is None:
             break
     if speed == 0.0:
@@ -168,12 +173,13 @@ def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> 
 
 
 def test_old_states_are_held_for_a_tenth_of_any_second() -> None:
-    safety, states = SafetyFilter(limits=LIMITS), list(moving(3.0))
+    safety = SafetyFilter(limits=LIMITS)
+    states = list(moving(3.0))
     for k in range(20, len(states)):
         t = k * DT
         # 30 ms old for 60 ms in each half second, then for good.
         old = t % 0.5 < 0.06 if t < 1.6 else True
-        _, decision = safety.judge([states[k - 15] if old else states[k]], wanted(POSE, t), t)
+        _, decision = safety.judge([states[k - 15] if old else states[k]], targeted(POSE, t), t)
         if decision.level >= FilterAction.DAMP:
             break
     assert decision.reason is Reason.HELD
