@@ -34,7 +34,7 @@ from pronk.jump.train.phases import TASKS
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import DELAY_STEPS
 from pronk.jump.trial.training_sim import adapter
-from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Evaluation, Plan
+from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import evaluate_policy
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec
@@ -78,7 +78,11 @@ class ImplicitDrive(DcMotorActuator):  # type: ignore[misc]
 
 
 def environment(
-    subject: adapter.Subject, gains: TrainingGains, plan: Plan, framework: Profile, device: str
+    subject: adapter.EvaluatedPolicy,
+    gains: TrainingGains,
+    plan: EvaluationPlan,
+    framework: Profile,
+    device: str,
 ) -> ManagerBasedRlEnv:
     """The evaluation's environment with the drives of a framework."""
     task = load_task(subject.robot)
@@ -172,11 +176,11 @@ def transfer(
         device: auto takes a GPU if there is one.
     """
     torch_device = "cuda:0" if find_devices(device) else "cpu"
-    subject = adapter.load_subject(policy, torch_device)
+    subject = adapter.load_evaluated_policy(policy, torch_device)
     robot = load_task(subject.robot).robot
     trained_profile = profile("mjlab")
     trained_gains = training_gains(gains, robot)
-    plan = Plan(robot=robot, robots=robots, seed=seed, walks=WALKS, jumps=JUMPS)
+    plan = EvaluationPlan(robot=robot, robots=robots, seed=seed, walks=WALKS, jumps=JUMPS)
     runs = [("mjlab", "its own", trained_profile, trained_gains)]
     for name in frameworks:
         framework = profile(name)

@@ -19,7 +19,7 @@ from pronk.jump.train import devices
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import stop_signals
-from pronk.jump.train.run import train
+from pronk.jump.train.run import run_training
 from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.tasks import load_task
 
@@ -77,7 +77,7 @@ def test_a_folder_that_is_not_empty_stays_as_it_is(tmp_path: Path) -> None:
 def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "provenance.json").write_text(content)
     with pytest.raises(PronkError):
-        train(TrainSettings(task="walk", out=tmp_path, resume=True))
+        run_training(TrainSettings(task="walk", out=tmp_path, resume=True))
 
 
 def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:

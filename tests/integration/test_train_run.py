@@ -87,10 +87,10 @@ def test_a_run_writes_policies_checkpoints_and_provenance(whole: RunFolder) -> N
         phase = found["phases"][name]
         assert (phase["iterations"], phase["env_steps"]) == (iterations, iterations * 24 * 8)
         assert phase.get("onnx_difference", 0.0) < 1e-5
-        assert name in checkpoint.read(whole.path / f"{name}.pt")["infos"]["phases"]
-    assert not checkpoint.jumps(checkpoint.read(whole.path / "walk.pt"))
-    assert checkpoint.latest(whole.path) == whole.path / "model_4.pt"
-    assert len(checkpoint.numbered(whole.path)) == 3
+        assert name in checkpoint.read_checkpoint(whole.path / f"{name}.pt")["infos"]["phases"]
+    assert not checkpoint.uses_jump_input(checkpoint.read_checkpoint(whole.path / "walk.pt"))
+    assert checkpoint.latest_checkpoint(whole.path) == whole.path / "model_4.pt"
+    assert len(checkpoint.numbered_checkpoints(whole.path)) == 3
     assert (whole.gains).read_bytes() == GAINS.read_bytes()
     assert found["sessions"][0]["versions"]["torch"] == torch.__version__
     assert any(whole.path.glob("events.out.*"))
@@ -111,7 +111,7 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
     words = ("train", "walk", "--gains", "naive", *SMALL, "--phase", "walk=6", "--out", folder.path)
     process = started(code, *words, cwd=tmp_path)
-    while not checkpoint.numbered(folder.path) and process.poll() is None:
+    while not checkpoint.numbered_checkpoints(folder.path) and process.poll() is None:
         time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate()
@@ -119,12 +119,12 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     stopped = folder.read()
     assert not stopped["finished"]
     assert stopped["sessions"][0]["stopped"] == "SIGTERM"
-    assert 1 <= checkpoint.read(folder.checkpoint())["iter"] + 1 < 6
+    assert 1 <= checkpoint.read_checkpoint(folder.checkpoint())["iter"] + 1 < 6
     assert train("walk", "--resume", "--out", folder.path) == 0
     found = folder.read()
     assert found["finished"]
     assert found["phases"]["walk"]["iterations"] == 6
-    state = checkpoint.read(folder.path / "walk.pt")
+    state = checkpoint.read_checkpoint(folder.path / "walk.pt")
     assert state["iter"] == 5
     assert state["infos"]["env_state"]["common_step_counter"] == 6 * 24
     assert not load_policy(folder.path / "policy.onnx").contract.jump
@@ -141,7 +141,7 @@ def test_a_jump_begins_with_a_walking_policy(whole: RunFolder, tmp_path: Path) -
     assert train(*words, *phases, "--init-checkpoint", whole.path) == 0
     found = RunFolder(out).read()
     assert set(found["phases"]) == {"jump_a", "jump_b"}
-    first = checkpoint.read(out / "jump_a.pt")
+    first = checkpoint.read_checkpoint(out / "jump_a.pt")
     assert first["iter"] == TASKS["jump"]["walk"]
     contract = load_policy(out / "policy.onnx").contract
     assert (contract.gains, contract.gains_sha256) == ("naive", "")
@@ -172,7 +172,7 @@ def test_mjlab_trains_every_phase_of_the_registered_task(whole: RunFolder, tmp_p
     assert (changed["weight"], changed["params"]["jump_scale"]) == ("-0.5", "0.25")
     assert theirs["rewards"] == ours["rewards"]
     for name in PHASES:
-        a, b = (checkpoint.read(path / f"{name}.pt") for path in (folder, whole.path))
+        a, b = (checkpoint.read_checkpoint(path / f"{name}.pt") for path in (folder, whole.path))
         assert a["infos"]["env_state"] == b["infos"]["env_state"]
         rates = [s["estimator_optimizer_state_dict"]["param_groups"][0]["lr"] for s in (a, b)]
         assert rates == [PHASES[name].estimator_rate] * 2

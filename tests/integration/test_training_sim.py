@@ -28,7 +28,7 @@ from pronk.jump.train.tasks import load_task
 from pronk.jump.trial.jumps import JumpRules, measure_jump
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.training_sim import adapter
-from pronk.jump.trial.training_sim.evaluation import NEVER, Plan
+from pronk.jump.trial.training_sim.evaluation import NEVER, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, evaluate_policy
 from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
@@ -37,7 +37,7 @@ DT = 0.005
 DROP = 0.3
 """Height of the fall at the start [m]."""
 ROBOT = load_robot("mini_cheetah")
-SHORT = Plan(
+SHORT = EvaluationPlan(
     robot=ROBOT,
     robots=2,
     seed=7,
@@ -178,13 +178,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     keys = (*checkpoint.NETWORKS, *checkpoint.OPTIMIZERS, "infos")
     state: dict[str, Any] = {key: {} for key in keys}
     state |= {"actor_state_dict": actor.state_dict(), "iter": 7}
-    checkpoint.write(folder.path / "model_7.pt", state)
+    checkpoint.write_checkpoint(folder.path / "model_7.pt", state)
     return folder.path, actor
 
 
 def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) -> None:
     folder, actor = trained
-    subject = adapter.load_subject(folder, "cpu")
+    subject = adapter.load_evaluated_policy(folder, "cpu")
     obs = TensorDict({"measured": torch.randn(5, 105), "jump": torch.ones(5, 1)}, [5])
     with torch.no_grad():
         assert torch.equal(subject.act(obs), actor(obs))
@@ -199,9 +199,9 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 
 
 def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
-    state = checkpoint.read(trained[0] / "model_7.pt")
+    state = checkpoint.read_checkpoint(trained[0] / "model_7.pt")
     del state["actor_state_dict"]["mlp.0.bias"]
-    checkpoint.write(tmp_path / "model_4.pt", state)
+    checkpoint.write_checkpoint(tmp_path / "model_4.pt", state)
     (tmp_path / "model_3.pt").write_bytes(b"PK not a checkpoint")
     (tmp_path / "empty").mkdir()
     for name, what in (
@@ -212,7 +212,7 @@ def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> N
         ("model_4.pt", "its actor is not that"),
     ):
         with pytest.raises(ArtefactError, match=what):
-            adapter.load_subject(tmp_path / name, "cpu")
+            adapter.load_evaluated_policy(tmp_path / name, "cpu")
 
 
 def test_an_exported_policy_does_what_its_checkpoint_does(
@@ -224,7 +224,10 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     contract = contract_for(cfg, jump=True, provenance={})
     path = tmp_path / "policy.onnx"
     export_policy(trained[1], contract, path)
-    subject, original = adapter.load_subject(path, "cpu"), adapter.load_subject(trained[0], "cpu")
+    subject, original = (
+        adapter.load_evaluated_policy(path, "cpu"),
+        adapter.load_evaluated_policy(trained[0], "cpu"),
+    )
     assert subject.jump
     assert subject.knows(gains)
     # More robots than cores, fewer robots than cores, each with its own output.
@@ -244,8 +247,8 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
     gains, before = training_gains("naive", ROBOT), {"forward 2": 0.1}
-    subject = adapter.load_subject(trained[0], "cpu")
-    found = adapter.evaluate(subject, gains, plan, device="cpu", before=before)
+    subject = adapter.load_evaluated_policy(trained[0], "cpu")
+    found = adapter.run_evaluation(subject, gains, plan, device="cpu", before=before)
     assert [walk.name for walk in found.walks] == ["forward 2", "stand"]
     assert (found.jumps, found.before, found.about["randomization"]) == ((), before, "full")
     assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}

@@ -14,7 +14,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.jump.trial.criteria import cost_of_jumping, evaluation_checks
 from pronk.jump.trial.results import Spread
 from pronk.jump.trial.training_sim import evaluation as sim
-from pronk.jump.trial.training_sim.results import load_speed_errors, save
+from pronk.jump.trial.training_sim.results import load_speed_errors, save_evaluation
 from pronk.robots import load_robot
 
 DT, ROBOT = 0.005, load_robot("mini_cheetah")
@@ -100,7 +100,7 @@ def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
 
 def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
     path = tmp_path / "evaluation.json"
-    save(path, evaluation())
+    save_evaluation(path, evaluation())
     assert load_speed_errors(path) == {case.name: 0.1 for case in sim.WALKS}
     assert len(json.loads(path.read_text())["checks"]) == 50
     for text in ('{"schema": "pronk/trial/9"}', '{"schema": "pronk/trial/3"}', "not"):
@@ -113,7 +113,7 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
 
 
 def test_every_robot_has_its_command_and_its_times() -> None:
-    plan = sim.Plan(robot=ROBOT, robots=200, seed=4)
+    plan = sim.EvaluationPlan(robot=ROBOT, robots=200, seed=4)
     assert plan.size == 14 * 200
     commands = plan.commands()[[0, plan.walkers - 1, -1], 0]
     assert commands.tolist() == [2.0, 0.0, -2.0]
@@ -130,4 +130,4 @@ def test_every_robot_has_its_command_and_its_times() -> None:
     assert plan.seconds == 20.0
     assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
     with pytest.raises(PronkError, match="robots"):
-        sim.Plan(robot=ROBOT, robots=0)
+        sim.EvaluationPlan(robot=ROBOT, robots=0)

@@ -28,7 +28,7 @@ from ppo_case import (
 )
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.networks import JUMP_WEIGHT, Estimator
+from pronk.jump.train.rl.networks import JUMP_WEIGHT, StateEstimator
 from pronk.jump.train.rl.ppo import EstimatorPPO
 from pronk.policy.observation import ACTOR_INDICES, ESTIMATOR_INDICES
 
@@ -40,7 +40,7 @@ PAPER = (1024, 512, 256)
 
 
 def test_losses_by_hand() -> None:
-    estimator = Estimator()
+    estimator = StateEstimator()
     with torch.no_grad():
         for parameter in estimator.parameters():
             parameter.zero_()
@@ -252,7 +252,7 @@ def test_a_checkpoint_without_jump_inputs_is_widened() -> None:
     before = trained(2, jump=False)
     state = {**copy.deepcopy(before.save()), "iter": 9, "infos": {}}
     narrow = narrow_state(state)
-    assert not checkpoint.jumps(narrow)
+    assert not checkpoint.uses_jump_input(narrow)
     after = build()
     assert after.load(narrow)
     for rows in (1, 64):
@@ -264,7 +264,7 @@ def test_a_checkpoint_without_jump_inputs_is_widened() -> None:
         torch.manual_seed(4)
         learn(algorithm)
     assert alike(before, after)
-    assert checkpoint.jumps(after.save())
+    assert checkpoint.uses_jump_input(after.save())
     narrow["optimizer_state_dict"]["param_groups"][0]["params"].pop()
     with pytest.raises(ValueError, match="size"):
         build().load(narrow)
@@ -276,9 +276,9 @@ def test_a_checkpoint_without_jump_inputs_is_widened() -> None:
 def test_saved_and_loaded_it_continues_alike(tmp_path: Path) -> None:
     first, second = trained(1), build()
     path = tmp_path / "model_3.pt"
-    checkpoint.write(path, {**first.save(), "iter": 3, "infos": {"note": "x"}})
+    checkpoint.write_checkpoint(path, {**first.save(), "iter": 3, "infos": {"note": "x"}})
     assert [p.name for p in tmp_path.iterdir()] == ["model_3.pt"]
-    state = checkpoint.read(path)
+    state = checkpoint.read_checkpoint(path)
     assert second.load(state)
     for algorithm in (first, second):
         torch.manual_seed(1)
@@ -308,21 +308,21 @@ def test_other_files_are_refused_and_run_no_code(tmp_path: Path) -> None:
     ):
         torch.save(state, path)
         with pytest.raises(ArtefactError, match=words):
-            checkpoint.read(path)
+            checkpoint.read_checkpoint(path)
     assert not mark.exists()
     for content in (b"", b"text", path.read_bytes()[:300]):
         path.write_bytes(content)
         with pytest.raises(ArtefactError, match="not a checkpoint"):
-            checkpoint.read(path)
+            checkpoint.read_checkpoint(path)
     with pytest.raises(ArtefactError, match="no such file"):
-        checkpoint.read(tmp_path / "none.pt")
+        checkpoint.read_checkpoint(tmp_path / "none.pt")
 
 
 def test_the_last_checkpoint_is_that_of_the_highest_iteration(tmp_path: Path) -> None:
-    assert checkpoint.latest(tmp_path) is None
+    assert checkpoint.latest_checkpoint(tmp_path) is None
     for name in ("model_9.pt", "model_10.pt", "model_best.pt", "walk.pt"):
         (tmp_path / name).touch()
-    assert checkpoint.latest(tmp_path) == tmp_path / "model_10.pt"
+    assert checkpoint.latest_checkpoint(tmp_path) == tmp_path / "model_10.pt"
 
 
 def test_a_number_that_is_not_finite_is_found_by_its_path() -> None:

@@ -11,10 +11,9 @@ import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.tables import Table
 
 
-def evaluate(
+def evaluate_command(
     policy: tyro.conf.Positional[Path],
     gains: str,
     out: Annotated[Path, tyro.conf.arg(aliases=("--json",))] = Path("evaluation.json"),
@@ -38,54 +37,56 @@ def evaluate(
         randomization: full: as in training. noise: one nominal robot many times, with noise, timing
             and delay as in training. none: the nominal robot, undisturbed.
         before: Evaluation of the policy before the jump phases, to compare the walk.
-        seed: Of all draws.
+        seed: Seed of all draws.
         device: auto: a GPU if there is one. On the CPU take a few robots.
     """
     from pronk.jump.train.devices import find_devices, require_extra
-    from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Plan
+    from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, EvaluationPlan
 
     require_extra()
     if out.suffix != ".json":
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
-    where = "cuda:0" if find_devices(device) else "cpu"
+    simulation_device = "cuda:0" if find_devices(device) else "cpu"
 
     from pronk.jump.train.gains import training_gains
     from pronk.jump.train.tasks import load_task
-    from pronk.jump.trial.training_sim import adapter
-    from pronk.jump.trial.training_sim.results import load_speed_errors, save, sheets
+    from pronk.jump.trial.training_sim.adapter import load_evaluated_policy, run_evaluation
+    from pronk.jump.trial.training_sim.results import (
+        evaluation_tables,
+        load_speed_errors,
+        save_evaluation,
+    )
 
-    errors = {} if before is None else load_speed_errors(before)
-    subject = adapter.load_subject(policy, where)
-    robot = load_task(subject.robot).robot
-    plan = Plan(
+    errors_before = {} if before is None else load_speed_errors(before)
+    evaluated_policy = load_evaluated_policy(policy, simulation_device)
+    robot = load_task(evaluated_policy.robot).robot
+    plan = EvaluationPlan(
         robot=robot,
         robots=robots,
         seed=seed,
         walks=() if what == "jump" else WALKS,
         jumps=() if what == "walk" else JUMPS,
     )
-    if plan.jumps and not subject.jump:
+    if plan.jumps and not evaluated_policy.jump:
         raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
-    drives = training_gains(gains, robot, like=like)
-    if not subject.knows(drives):
+    simulated_gains = training_gains(gains, robot, like=like)
+    if not evaluated_policy.knows(simulated_gains):
         console.warn(
-            f"{policy} was not trained with these gains; it is evaluated with {drives.name} ones"
+            f"{policy} was not trained with these gains; it is evaluated with "
+            f"{simulated_gains.name} ones"
         )
     # mjlab and Warp print to standard output.
     with console.progress() as report, redirect_stdout(io.StringIO()):
-        found = adapter.evaluate(
-            subject,
-            drives,
+        evaluation = run_evaluation(
+            evaluated_policy,
+            simulated_gains,
             plan,
-            device=where,
+            device=simulation_device,
             randomization=randomization,
-            before=errors,
+            before=errors_before,
             progress=report,
         )
-    save(out, found)
-    for sheet in sheets(found):
-        if isinstance(sheet, Table):
-            console.show(sheet)
-        else:
-            console.show_sheet(sheet)
+    save_evaluation(out, evaluation)
+    for table in evaluation_tables(evaluation):
+        console.show(table)
     console.say(f"wrote {out}")

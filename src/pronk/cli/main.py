@@ -38,8 +38,11 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Translate gains for a framework of another drive law.",
     ),
     "probe": ("pronk.cli.probe:probe", "Name what a simulator makes of a joint's settings."),
-    "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),
-    "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
+    "train": ("pronk.cli.train:train_command", "Train a policy that walks and jumps."),
+    "evaluate": (
+        "pronk.cli.evaluate:evaluate_command",
+        "Evaluate a policy in the training simulator.",
+    ),
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
     "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
     "deploy": ("pronk.cli.deploy:deploy_command", "Run a policy on a robot or the virtual robot."),

@@ -10,7 +10,7 @@ from pronk.cli import console
 from pronk.jump.train.settings import TrainSettings
 
 
-def train(settings: TrainSettings) -> console.Outcome:
+def train_command(settings: TrainSettings) -> console.Outcome:
     """Train a policy that walks, runs and jumps on command.
 
     Args:
@@ -20,11 +20,11 @@ def train(settings: TrainSettings) -> console.Outcome:
 
     require_extra()
 
-    from pronk.jump.train.run import train as run
+    from pronk.jump.train.run import run_training
 
     resume = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
     try:
-        record = run(settings, report=console.say)
+        record = run_training(settings, report=console.say)
     except KeyboardInterrupt:
         console.following(resume)
         raise

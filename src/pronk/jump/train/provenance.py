@@ -24,7 +24,7 @@ import pronk
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.export import versions
+from pronk.jump.train.rl.export import package_versions
 
 SCHEMA = "pronk/run/2"
 
@@ -47,7 +47,7 @@ class RunFolder:
 
     def checkpoint(self) -> Path:
         """Return the last numbered checkpoint; ArtefactError if there is none."""
-        path = checkpoint.latest(self.path)
+        path = checkpoint.latest_checkpoint(self.path)
         if path is None:
             raise ArtefactError(
                 f"{self.path}: no checkpoints in it; expected the folder of a run, a checkpoint, "
@@ -105,7 +105,7 @@ def new_session() -> dict[str, Any]:
         "seconds": None,
         "stopped": "",
         "device": None,
-        "versions": versions(),
+        "versions": package_versions(),
         "git": git_state(),
     }
 
@@ -114,7 +114,7 @@ def changed_versions(record: dict[str, Any]) -> list[str]:
     """List packages in other versions than when the run was last started, as text."""
     versions_before = record["sessions"][-1]["versions"]
     changes = []
-    for name, version in versions().items():
+    for name, version in package_versions().items():
         version_before = versions_before.get(name)
         if version_before != version:
             changes.append(f"{name} was {version_before} and is {version}")

@@ -30,7 +30,7 @@ COPIED_VARIABLES = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
 """Environment variables that the processes of several GPUs get, beside torchrunx's own."""
 
 
-def train(
+def run_training(
     settings: TrainSettings, report: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
     """Begin or resume a run, and train until it is finished or stopped.
@@ -84,7 +84,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
             shutil.copyfile(gains_file, temporary_path)
     start_sha256 = ""
     if start is not None:
-        checkpoint.write(folder.path / f"model_{start['iter']}.pt", start)
+        checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
         start_sha256 = start["infos"]["start_sha256"]
     record: dict[str, Any] = {
         "schema": provenance.SCHEMA,
@@ -122,10 +122,10 @@ def initial_state(path: Path, iterations: int) -> dict[str, Any]:
             f"--init-checkpoint {path}: no {missing}; "
             "expected the folder of a run whose phase walk is over, or one of its checkpoints."
         )
-    state = checkpoint.read(source)
+    state = checkpoint.read_checkpoint(source)
     infos = state["infos"] or {}
     phases = infos.get("phases", {})
-    if checkpoint.jumps(state) or "jump_a" in phases or "jump_b" in phases:
+    if checkpoint.uses_jump_input(state) or "jump_a" in phases or "jump_b" in phases:
         raise ArtefactError(
             f"--init-checkpoint {source}: a policy that jumps; expected one of phase walk."
         )
@@ -217,9 +217,9 @@ def _train_session(folder: RunFolder, settings: TrainSettings, processes: int) -
         session["seconds"] = time.monotonic() - begin
         is_gpu = os.environ["CUDA_VISIBLE_DEVICES"] != ""
         session["device"] = devices.device_facts("cuda" if is_gpu else "cpu", processes)
-        last_checkpoint = checkpoint.latest(folder.path)
+        last_checkpoint = checkpoint.latest_checkpoint(folder.path)
         if last_checkpoint is not None:
-            state = checkpoint.read(last_checkpoint)
+            state = checkpoint.read_checkpoint(last_checkpoint)
             infos = state["infos"]
             record["phases"] = infos.get("phases", {})
             record["finished"] = state["iter"] + 1 >= config.agent.max_iterations
@@ -246,7 +246,7 @@ def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
     agent.start_sha256 = folder.read()["start_sha256"]
     if settings.minutes is not None:
         agent.stop_at = time.time() + 60.0 * settings.minutes
-    if checkpoint.latest(folder.path) is not None:
+    if checkpoint.latest_checkpoint(folder.path) is not None:
         agent.resume = True
         agent.load_run = f"^{re.escape(folder.path.resolve().name)}$"
         agent.load_checkpoint = r"^model_\d+\.pt$"

@@ -25,13 +25,13 @@ OPTIMIZERS = ("optimizer_state_dict", "estimator_optimizer_state_dict")
 """Entries of a checkpoint with the optimizers."""
 
 
-def write(path: Path, state: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """Write a checkpoint, whole or not at all."""
     with written_whole(path) as temporary_path:
         torch.save(dict(state), temporary_path)
 
 
-def read(path: Path, device: str = "cpu") -> dict[str, Any]:
+def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     """Read a checkpoint of `pronk train` or mjlab's `train`.
 
     Args:
@@ -61,13 +61,13 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
     return state
 
 
-def latest(folder: Path) -> Path | None:
+def latest_checkpoint(folder: Path) -> Path | None:
     """Return the numbered checkpoint of the highest iteration in a folder; None without one."""
-    paths = numbered(folder)
+    paths = numbered_checkpoints(folder)
     return paths[-1] if paths else None
 
 
-def numbered(folder: Path) -> list[Path]:
+def numbered_checkpoints(folder: Path) -> list[Path]:
     """Return all numbered checkpoints in a folder, `model_ITERATION.pt`, in order."""
     paths = [path for path in folder.glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
     return sorted(paths, key=_iteration)
@@ -78,7 +78,7 @@ def _iteration(path: Path) -> int:
     return int(path.stem.removeprefix("model_"))
 
 
-def jumps(state: Mapping[str, Any]) -> bool:
+def uses_jump_input(state: Mapping[str, Any]) -> bool:
     """Return whether the actor of a checkpoint uses its jump input: its weights are not zero."""
     for name, weight in state["actor_state_dict"].items():
         if name.endswith(JUMP_WEIGHT) and bool(weight.any()):

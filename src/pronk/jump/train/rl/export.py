@@ -35,7 +35,7 @@ TOLERANCE = 1e-5
 """Largest difference between ONNX Runtime and PyTorch that `verify` should give."""
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of the packages that a run is computed with."""
     modules = ("mjlab", "mujoco", "mujoco_warp", "warp", "torch", "rsl_rl", "numpy")
     packages = {"warp": "warp-lang", "rsl_rl": "rsl-rl-lib"}
@@ -72,7 +72,7 @@ def contract_for(
         jump=jump,
         lift_off_velocity=command.settings.liftoff_velocity if jump else None,
         provenance=dict(provenance),
-        versions=versions(),
+        versions=package_versions(),
     )
 
 

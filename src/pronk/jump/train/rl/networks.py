@@ -200,7 +200,7 @@ class JumpModel(MLPModel):
             self.obs_normalizer.learn(obs[self.group], world_size)
 
 
-class Estimator(nn.Module):
+class StateEstimator(nn.Module):
     """Foot contacts and trunk velocity from the normalized measurement and the jump input.
 
     A small network beside the actor, trained on the simulator's state while PPO trains the actor
@@ -270,7 +270,7 @@ class EstimatorActor(JumpModel):
                 f"the measured vector has {measured_size} numbers; expected {MEASURED_SIZE}, as in "
                 "pronk.policy.observation."
             )
-        self.estimator = Estimator(self.jump_size)
+        self.estimator = StateEstimator(self.jump_size)
         actor_indices = torch.tensor(ACTOR_INDICES)
         estimator_indices = torch.tensor(ESTIMATOR_INDICES)
         self.register_buffer("_actor_indices", actor_indices, persistent=False)

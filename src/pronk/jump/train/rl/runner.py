@@ -295,7 +295,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         if self.folder is None or self.gpu_global_rank != 0:
             return
         self.save(str(self.folder / f"model_{self.current_learning_iteration}.pt"))
-        for path in checkpoint.numbered(self.folder)[:-KEPT_CHECKPOINTS]:
+        for path in checkpoint.numbered_checkpoints(self.folder)[:-KEPT_CHECKPOINTS]:
             path.unlink(missing_ok=True)
 
     def save(self, path: str, infos: Mapping[str, Any] | None = None) -> None:
@@ -320,7 +320,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             "seconds": self._seconds,
             "stopped": self.stop_reason,
         }
-        checkpoint.write(Path(path), state)
+        checkpoint.write_checkpoint(Path(path), state)
         if self.cfg["upload_model"]:
             self.logger.save_model(path, self.current_learning_iteration)
 
@@ -345,7 +345,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         Raises:
             ArtefactError: No checkpoint, or one of other networks.
         """
-        state = checkpoint.read(Path(path), map_location or self.device)
+        state = checkpoint.read_checkpoint(Path(path), map_location or self.device)
         try:
             resumed = self.alg.load(state, load_cfg, strict)
         except (KeyError, RuntimeError, ValueError) as error:
@@ -363,7 +363,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             self.phases = dict(infos.get("phases", {}))
             self._seconds = infos.get("seconds", 0.0)
             name, _ = phase_at(self.curriculum.iterations, self.iteration)
-            self._jumping = PHASES[name].jump and checkpoint.jumps(state)
+            self._jumping = PHASES[name].jump and checkpoint.uses_jump_input(state)
             # Draws other than those of the beginning.
             torch.manual_seed(self.cfg["seed"] + self.current_learning_iteration)
         return infos
@@ -380,7 +380,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             f"learning diverged in iteration {self.iteration}: {reason}; train with another seed "
             "or a smaller learning rate"
         )
-        good_checkpoint = None if self.folder is None else checkpoint.latest(self.folder)
+        good_checkpoint = None if self.folder is None else checkpoint.latest_checkpoint(self.folder)
         if good_checkpoint is not None:
             text += f"; {good_checkpoint} is the last good checkpoint"
         return PronkError(f"{text}.")

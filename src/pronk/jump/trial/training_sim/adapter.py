@@ -29,87 +29,98 @@ from pronk.jump.train.devices import device_facts
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
-from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.export import versions
+from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
+from pronk.jump.train.rl.export import package_versions
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import without_randomization
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
-from pronk.jump.trial.training_sim.evaluation import Evaluation, Plan
-from pronk.jump.trial.training_sim.run import TERM, Estimate, Policy, StepListener, evaluate_policy
+from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
+from pronk.jump.trial.training_sim.run import TERM, Act, Estimate, StepListener, evaluate_policy
 from pronk.policy.contract import check
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
-from pronk.policy.runtime import Inference, load_policy
-from pronk.policy.runtime import Policy as ExportedPolicy
+from pronk.policy.runtime import Inference, Policy, load_policy
 from pronk.robots import load_robot
 
 
 def evaluation_cfg(
-    cfg: ManagerBasedRlEnvCfg, plan: Plan, randomization: str = "full"
+    cfg: ManagerBasedRlEnvCfg, plan: EvaluationPlan, randomization: str = "full"
 ) -> ManagerBasedRlEnvCfg:
-    """Make an environment of training one to evaluate in; changes `cfg` and returns it.
+    """Make an environment of training one to evaluate in, without time-out and rewards.
 
-    It has no time-out, no rewards, and the step listener. Randomization `full` is as in training.
-    `noise` is the nominal body and gains, undisturbed, with noise, timing (D1) and command delay
-    drawn as in training: the closest to the paper's figures, of one robot measured several times.
-    With `none` only starts and times are drawn.
+    Args:
+        cfg: The configuration, which is changed and returned.
+        plan: The plan, of which the number of robots is read.
+        randomization: `full` is as in training. `noise` is the nominal body and gains, undisturbed,
+            with noise, timing (D1) and command delay drawn as in training: the closest to the
+            paper's figures, of one robot measured several times. With `none` only starts and times
+            are drawn.
     """
     if randomization != "full":
         without_randomization(cfg, noise=randomization == "noise")
     cfg.scene.num_envs = plan.size
     cfg.rewards = {}
     cfg.curriculum = {}
-    cfg.terminations = {name: t for name, t in cfg.terminations.items() if not t.time_out}
+    cfg.terminations = {name: term for name, term in cfg.terminations.items() if not term.time_out}
     cfg.metrics = {TERM: MetricsTermCfg(func=StepListener, per_substep=True)}
     return cfg
 
 
-def evaluate(
-    subject: Subject,
+def run_evaluation(
+    policy: EvaluatedPolicy,
     gains: TrainingGains,
-    plan: Plan,
+    plan: EvaluationPlan,
     *,
     device: str,
     randomization: str = "full",
     before: Mapping[str, float] | None = None,
     progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> Evaluation:
-    """Build the simulator on a device, `cpu` or `cuda:0`, and evaluate in it.
+    """Build the simulator and evaluate a policy in it.
 
-    `before` has speed errors to compare with; `randomization` is as of `evaluation_cfg`.
+    Args:
+        policy: The policy.
+        gains: Gains of the simulated drives.
+        plan: The plan.
+        device: `cpu` or `cuda:0`.
+        randomization: As of `evaluation_cfg`.
+        before: Speed errors by walk to compare with [m/s].
+        progress: Called with the name of a stage and the fraction of it that is over.
     """
     progress("building", 0.0)
-    task = load_task(subject.robot)
+    task = load_task(policy.robot)
     cfg = task.env_cfg(task.robot, gains, iterations=TASKS["all"], seed=plan.seed)
     env = ManagerBasedRlEnv(cfg=evaluation_cfg(cfg, plan, randomization), device=device)
     progress("building", 1.0)
     with closing(env):
-        found = evaluate_policy(
-            subject.act,
+        evaluation = evaluate_policy(
+            policy.act,
             env,
             plan,
-            estimate=subject.estimate,
+            estimate=policy.estimate,
             progress=partial(progress, "walking and jumping"),
         )
     about = {
-        "policy": subject.about,
+        "policy": policy.about,
         "gains": {"name": gains.name, "sha256": gains.sha256, "virtual": gains.virtual},
         "randomization": randomization,
         "device": device_facts(device.partition(":")[0], 1),
-        "versions": versions(),
+        "versions": package_versions(),
     }
-    return replace(found, about=about, before=before or {})
+    return replace(evaluation, about=about, before=before or {})
 
 
 # ---- the policy under evaluation ----
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class EvaluatedPolicy:
     """A policy under evaluation."""
 
-    act: Policy
+    act: Act
+    """Observations to actions."""
     estimate: Estimate
+    """Observations to the estimate."""
     jump: bool
     """Whether it has the jump input."""
     robot: str
@@ -118,54 +129,65 @@ class Subject:
     """File, hash, and provenance."""
 
     def knows(self, gains: TrainingGains) -> bool:
-        """Whether it was trained with these nominal gains."""
-        same = bool(self.about.get("gains") == gains.name)
-        return same and (gains.name == "naive" or self.about.get("gains_sha256") == gains.sha256)
+        """Return whether it was trained with these nominal gains."""
+        if self.about.get("gains") != gains.name:
+            return False
+        return gains.name == "naive" or self.about.get("gains_sha256") == gains.sha256
 
 
-def load_subject(path: Path, device: str) -> Subject:
-    """Read `policy.onnx`, a checkpoint, or the last checkpoint of the folder of a run."""
+def load_evaluated_policy(path: Path, device: str) -> EvaluatedPolicy:
+    """Read a policy.
+
+    Args:
+        path: `policy.onnx`, a checkpoint, or the folder of a run, whose last checkpoint is read.
+        device: Device of the simulation.
+
+    Raises:
+        ArtefactError: No such file, or one that is no policy of this pronk.
+    """
     if path.suffix == ".onnx":
-        return _exported(path, device)
-    found = RunFolder(path).checkpoint() if path.is_dir() else path
-    state = checkpoint.read(found)
+        return _exported_policy(path, device)
+    file = RunFolder(path).checkpoint() if path.is_dir() else path
+    state = read_checkpoint(file)
     actor = blank_actor()
     try:
         actor.load_state_dict(state["actor_state_dict"])
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1].strip()
         raise ArtefactError(
-            f"{found}: its actor is not that of this pronk ({reason}); train again."
+            f"{file}: its actor is not that of this pronk ({reason}); train again."
         ) from error
     actor = actor.to(device).eval()
-    run = RunFolder(found.parent)
+    run = RunFolder(file.parent)
     provenance = run.read() if run.provenance.is_file() else {}
-    settings, gains = provenance.get("settings", {}), provenance.get("gains", {})
+    settings = provenance.get("settings", {})
+    gains = provenance.get("gains", {})
     about = {
-        "file": str(found),
-        "sha256": sha256(found),
+        "file": str(file),
+        "sha256": sha256(file),
         "iteration": state["iter"],
         "gains": gains.get("name"),
         "gains_sha256": gains.get("sha256"),
         "settings": settings,
     }
-    return Subject(
+    return EvaluatedPolicy(
         act=actor,
         estimate=actor.estimate,
-        jump=checkpoint.jumps(state),
+        jump=uses_jump_input(state),
         robot=settings.get("robot", "mini_cheetah"),
         about=about,
     )
 
 
 def blank_actor() -> EstimatorActor:
-    """The actor as it is trained, with random weights."""
+    """Return the actor as it is trained, with random weights."""
     cfg = jump_rl_cfg(iterations=1).actor
-    sizes = {"measured": MEASURED_SIZE, "jump": 1}
-    blank = TensorDict({k: torch.zeros(1, n) for k, n in sizes.items()}, batch_size=[1])
+    blank = TensorDict(
+        {"measured": torch.zeros(1, MEASURED_SIZE), "jump": torch.zeros(1, 1)}, batch_size=[1]
+    )
     return EstimatorActor(
         blank,
-        {"actor": [*sizes]},
+        {"actor": ["measured", "jump"]},
         "actor",
         JOINTS,
         hidden_dims=cfg.hidden_dims,
@@ -175,7 +197,8 @@ def blank_actor() -> EstimatorActor:
     )
 
 
-def _exported(path: Path, device: str) -> Subject:
+def _exported_policy(path: Path, device: str) -> EvaluatedPolicy:
+    """Read an exported policy."""
     policy = load_policy(path)
     contract = policy.contract
     try:
@@ -185,11 +208,14 @@ def _exported(path: Path, device: str) -> Subject:
     about = {
         "file": str(path),
         "sha256": policy.sha256,
-        **{name: getattr(contract, name) for name in ("gains", "gains_sha256", "virtual")},
-        **{name: dict(getattr(contract, name)) for name in ("provenance", "versions")},
+        "gains": contract.gains,
+        "gains_sha256": contract.gains_sha256,
+        "virtual": contract.virtual,
+        "provenance": dict(contract.provenance),
+        "versions": dict(contract.versions),
     }
-    runner = _Exported(policy, device)
-    return Subject(
+    runner = _ParallelPolicy(policy, device)
+    return EvaluatedPolicy(
         act=runner.act,
         estimate=runner.estimate,
         jump=contract.jump,
@@ -198,39 +224,48 @@ def _exported(path: Path, device: str) -> Subject:
     )
 
 
-class _Exported:
-    """An exported policy that acts for many robots at once."""
+class _ParallelPolicy:
+    """An exported policy that acts for many robots at once, on all cores."""
 
-    def __init__(self, policy: ExportedPolicy, device: str) -> None:
-        self._policy, self._device = policy, device
+    def __init__(self, policy: Policy, device: str) -> None:
+        self._policy = policy
+        self._device = device
         self._workers = os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(self._workers)
-        self._last: Tensor | None = None
+        self._inferred_on: Tensor | None = None
         self._inferred: list[Inference] = []
 
     def act(self, obs: TensorDict) -> Tensor:
+        """Return the actions, (N, 12)."""
         self._infer(obs)
         # The next observations may be written into the same tensor.
-        self._last = None
-        return self._joined("action")
+        self._inferred_on = None
+        return self._tensor([inference.action for inference in self._inferred])
 
     def estimate(self, obs: TensorDict) -> tuple[Tensor, Tensor]:
+        """Return contact probabilities (N, 4) and velocity [m/s] (N, 3)."""
         self._infer(obs)
-        return self._joined("contact"), self._joined("linear_velocity")
+        contact = self._tensor([inference.contact for inference in self._inferred])
+        velocity = self._tensor([inference.linear_velocity for inference in self._inferred])
+        return contact, velocity
 
     def _infer(self, obs: TensorDict) -> None:
         """Run the network, unless it has just been run on these observations."""
         measured = obs["measured"]
-        if measured is self._last:
+        if measured is self._inferred_on:
             return
         jump = obs["jump"].cpu().numpy()
         if not self._policy.contract.jump:
             jump = np.zeros_like(jump)
-        parts = [np.array_split(a, self._workers) for a in (measured.cpu().numpy(), jump)]
-        rows = [(m, j) for m, j in zip(*parts, strict=True) if len(m)]
-        self._inferred = list(self._pool.map(lambda row: self._policy.infer(*row), rows))
-        self._last = measured
+        measured_parts = np.array_split(measured.cpu().numpy(), self._workers)
+        jump_parts = np.array_split(jump, self._workers)
+        futures = []
+        for measured_part, jump_part in zip(measured_parts, jump_parts, strict=True):
+            if len(measured_part):
+                futures.append(self._pool.submit(self._policy.infer, measured_part, jump_part))
+        self._inferred = [future.result() for future in futures]
+        self._inferred_on = measured
 
-    def _joined(self, name: str) -> Tensor:
-        whole = np.concatenate([getattr(part, name) for part in self._inferred])
-        return torch.from_numpy(whole).to(self._device)
+    def _tensor(self, parts: list[Any]) -> Tensor:
+        """Join the parts of the robots on the simulation's device."""
+        return torch.from_numpy(np.concatenate(parts)).to(self._device)

@@ -27,25 +27,37 @@ Samples = NDArray[np.int64]
 NEVER = 2**30
 """A sample that does not come."""
 WALKS = named(
-    *("forward 2", "back 2", "left 1", "right 1", "forward 3", "back 3"),
-    *("yaw 2", "yaw -2", "stand"),
+    "forward 2",
+    "back 2",
+    "left 1",
+    "right 1",
+    "forward 3",
+    "back 3",
+    "yaw 2",
+    "yaw -2",
+    "stand",
 )
 """Velocities to keep."""
 JUMPS = PAPER_COMMANDS
+"""Commands to jump with."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class EvaluationPlan:
     """The commands of an evaluation, and their times."""
 
     robot: RobotSpec
+    """The robot."""
     robots: int = 1000
-    """For each command."""
+    """Number of robots for each command."""
     seed: int = 0
-    """Of noise, pushes, starts and the times of the jumps."""
+    """Seed of noise, pushes, starts and the times of the jumps."""
     walks: tuple[Case, ...] = WALKS
+    """Commands to walk with."""
     jumps: tuple[Case, ...] = JUMPS
+    """Commands to jump with."""
     walk_s: float = 20.0
+    """Duration of a walk [s]."""
     settle_s: float = 2.0
     """Time to accelerate, left out of the errors [s]."""
     script: Script = field(default_factory=lambda: Script(command=STILL))
@@ -53,6 +65,7 @@ class Plan:
     spread_s: float = 0.5
     """The jump input rises up to this much later, uniformly [s]."""
     rules: JumpRules | None = None
+    """Definition of a jump; None for the robot's."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan."""
@@ -61,17 +74,17 @@ class Plan:
 
     @property
     def jump_rules(self) -> JumpRules:
-        """`rules`, or those of the robot."""
+        """Definition of a jump: `rules`, or those of the robot."""
         return self.rules or JumpRules.of(self.robot)
 
     @property
     def size(self) -> int:
-        """Robots in all: first those of each walk, then those of each jump."""
+        """Number of robots in all: first those of each walk, then those of each jump."""
         return self.robots * (len(self.walks) + len(self.jumps))
 
     @property
     def walkers(self) -> int:
-        """Robots that walk."""
+        """Number of robots that walk."""
         return self.robots * len(self.walks)
 
     @property
@@ -86,7 +99,7 @@ class Plan:
         return max(self.walk_s if self.walks else 0.0, self.jump_seconds)
 
     def commands(self) -> Array:
-        """The velocity command of each robot. (N, 3)."""
+        """Return the velocity command of each robot. (N, 3)."""
         commands = [case.command for case in (*self.walks, *self.jumps)]
         return np.repeat(np.array(commands, dtype=float), self.robots, axis=0)
 
@@ -95,9 +108,9 @@ class Plan:
 
         For each robot, in samples of `dt`, (N,); `NEVER` for what does not happen.
         """
-        draws = np.random.default_rng(self.seed).random(self.size - self.walkers)
+        delays = np.random.default_rng(self.seed).random(self.size - self.walkers)
         on = np.full(self.size, NEVER)
-        on[self.walkers :] = np.rint((self.script.on + self.spread_s * draws) / dt)
+        on[self.walkers :] = np.rint((self.script.on + self.spread_s * delays) / dt)
         jumping = on < NEVER
         off = np.where(jumping, on + round(self.script.jump_s / dt), NEVER)
         return {
@@ -113,9 +126,11 @@ class CommandResult:
     """All robots of one command."""
 
     name: str
+    """Name of the command."""
     command: tuple[float, float, float]
+    """Forward, left [m/s], yaw rate [rad/s]."""
     figures: Mapping[str, Spread]
-    """Over the robots that have it; the mean of a flag is its share.
+    """Each figure over the robots that have it; the mean of a flag is its share.
 
     Numbers of `pronk.jump.trial.jumps` and `walk`; `drift` from the end of settling to the end [m];
     `uncommanded`: the highest flight without a jump input, over standing height [m]. Flags: `fell`,
@@ -133,11 +148,14 @@ class Evaluation:
     """The whole evaluation, and what it rests on."""
 
     walks: tuple[CommandResult, ...]
+    """Results of the walks."""
     jumps: tuple[CommandResult, ...]
+    """Results of the jumps."""
     estimator: Mapping[str, float]
-    """Over all walks, standing included: root mean square error of the velocity [m/s] by axis
-    (`forward`, `left`, `up`) and of the vector (`velocity`), and the share of feet and policy steps
-    at which the contact estimate is right (`contacts_right`). Empty without estimator or walks."""
+    """Errors of the estimator over all walks, standing included: root mean square error of the
+    velocity [m/s] by axis (`forward`, `left`, `up`) and of the vector (`velocity`), and the share
+    of feet and policy steps at which the contact estimate is right (`contacts_right`). Empty
+    without estimator or walks."""
     plan: Mapping[str, Any]
     """Fields of the plan."""
     seconds: float
@@ -148,5 +166,5 @@ class Evaluation:
     """Speed errors of the policy before the jump phases, by walk [m/s]; empty if not compared."""
 
     def speed_errors(self) -> dict[str, float]:
-        """Mean speed error by walk [m/s]."""
+        """Return the mean speed error by walk [m/s]."""
         return {walk.name: walk["speed_error"].mean for walk in self.walks}

@@ -9,80 +9,140 @@ from pathlib import Path
 from pronk.errors import ArtefactError
 from pronk.jump.trial.criteria import evaluation_checks
 from pronk.jump.trial.results import load_json, save_json
-from pronk.jump.trial.tables import Sheet, check_table, spread_text, table
-from pronk.jump.trial.training_sim.evaluation import Evaluation
-from pronk.tables import Table, number, percent
+from pronk.jump.trial.tables import check_table, spread_text
+from pronk.jump.trial.training_sim.evaluation import CommandResult, Evaluation
+from pronk.tables import Cell, Column, Table, number, percent
 
 SCHEMA = "pronk/trial/3"
 
+WALK_COLUMNS = (
+    Column(heading="command"),
+    Column(heading="speed error", unit="m/s"),
+    Column(heading="yaw rate error", unit="rad/s"),
+    Column(heading="mean velocity", unit="m/s, m/s, rad/s"),
+    Column(heading="drift", unit="m", digits=2),
+    Column(heading="falls", unit="%"),
+    Column(heading="flight over standing", unit="cm"),
+)
+JUMP_COLUMNS = (
+    Column(heading="command"),
+    Column(heading="height", unit="m"),
+    Column(heading="distance", unit="m"),
+    Column(heading="lift-off up", unit="m/s"),
+    Column(heading="after", unit="s"),
+    Column(heading="along", unit="m", digits=2),
+    Column(heading="flights", digits=2),
+    Column(heading="high ones", digits=2),
+    Column(heading="one", unit="%"),
+    Column(heading="jumped", unit="%"),
+    Column(heading="upright", unit="%"),
+    Column(heading="non-foot contact", unit="%"),
+)
 
-def save(path: Path, evaluation: Evaluation) -> None:
+
+def save_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Write an evaluation and its checks as JSON, whole or not at all; NaN becomes null."""
     checks = [check.row() for check in evaluation_checks(evaluation)]
     save_json(path, SCHEMA, {"checks": checks, **asdict(evaluation)})
 
 
 def load_speed_errors(path: Path) -> dict[str, float]:
-    """Read the mean speed errors by walk [m/s] of a saved evaluation."""
+    """Read the mean speed errors by walk [m/s] of a saved evaluation.
+
+    Raises:
+        ArtefactError: The file is no evaluation, or one without walks.
+    """
+    errors = {}
     with load_json(path, SCHEMA, "pronk evaluate") as body:
-        errors = {
-            str(walk["name"]): float(walk["figures"]["speed_error"]["mean"] or math.nan)
-            for walk in body["walks"]
-        }
+        for walk in body["walks"]:
+            mean = walk["figures"]["speed_error"]["mean"]
+            errors[str(walk["name"])] = float(mean or math.nan)
     if not errors:
         raise ArtefactError(f"{path}: has no walks; evaluate that policy with --what walk.")
     return errors
 
 
-def sheets(evaluation: Evaluation) -> tuple[Sheet | Table, ...]:
-    """The tables of an evaluation."""
-    walks = []
-    for walk in evaluation.walks:
-        errors = (
-            f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
-            for name in ("speed_error", "yaw_error")
+def evaluation_tables(evaluation: Evaluation) -> list[Table]:
+    """Make the tables of an evaluation: walks, jumps, acceptance criteria."""
+    tables = []
+    if evaluation.walks:
+        tables.append(
+            Table(
+                title="Walking: mean over robots and time; in brackets with the stride averaged "
+                "out",
+                columns=WALK_COLUMNS,
+                rows=tuple(_walk_row(walk) for walk in evaluation.walks),
+            )
         )
-        velocity = ", ".join(number(walk[n].mean, 2) for n in ("forward", "left", "yaw_rate"))
-        shares = percent(walk["fell"].mean), percent(walk["uncommanded"].most)
-        walks.append((walk.name, *errors, velocity, walk["drift"].mean, *shares))
-    jumps = [
-        (
-            jump.name,
-            spread_text(jump["height"]),
-            *(spread_text(jump[name], 2) for name in ("distance", "lift_off_velocity", "delay")),
-            *(jump[name].mean for name in ("along", "flights", "high_flights")),
-            *(percent(jump[n].mean) for n in ("single", "found", "upright", "non_foot_contact")),
+    if evaluation.jumps:
+        tables.append(
+            Table(
+                title="Jumping: mean +- standard deviation over robots",
+                columns=JUMP_COLUMNS,
+                rows=tuple(_jump_row(jump) for jump in evaluation.jumps),
+                notes=(
+                    "non-foot contact: anything but a foot on the ground, from the jump input to "
+                    "2 s after touchdown; a trial counts no such jump as a success.",
+                ),
+            )
         )
-        for jump in evaluation.jumps
-    ]
-    notes, estimator = [], evaluation.estimator
+    checks = check_table("Acceptance criteria", evaluation_checks(evaluation), _notes(evaluation))
+    if checks.rows:
+        tables.append(checks)
+    return tables
+
+
+def _walk_row(walk: CommandResult) -> tuple[Cell, ...]:
+    """Return the row of a walk."""
+    speed_error = number(walk["speed_error"].mean)
+    speed_error_averaged = number(walk["speed_error_averaged"].mean)
+    yaw_error = number(walk["yaw_error"].mean)
+    yaw_error_averaged = number(walk["yaw_error_averaged"].mean)
+    forward = number(walk["forward"].mean, 2)
+    left = number(walk["left"].mean, 2)
+    yaw_rate = number(walk["yaw_rate"].mean, 2)
+    return (
+        walk.name,
+        f"{speed_error} ({speed_error_averaged})",
+        f"{yaw_error} ({yaw_error_averaged})",
+        f"{forward}, {left}, {yaw_rate}",
+        walk["drift"].mean,
+        percent(walk["fell"].mean),
+        percent(walk["uncommanded"].most),
+    )
+
+
+def _jump_row(jump: CommandResult) -> tuple[Cell, ...]:
+    """Return the row of a jump."""
+    return (
+        jump.name,
+        spread_text(jump["height"]),
+        spread_text(jump["distance"], 2),
+        spread_text(jump["lift_off_velocity"], 2),
+        spread_text(jump["delay"], 2),
+        jump["along"].mean,
+        jump["flights"].mean,
+        jump["high_flights"].mean,
+        percent(jump["single"].mean),
+        percent(jump["found"].mean),
+        percent(jump["upright"].mean),
+        percent(jump["non_foot_contact"].mean),
+    )
+
+
+def _notes(evaluation: Evaluation) -> list[str]:
+    """Return what stands below the acceptance criteria."""
+    notes = []
+    estimator = evaluation.estimator
     if estimator:
-        axes = " / ".join(f"{estimator[axis]:.3f}" for axis in ("forward", "left", "up"))
         notes.append(
             f"estimator while walking: velocity RMSE {estimator['velocity']:.3f} m/s (forward / "
-            f"left / up {axes}), contacts right {percent(estimator['contacts_right'])} %"
+            f"left / up {estimator['forward']:.3f} / {estimator['left']:.3f} / "
+            f"{estimator['up']:.3f}), contacts right {percent(estimator['contacts_right'])} %"
         )
     notes.append(
         f"PASSED; {evaluation.plan['robots']} robots a command, randomization "
         f"{evaluation.about.get('randomization', '-')}, seed {evaluation.plan['seed']}, "
         f"{evaluation.seconds:.0f} s"
     )
-    found = (
-        table(
-            "command | speed error [m/s] | yaw rate error [rad/s] | mean velocity [m/s, m/s, rad/s]"
-            " | drift [m];2 | falls [%] | flight over standing [cm]",
-            walks,
-            title="Walking: mean over robots and time; in brackets with the stride averaged out",
-        ),
-        table(
-            "command | height [m] | distance [m] | lift-off up [m/s] | after [s] | along [m];2"
-            " | flights;2 | high ones;2 | one [%] | jumped [%] | upright [%]"
-            " | non-foot contact [%]",
-            jumps,
-            "non-foot contact: anything but a foot on the ground, from the jump input to 2 s after "
-            "touchdown; a trial counts no such jump as a success.",
-            title="Jumping: mean +- standard deviation over robots",
-        ),
-        check_table("Acceptance criteria", evaluation_checks(evaluation), notes),
-    )
-    return tuple(one for one in found if one.rows)
+    return notes
