@@ -1,4 +1,4 @@
-"""What a robot is: joints, drives, limits, poses and its MuJoCo model.
+"""Robots: joints, drives, limits, poses and the MuJoCo model of each.
 
 A robot is a folder with `robot.yaml` and the MJCF or URDF that it names.
 """
@@ -16,45 +16,61 @@ from pronk.robots.robot import Drive, Joint, RobotSpec
 
 ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
 """The robots that pronk brings."""
-_FILES = (".yaml", ".yml")
-_MODELS = (".xml", ".mjcf", ".urdf")
+ROBOT_SUFFIXES = (".yaml", ".yml")
+"""Endings of robot files."""
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
+"""Endings of models."""
 
 
 def load_robot(name: str | Path) -> RobotSpec:
-    """Load a robot; a RobotError says that there is none, or what is inconsistent in its files.
+    """Load a robot.
 
     Args:
-        name: A shipped robot, a path to a `robot.yaml` or its folder, to an MJCF or a URDF, or an
-            entry point of the group `pronk.robots` (a function that returns such a path).
+        name: A shipped robot (`mini_cheetah`, `go2`, `so101`); a path to a `robot.yaml` or its
+            folder, to an MJCF or a URDF; or an entry point of the group `pronk.robots`, a function
+            that returns such a path.
+
+    Returns:
+        The robot: its joints, drives, gains and poses, and a recipe for its MuJoCo model.
+
+    Raises:
+        RobotError: There is no such robot, or its files are inconsistent; the message says where.
+
+    Example:
+        >>> import pronk
+        >>> robot = pronk.load_robot("mini_cheetah")
+        >>> robot.joint("FR_knee").drive.effort_limit
     """
-    path, shipped = Path(name), str(name) in ROBOT_NAMES
+    path = Path(name)
+    shipped = str(name) in ROBOT_NAMES
     if shipped:
         path = Path(__file__).parent / str(name) / "robot.yaml"
     elif not path.exists():
-        known = entry_points(group="pronk.robots")
-        if str(name) not in known.names:
+        installed = entry_points(group="pronk.robots")
+        if str(name) not in installed.names:
             raise RobotError(
                 f"there is no robot {str(name)!r}; the robots are {', '.join(ROBOT_NAMES)}, or "
                 "give the path of a robot.yaml, an MJCF or a URDF."
             )
-        path = Path(load_entry_point(known[str(name)])())
+        path = Path(load_entry_point(installed[str(name)])())
     if path.is_dir():
         path = path / "robot.yaml"
-    if path.suffix not in _FILES + _MODELS:
+    if path.suffix not in ROBOT_SUFFIXES + MODEL_SUFFIXES:
         raise RobotError(f"{path}: expected a robot.yaml, or a model ending in .xml or .urdf.")
     try:
-        robot = _load(path.resolve(), path.stat().st_mtime_ns)
+        robot = _read(path.resolve(), path.stat().st_mtime_ns)
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
     return replace(robot, source=str(name) if shipped else str(path.resolve()))
 
 
 @lru_cache
-def _load(path: Path, _changed: int) -> RobotSpec:
+def _read(path: Path, _modified_ns: int) -> RobotSpec:
+    """Read a robot file or a model once for each time of its last modification."""
     from pronk.robots.bare import file_of_model
     from pronk.robots.load import make_robot, read_model, read_robot
 
-    if path.suffix in _MODELS:
+    if path.suffix in MODEL_SUFFIXES:
         return make_robot(file_of_model(path), read_model(path), str(path))
     return read_robot(path)
 

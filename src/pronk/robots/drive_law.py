@@ -32,9 +32,10 @@ LAWS = ("explicit", "implicit_damping", "implicit")
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLaw:
-    """One drive law."""
+    """Drive law of a simulator."""
 
     kind: Literal["explicit", "implicit_damping", "implicit"] = "explicit"
+    """Which of the three laws above it is."""
     iterations: int = 1
     """Parts of a physics step that law `implicit` computes one after the other."""
     passive_damping: Literal["implicit", "explicit"] = "implicit"
@@ -58,16 +59,28 @@ class DriveLaw:
 
     @property
     def label(self) -> str:
-        """Short name: E, IF or I with the number of iterations."""
-        return {"explicit": "E", "implicit_damping": "IF"}.get(self.kind, f"I{self.iterations}")
+        """Short name: E, IF, or I with the number of iterations."""
+        if self.kind == "explicit":
+            return "E"
+        if self.kind == "implicit_damping":
+            return "IF"
+        return f"I{self.iterations}"
 
     def substep(self, timestep: float) -> float:
-        """Step of the integration within a physics step [s]."""
+        """Return the step of the integration within a physics step [s]."""
         return timestep / self.iterations
 
     def damping(self, stiffness: Value, damping: Value, substep: float) -> Value:
-        """Damping [N m s/rad] that gives this law where only damping is implicit."""
-        return damping + substep * stiffness if self.kind == "implicit" else damping
+        """Return the damping that gives this law where only damping is implicit [N m s/rad].
+
+        Args:
+            stiffness: Stiffness of the drive [N m/rad].
+            damping: Damping of the drive [N m s/rad].
+            substep: Step of the integration [s].
+        """
+        if self.kind == "implicit":
+            return damping + substep * stiffness
+        return damping
 
 
 EXPLICIT = DriveLaw()

@@ -15,29 +15,34 @@ from pronk.robots import load_robot
 
 @dataclass(frozen=True, kw_only=True)
 class Legged:
-    """Legs `LEG` with joints `LEG_JOINT`; the last two turn a thigh and a shank."""
+    """Dimensions of a robot with legs, of which the last two joints turn a thigh and a shank."""
 
     legs: tuple[str, ...]
+    """Prefixes of the joints of each leg."""
     leg_joints: tuple[str, ...]
+    """Joints of a leg from the hip down, without the prefix."""
     default_position: dict[str, float]
-    """By joint of a leg [rad]."""
+    """Position of each joint of a leg in the default pose [rad]."""
     thigh_length: float
-    """Axis of the thigh's joint to knee axis, in the plane of the leg [m]."""
+    """Distance from the axis of the thigh's joint to the knee, in the plane of the leg [m]."""
     shank_length: float
-    """Knee axis to the centre of the foot [m]."""
+    """Distance from the axis of the knee to the centre of the foot [m]."""
     foot_radius: float
-    """[m]"""
+    """Radius of the spherical foot [m]."""
     standing_height: float
     """Height of the base over the floor in the default pose [m]."""
     total_mass: float
-    """[kg]"""
+    """Mass of the whole robot [kg]."""
     base_mass: float
-    """[kg]"""
+    """Mass of the base [kg]."""
 
 
 @lru_cache
 def legged(name: str | Path) -> Legged:
     """Read the dimensions of a robot from its first leg, whose foot is a sphere on the shank.
+
+    Args:
+        name: A robot, as of `load_robot`.
 
     Raises:
         RobotError: The robot has no legs, or its first leg has no such foot.
@@ -49,15 +54,18 @@ def legged(name: str | Path) -> Legged:
     joints = [joint for joint in robot.joints if joint.name.startswith(leg)]
     model = robot.build_spec().compile()
     shank = model.joint(joints[-1].name).bodyid[0]
-    spheres = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
-    feet = np.flatnonzero(spheres & (model.geom_bodyid == shank))
+    is_sphere = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    feet = np.flatnonzero(is_sphere & (model.geom_bodyid == shank))
     if not len(feet):
         raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
     base = model.body(robot.base_body)
+    default_position = {}
+    for joint in joints:
+        default_position[joint.name.removeprefix(leg)] = joint.default_position
     return Legged(
         legs=robot.legs,
-        leg_joints=tuple(joint.name.removeprefix(leg) for joint in joints),
-        default_position={j.name.removeprefix(leg): j.default_position for j in joints},
+        leg_joints=tuple(default_position),
+        default_position=default_position,
         thigh_length=float(-model.body_pos[shank, 2]),
         shank_length=float(-model.geom_pos[feet[-1], 2]),
         foot_radius=float(model.geom_size[feet[-1], 0]),

@@ -1,4 +1,4 @@
-"""A robot as data: joints, drives, the gains on them, and the bench test of each joint."""
+"""RobotSpec: a robot as data, with its joints, drives, gains, and the bench test of each joint."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """Motor, gearbox and inverter of one joint. Joint side unless the name contains motor."""
+    """Motor, gearbox and inverter of one joint.
+
+    Quantities are those at the joint, behind the gear, unless their text says motor side.
+    """
 
     gear_ratio: float
-    """Motor revolutions per joint revolution."""
+    """Revolutions of the motor per revolution of the joint."""
     rotor_inertia: float
-    """Inertia of the rotor about its own axis, motor side [kg m^2]."""
+    """Inertia of the rotor about its axis, motor side [kg m^2]."""
     stall_torque: float
     """Torque at standstill with the full bus voltage across the winding [N m]."""
     no_load_speed: float
@@ -34,39 +37,52 @@ class Drive:
     viscous_damping: float
     """Viscous friction [N m s/rad]."""
     bus_voltage: float
-    """Nominal supply [V]."""
+    """Nominal voltage of the supply [V]."""
     resistance: float
-    """Winding resistance, phase, motor side [ohm]."""
+    """Resistance of the winding of one phase, motor side [ohm]."""
     torque_constant: float
     """Torque per ampere, motor side [N m/A]."""
     stribeck_speed: float = 0.0
     """Speed V of dry friction `F (1 - share (1 - exp(-(speed / V)^2)))`, whose share a match of
-    whole chains fits [rad/s]; 0: the dry friction F does not depend on speed."""
+    whole chains fits [rad/s]; 0 if the dry friction F does not depend on speed."""
 
     def __post_init__(self) -> None:
         """Refuse values that must be positive and are not, and negative friction."""
-        positive = ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage")
-        least = ("rotor_inertia", "frictionloss", "viscous_damping", "stribeck_speed")
-        for name in (*positive, *least):
-            value = getattr(self, name)
-            if not (value > 0.0 if name in positive else value >= 0.0):
-                expected = "positive" if name in positive else "0 or more"
-                raise RobotError(f"Drive.{name} is {value}; expected {expected}.")
+        positive = {
+            "gear_ratio": self.gear_ratio,
+            "stall_torque": self.stall_torque,
+            "no_load_speed": self.no_load_speed,
+            "effort_limit": self.effort_limit,
+            "bus_voltage": self.bus_voltage,
+        }
+        for name, value in positive.items():
+            if not value > 0.0:
+                raise RobotError(f"Drive.{name} is {value}; expected positive.")
+        not_negative = {
+            "rotor_inertia": self.rotor_inertia,
+            "frictionloss": self.frictionloss,
+            "viscous_damping": self.viscous_damping,
+            "stribeck_speed": self.stribeck_speed,
+        }
+        for name, value in not_negative.items():
+            if not value >= 0.0:
+                raise RobotError(f"Drive.{name} is {value}; expected 0 or more.")
 
     @property
     def armature(self) -> float:
-        """Rotor inertia reflected through the gear, `rotor_inertia * gear_ratio**2` [kg m^2]."""
+        """Rotor inertia at the joint, `rotor_inertia * gear_ratio**2` [kg m^2]."""
         return self.rotor_inertia * self.gear_ratio**2
 
     @property
     def motor(self) -> tuple[float, float]:
-        """Constants of the gearless one-phase motor with this torque-speed line, joint side.
+        """Constants (K, R) of the gearless one-phase motor with this torque-speed line.
 
         `K = V / no_load_speed` [N m/A] = [V s/rad] and `R = K V / stall_torque` [ohm], so that
         `torque = K (V - K speed) / R`.
         """
         constant = self.bus_voltage / self.no_load_speed
-        return constant, constant * self.bus_voltage / self.stall_torque
+        resistance = constant * self.bus_voltage / self.stall_torque
+        return constant, resistance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,23 +90,24 @@ class Joint:
     """One actuated joint and how it is excited on the bench."""
 
     name: str
-    """`LEG_JOINT`, for instance FR_hip_roll."""
+    """Name of the joint, `LEG_JOINT` for a robot with legs, for instance FR_hip_roll."""
     group: str
-    """Joints that are built alike and share training gains, for instance hip_roll."""
+    """Name of the joints that are built alike and share training gains, for instance hip_roll."""
     drive: Drive
+    """Motor, gearbox and inverter."""
     range: tuple[float, float]
-    """Mechanical limits [rad]."""
+    """Lower and upper mechanical limit [rad]."""
     default_position: float
     """Position in the default pose, also the pose of the sweep [rad]."""
     folded_position: float | None = None
     """Position of a robot that lies with its feet under its hips, ready to rise [rad]; None for one
     that does not stand."""
     stiffness: float
-    """Proportional gain on the real drive [N m/rad]."""
+    """Nominal stiffness, the proportional gain on the real drive [N m/rad]."""
     damping: float
-    """Derivative gain on the real drive [N m s/rad]."""
+    """Nominal damping, the derivative gain on the real drive [N m s/rad]."""
     band_hz: tuple[float, float]
-    """Frequencies at which the match compares magnitudes [Hz]."""
+    """Lowest and highest frequency at which the match compares magnitudes [Hz]."""
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically while this one is excited; the rest are held by their drives."""
     chain: tuple[str, ...] = ()
@@ -102,37 +119,44 @@ class Joint:
     None for the original of each family.
     """
     own_name: str = ""
-    """Its name in the models of the robot's maker, for exports; empty if it is `name`."""
+    """Name of the joint in the models of the robot's maker, for exports; empty if it is `name`."""
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Its own stiffness, damping, armature and frictionloss, as a simulator sets them."""
-        drive = {"armature": self.drive.armature, "frictionloss": self.drive.frictionloss}
-        return {"stiffness": self.stiffness, "damping": self.damping, **drive}
+        """Nominal stiffness, damping, armature and frictionloss, as a simulator sets them."""
+        return {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "armature": self.drive.armature,
+            "frictionloss": self.drive.frictionloss,
+        }
 
     @property
     def original(self) -> tuple[str, float]:
-        """The joint to simulate in this one's place, and the sign between their coordinates."""
+        """Joint to simulate in place of this one, and the sign between their coordinates."""
         return self.mirror or (self.name, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpec:
-    """A robot: joints in file order, timing, and a recipe for its MuJoCo model."""
+    """A robot: its joints, the timing of its commands, and a recipe for its MuJoCo model."""
 
     name: str
+    """Name of the robot, which logs, gains and policies hold."""
     joints: tuple[Joint, ...]
+    """Joints in the order of the model, which every file and table keeps."""
     build_spec: Callable[[], mujoco.MjSpec] = field(repr=False)
-    """Builds a fresh, free-floating (or, for an arm, fixed) model without actuators."""
+    """Function that builds a fresh model without actuators, free-floating or, for an arm, fixed."""
     base_body: str
     """Body that the bench holds still."""
     legs: tuple[str, ...] = ()
     """Prefixes of the joints of each leg, from the hip down; empty for a robot without legs."""
     source: str = ""
-    """What `load_robot` reads it from: a shipped name or a path."""
+    """What `load_robot` reads the robot from: a shipped name or a path."""
     policy_rate_hz: float = 50.0
+    """Rate of the commands to the joints [Hz]."""
     timestep_s: float = 0.005
-    """Physics step of the training simulator."""
+    """Physics step of the training simulator [s]."""
     decimation: int = 4
     """Physics steps per policy step."""
     law: DriveLaw = EXPLICIT
@@ -142,7 +166,14 @@ class RobotSpec:
     grid_damping: tuple[float, float] = (0.1, 0.7)
     """Damping axis of the grid search [N m s/rad] (paper F7)."""
     limits: OperatingLimits = field(default_factory=OperatingLimits)
-    """Limits of its commands and measurements, for the safety filter of a deployment."""
+    """Limits of commands and measurements, for the safety filter of a deployment."""
+
+    def __repr__(self) -> str:
+        """Name the robot, the number of its joints and its timing."""
+        return (
+            f"<RobotSpec {self.name}: {len(self.joints)} joints, commands at "
+            f"{self.policy_rate_hz:g} Hz, timestep {self.timestep_s:g} s>"
+        )
 
     def __post_init__(self) -> None:
         """Check that names are unique and every reference resolves."""
@@ -168,7 +199,7 @@ class RobotSpec:
         return tuple(dict.fromkeys(joint.group for joint in self.joints))
 
     def joint(self, name: str) -> Joint:
-        """The joint called `name`; a RobotError lists those there are."""
+        """Return the joint of a name; a RobotError for an unknown one lists the joints."""
         for joint in self.joints:
             if joint.name == name:
                 return joint
@@ -177,23 +208,39 @@ class RobotSpec:
         )
 
     def branches(self, names: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """Some joints by the chains that hold them; with the base fixed, these move independently.
+        """Divide some joints by the chains that hold them.
 
-        Yields the joint whose chain it is, the shortest with most of the joints that are left, and
-        those of `names` that it holds.
+        With the base fixed the chains move independently. Each is the shortest of those that hold
+        most of the joints that no earlier one holds.
+
+        Args:
+            names: Names of joints.
+
+        Yields:
+            The joint whose chain it is, and those of `names` that the chain holds.
         """
-        left = [name for name in self.joint_names if name in names]
-        while left:
-            roots = [joint for joint in self.joints if left[0] in joint.chain]
-            root = max(roots, key=lambda one: (len(set(one.chain) & set(left)), -len(one.chain)))
-            yield root.name, tuple(name for name in left if name in root.chain)
-            left = [name for name in left if name not in root.chain]
+        remaining = [name for name in self.joint_names if name in names]
+        while remaining:
+            candidates = [joint for joint in self.joints if remaining[0] in joint.chain]
+            best = candidates[0]
+            for candidate in candidates[1:]:
+                if _covers_more(candidate.chain, best.chain, remaining):
+                    best = candidate
+            yield best.name, tuple(name for name in remaining if name in best.chain)
+            remaining = [name for name in remaining if name not in best.chain]
 
     def group(self, name: str) -> tuple[Joint, ...]:
-        """The joints of one group, in file order; a RobotError lists the groups."""
+        """Return the joints of one group; a RobotError for an unknown one lists the groups."""
         members = tuple(joint for joint in self.joints if joint.group == name)
         if not members:
             raise RobotError(
                 f"{self.name} has no joint group {name!r}; its groups are {', '.join(self.groups)}."
             )
         return members
+
+
+def _covers_more(chain: Collection[str], best: Collection[str], names: Collection[str]) -> bool:
+    """Return whether a chain holds more joints than the best one, or as many and is shorter."""
+    count = len(set(chain) & set(names))
+    best_count = len(set(best) & set(names))
+    return count > best_count or (count == best_count and len(chain) < len(best))
