@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import msgspec
 import mujoco
@@ -27,17 +27,19 @@ from pronk.robots.limits import OperatingLimits
 from pronk.robots.model import set_inertia
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
+T = TypeVar("T")
+
 SCHEMA = "pronk/robot/1"
-_MIRROR_TOLERANCE = 1e-9
+MIRROR_TOLERANCE = 1e-9
 """Largest relative difference of inertia and bias forces of joints that mirror each other."""
-_ROUNDING = 1e-3
-"""How far a pose may be outside of a range by its rounding to four digits [rad]."""
-_MOTORS = {1: (1.0, 1.0), 3: (1.5, 2.0)}
-"""By phases: torque over `kt i`, and back-EMF over `kt omega`. Of a three-phase motor with peak
-currents, as in Cheetah-Software's ActuatorModel.h, torque is 1.5 kt i, and the back-EMF that fits
-under the bus voltage 2 kt omega."""
+POSE_ROUNDING = 1e-3
+"""Distance by which a pose may be outside of a range by its rounding to four digits [rad]."""
+MOTOR_FACTORS = {1: (1.0, 1.0), 3: (1.5, 2.0)}
+"""Torque over `kt i` and back-EMF over `kt omega`, by the number of phases. Of a three-phase motor
+with peak currents, as in Cheetah-Software's ActuatorModel.h, torque is 1.5 kt i, and the back-EMF
+that fits under the bus voltage 2 kt omega."""
 _Positive = Annotated[float, Meta(gt=0.0)]
-_Least = Annotated[float, Meta(ge=0.0)]
+_NotNegative = Annotated[float, Meta(ge=0.0)]
 _Band = tuple[_Positive, _Positive]
 
 
@@ -51,51 +53,59 @@ class DriveEntry(_Entry, frozen=True):
     effort_limit: _Positive
     bus_voltage: _Positive = 24.0
     gear_ratio: _Positive = 1.0
-    rotor_inertia: _Least | None = None
-    armature: _Least | None = None
+    rotor_inertia: _NotNegative | None = None
+    armature: _NotNegative | None = None
     stall_torque: _Positive | None = None
     no_load_speed: _Positive | None = None
     torque_constant: _Positive | None = None
     joint_torque_constant: _Positive | None = None
     resistance: _Positive | None = None
     phases: int = 3
-    frictionloss: _Least = 0.0
-    viscous_damping: _Least = 0.0
-    stribeck_speed: _Least = 0.0
+    frictionloss: _NotNegative = 0.0
+    viscous_damping: _NotNegative = 0.0
+    stribeck_speed: _NotNegative = 0.0
 
     def drive(self, source: str) -> Drive:
         """Make the drive; a RobotError names what is missing of its torque-speed line."""
-        gear, volts = self.gear_ratio, self.bus_voltage
-        if self.phases not in _MOTORS:
+        if self.phases not in MOTOR_FACTORS:
             raise RobotError(f"{source}: phases is {self.phases}; expected 1 (brushed) or 3.")
         if self.armature is not None and self.rotor_inertia is not None:
             raise RobotError(f"{source}: give rotor_inertia or armature, not both.")
-        torque_factor, emf_factor = _MOTORS[self.phases]
-        constant, resistance = self.torque_constant, self.resistance
+        gear_ratio = self.gear_ratio
+        voltage = self.bus_voltage
+        torque_factor, emf_factor = MOTOR_FACTORS[self.phases]
+        torque_constant = self.torque_constant
         if self.joint_torque_constant is not None:
-            constant = self.joint_torque_constant / gear
-        stall, free = self.stall_torque, self.no_load_speed
-        if constant is not None and resistance is not None:
-            stall = torque_factor * gear * constant * volts / resistance
-            free = volts / (emf_factor * gear * constant)
-        elif stall is not None and free is not None:
-            constant = volts / (emf_factor * gear * free)
-            resistance = torque_factor * gear * constant * volts / stall
+            torque_constant = self.joint_torque_constant / gear_ratio
+        resistance = self.resistance
+        stall_torque = self.stall_torque
+        no_load_speed = self.no_load_speed
+        if torque_constant is not None and resistance is not None:
+            stall_torque = torque_factor * gear_ratio * torque_constant * voltage / resistance
+            no_load_speed = voltage / (emf_factor * gear_ratio * torque_constant)
+        elif stall_torque is not None and no_load_speed is not None:
+            torque_constant = voltage / (emf_factor * gear_ratio * no_load_speed)
+            resistance = torque_factor * gear_ratio * torque_constant * voltage / stall_torque
         else:
             raise RobotError(
                 f"{source}: the torque-speed line is missing; give stall_torque and no_load_speed, "
                 "or torque_constant and resistance."
             )
-        rotor = (self.armature or 0.0) / gear**2
-        friction = ("frictionloss", "viscous_damping", "stribeck_speed")
-        same = ("gear_ratio", "bus_voltage", "effort_limit", *friction)
+        rotor_inertia = self.rotor_inertia
+        if rotor_inertia is None:
+            rotor_inertia = (self.armature or 0.0) / gear_ratio**2
         return Drive(
-            rotor_inertia=rotor if self.rotor_inertia is None else self.rotor_inertia,
-            stall_torque=stall,
-            no_load_speed=free,
+            gear_ratio=gear_ratio,
+            rotor_inertia=rotor_inertia,
+            stall_torque=stall_torque,
+            no_load_speed=no_load_speed,
+            effort_limit=self.effort_limit,
+            frictionloss=self.frictionloss,
+            viscous_damping=self.viscous_damping,
+            bus_voltage=voltage,
             resistance=resistance,
-            torque_constant=constant,
-            **{name: getattr(self, name) for name in same},
+            torque_constant=torque_constant,
+            stribeck_speed=self.stribeck_speed,
         )
 
 
@@ -196,35 +206,61 @@ class Model:
 
 @lru_cache
 def read_model(path: Path) -> Model:
-    """Read an MJCF or URDF; angles in radians, explicit inertias, no meshes and drives."""
+    """Read an MJCF or URDF: angles in radians, explicit inertias, no meshes and no drives.
+
+    Args:
+        path: File of the model.
+
+    Raises:
+        RobotError: MuJoCo cannot read the file.
+    """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         text = path.read_text(encoding="utf-8")
-        compiler = spec.compiler
-        # An MJCF that needs nothing resolved keeps all digits of its numbers.
-        if not (
-            path.suffix == ".urdf" or "<include" in text or compiler.degree or compiler.fusestatic
-        ) and not (spec.actuators or spec.meshes or spec.frames or spec.sensors):
+        if _is_plain(spec, text, path):
             spec.compile()
-            return Model(text)
-        compiler.fusestatic = False
-        model = spec.compile()
+            return Model(text)  # as it is, with all digits of its numbers
+        spec.compiler.fusestatic = False
+        compiled = spec.compile()
         for body in spec.bodies[1:]:
             if not body.explicitinertial:
-                set_inertia(body, model)
-        for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]:
-            spec.delete(geom)
-        unused = (spec.pairs, spec.sensors, spec.keys, spec.actuators, spec.skins, spec.meshes)
-        for elements in (*unused, spec.materials, spec.textures):
-            for element in list(elements):
-                spec.delete(element)
+                set_inertia(body, compiled)
+        _delete_unused(spec)
         spec.compile()
-        made = Model(spec.to_xml())
-        made().compile()  # MuJoCo writes XML that it cannot read where a number is not finite.
-        return made
+        model = Model(spec.to_xml())
+        model().compile()  # MuJoCo writes XML that it cannot read where a number is not finite.
+        return model
     except (ValueError, OSError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
+
+
+def _is_plain(spec: mujoco.MjSpec, text: str, path: Path) -> bool:
+    """Return whether nothing in an MJCF has to be resolved or removed."""
+    compiler = spec.compiler
+    resolved = path.suffix == ".urdf" or "<include" in text
+    resolved = resolved or compiler.degree or compiler.fusestatic
+    removed = spec.actuators or spec.meshes or spec.frames or spec.sensors
+    return not resolved and not removed
+
+
+def _delete_unused(spec: mujoco.MjSpec) -> None:
+    """Delete meshes and what a model without drives does not need."""
+    for geom in list(spec.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
+            spec.delete(geom)
+    for elements in (
+        spec.pairs,
+        spec.sensors,
+        spec.keys,
+        spec.actuators,
+        spec.skins,
+        spec.meshes,
+        spec.materials,
+        spec.textures,
+    ):
+        for element in list(elements):
+            spec.delete(element)
 
 
 def read_robot(path: Path) -> RobotSpec:
@@ -237,7 +273,16 @@ def read_robot(path: Path) -> RobotSpec:
 
 
 def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
-    """Join a robot file with its model; a RobotError names the entry that is inconsistent."""
+    """Join a robot file with its model.
+
+    Args:
+        file: Content of the `robot.yaml`.
+        build: The model.
+        source: Name of the file, with which errors begin.
+
+    Raises:
+        RobotError: An entry is missing or inconsistent; the message names it.
+    """
     ticks = file.timestep_s * file.decimation * file.policy_rate_hz
     if abs(ticks - 1.0) > 1e-9:
         raise RobotError(
@@ -245,117 +290,176 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
             "command for `decimation` steps of the simulator."
         )
     model = build().compile()
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    base = file.base_body or (model.body(model.jnt_bodyid[free[0]]).name if len(free) else "world")
-    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base) < 0:
-        raise RobotError(f"{source}: base_body {base!r} is not a body of the model.")
-    hinges = {
-        model.joint(i).name: _limb(model, int(model.jnt_bodyid[i]), model.body(base).id)
-        for i in range(model.njnt)
-        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
-    }
-    groups = _groups(file, hinges, source)
-    timing = ("policy_rate_hz", "timestep_s", "decimation")
-    copied = ("legs", *timing, "grid_stiffness", "grid_damping")
+    base_body = file.base_body or _floating_body(model)
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base_body) < 0:
+        raise RobotError(f"{source}: base_body {base_body!r} is not a body of the model.")
+    limbs = {}
+    for index in range(model.njnt):
+        if model.jnt_type[index] == mujoco.mjtJoint.mjJNT_HINGE:
+            body = int(model.jnt_bodyid[index])
+            limbs[model.joint(index).name] = _limb(model, body, model.body(base_body).id)
+    groups = _groups(file, limbs, source)
+    joints = []
+    for name, limb in limbs.items():
+        limb_joints = [other for other in limbs if limbs[other] == limb]
+        joints.append(_joint(file, model, name, groups[name], limb_joints, source))
     robot = RobotSpec(
         name=file.name,
-        joints=tuple(_joint(file, model, name, hinges, groups[name], source) for name in hinges),
+        joints=tuple(joints),
         build_spec=build,
-        base_body=base,
-        **{name: getattr(file, name) for name in copied},
+        base_body=base_body,
+        legs=file.legs,
+        policy_rate_hz=file.policy_rate_hz,
+        timestep_s=file.timestep_s,
+        decimation=file.decimation,
+        grid_stiffness=file.grid_stiffness,
+        grid_damping=file.grid_damping,
         limits=file.limits.limits(),
     )
     _verify_mirrors(robot, model, source)
     return robot
 
 
-def _groups(file: RobotFile, hinges: Iterable[str], source: str) -> dict[str, str]:
-    """The group of each hinge."""
-    found: dict[str, str] = {}
+def _floating_body(model: mujoco.MjModel) -> str:
+    """Return the name of the body that floats; the world of a model with a fixed base."""
+    free_joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    if not len(free_joints):
+        return "world"
+    return str(model.body(model.jnt_bodyid[free_joints[0]]).name)
+
+
+def _limb(model: mujoco.MjModel, body: int, base: int) -> int:
+    """Return the child of the base under which a body is."""
+    while model.body_parentid[body] not in (base, 0):
+        body = int(model.body_parentid[body])
+    return int(body)
+
+
+def _groups(file: RobotFile, joints: Iterable[str], source: str) -> dict[str, str]:
+    """Return the group of each hinge joint."""
+    groups: dict[str, str] = {}
     for name, group in file.groups.items():
-        members = fnmatch.filter(hinges, group.joints or name)
+        members = fnmatch.filter(joints, group.joints or name)
         if not members:
             raise RobotError(
                 f"{source}: groups.{name} matches no hinge joint of the model; those are "
-                f"{', '.join(hinges)}."
+                f"{', '.join(joints)}."
             )
         for joint in members:
-            if joint in found:
-                raise RobotError(f"{source}: {joint} is in the groups {found[joint]} and {name}.")
-            found[joint] = name
-    if missing := [name for name in hinges if name not in found]:
+            if joint in groups:
+                raise RobotError(f"{source}: {joint} is in the groups {groups[joint]} and {name}.")
+            groups[joint] = name
+    missing = [name for name in joints if name not in groups]
+    if missing:
         raise RobotError(f"{source}: {', '.join(missing)} is in no group; add one that matches it.")
-    return found
+    return groups
 
 
 def _joint(
     file: RobotFile,
     model: mujoco.MjModel,
     name: str,
-    limbs: Mapping[str, int],
     group: str,
+    limb_joints: Sequence[str],
     source: str,
 ) -> Joint:
-    """One joint, from its group, the defaults, the poses and the model."""
-    own = file.groups[group]
-    entry: dict[str, Any] = {}
-    for field in ("drive", "stiffness", "damping", "band_hz"):
-        stated = (getattr(one, field) for one in (own, file.defaults))
-        entry[field] = next((value for value in stated if value is not None), None)
-        if entry[field] is None:
-            raise RobotError(f"{source}: groups.{group}.{field} is missing.")
-    drive = entry.pop("drive")
+    """Make a joint from its group, the defaults, the poses and the model."""
+    entry = file.groups[group]
+    defaults = file.defaults
+    place = f"{source}: groups.{group}"
+    drive = _stated(entry.drive, defaults.drive, f"{place}.drive")
     if drive not in file.drives:
         drives = ", ".join(file.drives)
-        raise RobotError(f"{source}: groups.{group}.drive is {drive!r}; the drives are {drives}.")
-    limb = [other for other in limbs if limbs[other] == limbs[name]]
-    patterns = own.clamped or file.defaults.clamped
-    clamped = tuple(other for other in limb if any(fnmatch.fnmatch(other, p) for p in patterns))
-    (low, high), limited = model.joint(name).range, model.jnt_limited[model.joint(name).id]
-    mirror = None
-    for prefix, original in file.symmetry.mirror.items():
-        if name.startswith(f"{prefix}_"):
-            sign = -1.0 if name in file.symmetry.negated else 1.0
-            mirror = (original + name.removeprefix(prefix), sign)
-    position: dict[str, float] = {}
-    for pose in ("default", "folded") if "folded" in file.poses else ("default",):
-        angles = file.poses.get(pose, {})
-        if name not in angles and group not in angles:
-            raise RobotError(f"{source}: poses.{pose} has no entry for {name} or {group}.")
-        position[pose] = angle = float(angles[name if name in angles else group])
-        if limited and not low - _ROUNDING <= angle <= high + _ROUNDING:
-            raise RobotError(
-                f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
-                f"{low:g} to {high:g} rad."
-            )
-    pattern, theirs = own.joints or group, own.own_names or ""
-    if theirs and not pattern.count("*") == theirs.count("*") == 1:
-        raise RobotError(
-            f"{source}: groups.{group}.own_names is {theirs!r} for joints {pattern!r}; expected "
-            "one star in both."
-        )
-    before, _, after = pattern.partition("*")
-    stem = name.removeprefix(before).removesuffix(after)
+        raise RobotError(f"{place}.drive is {drive!r}; the drives are {drives}.")
+    stiffness = _stated(entry.stiffness, defaults.stiffness, f"{place}.stiffness")
+    damping = _stated(entry.damping, defaults.damping, f"{place}.damping")
+    band_hz = _stated(entry.band_hz, defaults.band_hz, f"{place}.band_hz")
+
+    clamped = []
+    for other in limb_joints:
+        if _matches_any(other, entry.clamped or defaults.clamped):
+            clamped.append(other)
+    chain = [other for other in limb_joints if other not in clamped]
+    folded_position = None
+    if "folded" in file.poses:
+        folded_position = _pose_angle(file, model, "folded", name, group, source)
+    joint_range = (-math.pi, math.pi)
+    if model.jnt_limited[model.joint(name).id]:
+        low, high = model.joint(name).range
+        joint_range = (float(low), float(high))
     return Joint(
         name=name,
-        own_name=theirs.replace("*", stem),
+        own_name=_maker_name(entry, name, group, source),
         group=group,
         drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
-        range=(float(low), float(high)) if limited else (-math.pi, math.pi),
-        default_position=position["default"],
-        folded_position=position.get("folded"),
-        clamped=clamped,
-        chain=tuple(other for other in limb if other not in clamped),
-        mirror=mirror,
-        **entry,
+        range=joint_range,
+        default_position=_pose_angle(file, model, "default", name, group, source),
+        folded_position=folded_position,
+        stiffness=stiffness,
+        damping=damping,
+        band_hz=band_hz,
+        clamped=tuple(clamped),
+        chain=tuple(chain),
+        mirror=_mirror(file.symmetry, name),
     )
 
 
-def _limb(model: mujoco.MjModel, body: int, base: int) -> int:
-    """The child of the base under which a body is."""
-    while model.body_parentid[body] not in (base, 0):
-        body = int(model.body_parentid[body])
-    return int(body)
+def _stated(value: T | None, default: T | None, place: str) -> T:
+    """Return the value of a group, or else that of the defaults; refuse if there is neither."""
+    if value is not None:
+        return value
+    if default is not None:
+        return default
+    raise RobotError(f"{place} is missing.")
+
+
+def _matches_any(name: str, patterns: Iterable[str]) -> bool:
+    """Return whether a name matches one of some patterns of a shell."""
+    return any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
+
+
+def _mirror(symmetry: SymmetryEntry, name: str) -> tuple[str, float] | None:
+    """Return the joint that a joint mirrors and the sign between their coordinates."""
+    mirror = None
+    for prefix, original in symmetry.mirror.items():
+        if name.startswith(f"{prefix}_"):
+            sign = -1.0 if name in symmetry.negated else 1.0
+            mirror = (original + name.removeprefix(prefix), sign)
+    return mirror
+
+
+def _pose_angle(
+    file: RobotFile, model: mujoco.MjModel, pose: str, name: str, group: str, source: str
+) -> float:
+    """Return the position of a joint in a pose by its entry, or else by its group's [rad]."""
+    angles = file.poses.get(pose, {})
+    if name not in angles and group not in angles:
+        raise RobotError(f"{source}: poses.{pose} has no entry for {name} or {group}.")
+    angle = float(angles[name] if name in angles else angles[group])
+    low, high = model.joint(name).range
+    limited = model.jnt_limited[model.joint(name).id]
+    if limited and not low - POSE_ROUNDING <= angle <= high + POSE_ROUNDING:
+        raise RobotError(
+            f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
+            f"{low:g} to {high:g} rad."
+        )
+    return angle
+
+
+def _maker_name(entry: GroupEntry, name: str, group: str, source: str) -> str:
+    """Return the name of a joint in the models of the robot's maker; empty if none is stated."""
+    pattern = entry.joints or group
+    maker_pattern = entry.own_names or ""
+    if not maker_pattern:
+        return ""
+    if pattern.count("*") != 1 or maker_pattern.count("*") != 1:
+        raise RobotError(
+            f"{source}: groups.{group}.own_names is {maker_pattern!r} for joints {pattern!r}; "
+            "expected one star in both."
+        )
+    before, _, after = pattern.partition("*")
+    stem = name.removeprefix(before).removesuffix(after)
+    return maker_pattern.replace("*", stem)
 
 
 def _verify_mirrors(robot: RobotSpec, model: mujoco.MjModel, source: str) -> None:
@@ -363,28 +467,31 @@ def _verify_mirrors(robot: RobotSpec, model: mujoco.MjModel, source: str) -> Non
     mirrored = [joint for joint in robot.joints if joint.mirror]
     if not mirrored:
         return
-    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data = mujoco.MjData(model)
     dof = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in robot.joints}
     # The same pose about the default one, and the same speeds, in the originals' coordinates.
     for joint in robot.joints:
         original, sign = joint.original
         phase = 1.0 + robot.joint_names.index(original)
-        at = model.joint(joint.name).qposadr[0]
-        data.qpos[at] = joint.default_position + sign * (0.2 * math.sin(phase))
+        address = model.joint(joint.name).qposadr[0]
+        data.qpos[address] = joint.default_position + sign * (0.2 * math.sin(phase))
         data.qvel[dof[joint.name]] = sign * math.cos(phase)
     mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, full)
-    scale = max(np.abs(full[d, d]) for d in dof.values())
-    force = max(np.abs(data.qfrc_bias[d]) for d in dof.values())
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    force = data.qfrc_bias
+    largest_mass = max(np.abs(mass[index, index]) for index in dof.values())
+    largest_force = max(np.abs(force[index]) for index in dof.values())
     for joint in mirrored:
         original, sign = joint.original
-        error = abs(data.qfrc_bias[dof[joint.name]] - sign * data.qfrc_bias[dof[original]]) / force
+        force_difference = force[dof[joint.name]] - sign * force[dof[original]]
+        error = abs(force_difference) / largest_force
         for other in joint.chain:
-            first, other_sign = robot.joint(other).original
-            own = full[dof[joint.name], dof[other]]
-            theirs = sign * other_sign * full[dof[original], dof[first]]
-            error = max(error, abs(own - theirs) / scale)
-        if not error <= _MIRROR_TOLERANCE:
+            other_original, other_sign = robot.joint(other).original
+            joint_mass = mass[dof[joint.name], dof[other]]
+            original_mass = sign * other_sign * mass[dof[original], dof[other_original]]
+            error = max(error, abs(joint_mass - original_mass) / largest_mass)
+        if not error <= MIRROR_TOLERANCE:
             raise RobotError(
                 f"{source}: {joint.name} does not mirror {original} with sign {sign:+.0f}: inertia "
                 f"or gravity differ by {error:.2g} of the largest; correct symmetry.mirror or "

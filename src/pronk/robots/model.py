@@ -31,19 +31,27 @@ from pronk.errors import RobotError
 from pronk.robots.drive_law import EXPLICIT, DriveLaw
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
-_POSITION_INPUT = 1  # dcmotor input_mode: control is a position command
-_KP, _KD = 4, 6  # where MuJoCo 3.11 packs controller[0] and controller[2] in actuator_gainprm
-_BRISTLE, _FRICTION = slice(5, 7), slice(3, 6)
-"""Where it packs lugre[:2] in actuator_dynprm and lugre[2:] in actuator_biasprm."""
-_BRISTLE_ANGLE = 0.5
-"""Radians that the bristles of dry friction with a Stribeck speed turn a physics step, at a damping
-ratio of a half, with the inertia of the joint. They are as stiff as an explicit step allows: of a
-servo of the SO-101 280 N m/rad at 5 ms, which is within 2 mrad of bristles a hundred times as stiff
-at a twentieth of the step over a step of the command of 0.1 rad."""
+POSITION_INPUT = 1
+"""Value of `input_mode` of a dcmotor whose control is a position command."""
+STIFFNESS_COLUMN = 4
+"""Column of actuator_gainprm in which MuJoCo 3.11 packs controller[0], the proportional gain."""
+DAMPING_COLUMN = 6
+"""Column of actuator_gainprm in which MuJoCo 3.11 packs controller[2], the derivative gain."""
+BRISTLE_COLUMNS = slice(5, 7)
+"""Columns of actuator_dynprm in which MuJoCo 3.11 packs lugre[:2]."""
+FRICTION_COLUMNS = slice(3, 6)
+"""Columns of actuator_biasprm in which MuJoCo 3.11 packs lugre[2:]."""
+BRISTLE_ANGLE = 0.5
+"""Angle by which the bristles of dry friction with a Stribeck speed turn in a physics step, at a
+damping ratio of a half, with the inertia of the joint [rad]. They are as stiff as an explicit step
+allows: of a servo of the SO-101 280 N m/rad at 5 ms, which is within 2 mrad of bristles a hundred
+times as stiff at a twentieth of the step over a step of the command of 0.1 rad."""
+NO_VALUES: Mapping[str, float] = {}
+"""Values of no joint."""
 
 
 def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
-    """The robot as it stands, without floor and without actuators.
+    """Build the robot as it stands, without floor and without actuators.
 
     Joints have their armature, dry friction and viscous damping; the timestep is the training
     simulator's, the integrator implicitfast; keyframe `default` is the default pose.
@@ -59,10 +67,12 @@ def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
 
 def set_law(option: mujoco.MjOption, robot: RobotSpec) -> None:
     """Give options the step and the integrator of a robot's drive law."""
-    law, names = robot.law, mujoco.mjtIntegrator
+    law = robot.law
     option.timestep = law.substep(robot.timestep_s)
-    explicit = law.kind == "explicit"
-    option.integrator = names.mjINT_EULER if explicit else names.mjINT_IMPLICITFAST
+    if law.kind == "explicit":
+        option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    else:
+        option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if law.passive_damping == "explicit":
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 
@@ -70,16 +80,26 @@ def set_law(option: mujoco.MjOption, robot: RobotSpec) -> None:
 def bench_spec(
     robot: RobotSpec,
     joint_name: str,
-    **drives: Mapping[str, float],
+    *,
+    stiffness: Mapping[str, float] = NO_VALUES,
+    damping: Mapping[str, float] = NO_VALUES,
+    stribeck: Mapping[str, float] = NO_VALUES,
 ) -> mujoco.MjSpec:
-    """One joint on the bench: what moves when it is excited, and nothing else.
+    """Build one joint on the bench: what moves when it is excited, and nothing else.
 
     The base is fixed, other branches are removed, clamped joints are welded at their default
     position, the other joints of the chain are held by their own drives. There is gravity; there
     are no contacts and no geoms. Keyframe `default` is the default pose and its commands.
 
-    `drives` are `stiffness`, `damping` and `stribeck` of `add_drives`. A RobotError names a joint
-    outside the chain that could move with it.
+    Args:
+        robot: The robot.
+        joint_name: Joint that is excited.
+        stiffness: Stiffness of some drives, as of `add_drives` [N m/rad].
+        damping: Damping of some drives [N m s/rad].
+        stribeck: Share of the dry friction of some drives that motion takes away.
+
+    Raises:
+        RobotError: A joint outside of the chain could move with it.
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
@@ -94,7 +114,7 @@ def bench_spec(
         _weld(spec, name, robot.joint(name).default_position)
     for name in joint.chain:
         _set_passive(spec, robot.joint(name))
-    add_drives(spec, robot, joint.chain, **drives)
+    add_drives(spec, robot, joint.chain, stiffness=stiffness, damping=damping, stribeck=stribeck)
     _add_default_key(spec, robot)
     return spec
 
@@ -102,7 +122,8 @@ def bench_spec(
 def set_inertia(body: Any, model: mujoco.MjModel) -> None:
     """Give a body of a spec the inertia that it has in the compiled model as an explicit one."""
     body.mass = model.body_mass[body.id]
-    body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+    body.ipos = model.body_ipos[body.id]
+    body.iquat = model.body_iquat[body.id]
     body.inertia = model.body_inertia[body.id]
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.fullinertia = [np.nan] * 6
@@ -111,8 +132,12 @@ def set_inertia(body: Any, model: mujoco.MjModel) -> None:
 
 def remove_geoms(spec: mujoco.MjSpec) -> None:
     """Delete all geoms; bodies whose inertia comes from them keep it as an explicit one."""
-    ignored = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    inferred = [body for body in spec.bodies[1:] if ignored or not body.explicitinertial]
+    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    ignores_explicit = spec.compiler.inertiafromgeom == from_geoms
+    inferred = []
+    for body in spec.bodies[1:]:
+        if ignores_explicit or not body.explicitinertial:
+            inferred.append(body)
     if inferred:
         try:
             model = spec.compile()
@@ -132,37 +157,51 @@ def add_drives(
     robot: RobotSpec,
     joint_names: Iterable[str],
     *,
-    stiffness: Mapping[str, float] = {},
-    damping: Mapping[str, float] = {},
-    stribeck: Mapping[str, float] = {},
+    stiffness: Mapping[str, float] = NO_VALUES,
+    damping: Mapping[str, float] = NO_VALUES,
+    stribeck: Mapping[str, float] = NO_VALUES,
 ) -> None:
     """Give joints of a spec a native dcmotor each, of the same name; commands are positions [rad].
 
-    Gains by joint name [N m/rad, N m s/rad] replace those of the robot's drives. Of joints with a
-    `stribeck` share (see `lugre`) the actuator takes over the dry friction that the joint has.
+    Args:
+        spec: Model to add them to.
+        robot: The robot.
+        joint_names: Joints that get a drive.
+        stiffness: Stiffness by joint [N m/rad]; that of the robot's drive where none is given.
+        damping: Damping by joint [N m s/rad]; that of the robot's drive where none is given.
+        stribeck: Share of the dry friction that motion takes away, by joint. Of these joints the
+            actuator takes over the dry friction (`lugre_parameters`).
+
+    Raises:
+        RobotError: A gain is of a joint that the robot does not have.
     """
     for name in (*stiffness, *damping):
-        robot.joint(name)
+        robot.joint(name)  # raises RobotError for an unknown joint
     model = spec.compile() if stribeck else None
-    step = spec.option.timestep
+    timestep = spec.option.timestep
     for name in joint_names:
         joint = robot.joint(name)
         drive = joint.drive
         constant, resistance = drive.motor
-        kp, kd = stiffness.get(name, joint.stiffness), damping.get(name, joint.damping)
-        kp, kd = _voltage_gains(drive, kp, robot.law.damping(kp, kd, step))
+        joint_stiffness = stiffness.get(name, joint.stiffness)
+        joint_damping = damping.get(name, joint.damping)
+        law_damping = robot.law.damping(joint_stiffness, joint_damping, timestep)
+        stiffness_gain, damping_gain = _voltage_gains(drive, joint_stiffness, law_damping)
         friction = {}
         if model and name in stribeck:
-            hinge, inertia = spec.joint(name), float(model.joint(name).M0[0])
-            friction["lugre"] = lugre(drive, inertia, hinge.frictionloss, stribeck[name], step)
+            hinge = spec.joint(name)
+            inertia = float(model.joint(name).M0[0])
+            friction["lugre"] = lugre_parameters(
+                drive, inertia, hinge.frictionloss, stribeck[name], timestep
+            )
             hinge.frictionloss = 0.0
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_dcmotor(
             motorconst=[constant, 0.0],
             resistance=resistance,
             saturation=[drive.effort_limit, 0.0, 0.0],
-            controller=[kp, 0.0, kd, 0.0, 0.0, drive.bus_voltage],
-            input_mode=_POSITION_INPUT,
+            controller=[stiffness_gain, 0.0, damping_gain, 0.0, 0.0, drive.bus_voltage],
+            input_mode=POSITION_INPUT,
             **friction,
         )
 
@@ -176,80 +215,116 @@ def set_drive_gains(
     law: DriveLaw = EXPLICIT,
 ) -> None:
     """Change the gains of one drive in a compiled model, exactly as compiling anew would."""
-    index = _index(model, "actuator", model.nu, joint_name)
+    index = _actuator_index(model, joint_name)
     damping = law.damping(stiffness, damping, model.opt.timestep)
-    model.actuator_gainprm[index, [_KP, _KD]] = _voltage_gains(drive, stiffness, damping)
+    stiffness_gain, damping_gain = _voltage_gains(drive, stiffness, damping)
+    model.actuator_gainprm[index, STIFFNESS_COLUMN] = stiffness_gain
+    model.actuator_gainprm[index, DAMPING_COLUMN] = damping_gain
 
 
-def lugre(
+def lugre_parameters(
     drive: Drive, inertia: float, frictionloss: float, stribeck: float, timestep: float
 ) -> list[float]:
-    """Parameters `lugre` of MuJoCo's dcmotor for dry friction that falls with speed.
+    """Return the parameters `lugre` of MuJoCo's dcmotor for dry friction that falls with speed.
 
-    Stiffness [N m/rad] and damping [N m s/rad] of the bristles, friction in motion and at rest
-    [N m], Stribeck speed [rad/s]. `stribeck` is the share of `frictionloss` that motion takes away.
+    Args:
+        drive: Drive with a Stribeck speed.
+        inertia: Inertia about the joint [kg m^2].
+        frictionloss: Dry friction at rest [N m].
+        stribeck: Share of it that motion takes away.
+        timestep: Physics step [s].
+
+    Returns:
+        Stiffness [N m/rad] and damping [N m s/rad] of the bristles, friction in motion and at rest
+        [N m], Stribeck speed [rad/s].
     """
-    damping = inertia * _BRISTLE_ANGLE / timestep
-    stiffness = damping * _BRISTLE_ANGLE / timestep
-    moving = frictionloss * (1.0 - stribeck)
-    return [stiffness, damping, moving, frictionloss, drive.stribeck_speed]
+    bristle_damping = inertia * BRISTLE_ANGLE / timestep
+    bristle_stiffness = bristle_damping * BRISTLE_ANGLE / timestep
+    sliding_friction = frictionloss * (1.0 - stribeck)
+    return [
+        bristle_stiffness,
+        bristle_damping,
+        sliding_friction,
+        frictionloss,
+        drive.stribeck_speed,
+    ]
 
 
 def set_stribeck(
     model: mujoco.MjModel, joint_name: str, drive: Drive, frictionloss: float, stribeck: float
 ) -> None:
-    """Change the dry friction of a joint whose drive was added with `stribeck`, as `lugre`."""
-    index = _index(model, "actuator", model.nu, joint_name)
+    """Change the dry friction of a joint whose drive was added with `stribeck`."""
+    index = _actuator_index(model, joint_name)
     inertia = float(model.dof_M0[model.joint(joint_name).dofadr[0]])
-    values = lugre(drive, inertia, frictionloss, stribeck, model.opt.timestep)
-    model.actuator_dynprm[index, _BRISTLE] = values[:2]
-    model.actuator_biasprm[index, _FRICTION] = values[2:]
+    values = lugre_parameters(drive, inertia, frictionloss, stribeck, model.opt.timestep)
+    model.actuator_dynprm[index, BRISTLE_COLUMNS] = values[:2]
+    model.actuator_biasprm[index, FRICTION_COLUMNS] = values[2:]
 
 
-def set_passive(model: mujoco.MjModel, joint_name: str, **values: float) -> None:
-    """Change `armature` [kg m^2] or `frictionloss` [N m] of one joint in a compiled model.
+def set_passive(
+    model: mujoco.MjModel,
+    joint_name: str,
+    *,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+) -> None:
+    """Change armature [kg m^2] or dry friction [N m] of one joint in a compiled model.
 
     Constants that MuJoCo derives from them are computed anew, so the model is the one that
     compiling with these values would give.
     """
-    dof = model.jnt_dofadr[_index(model, "joint", model.njnt, joint_name)]
-    for name, value in values.items():
-        getattr(model, f"dof_{name}")[dof] = value
-    if "armature" in values:
+    dof = model.jnt_dofadr[_joint_index(model, joint_name)]
+    if frictionloss is not None:
+        model.dof_frictionloss[dof] = frictionloss
+    if armature is not None:
+        model.dof_armature[dof] = armature
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _index(model: mujoco.MjModel, kind: str, count: int, name: str) -> int:
-    """Index of a named joint or actuator of a compiled model."""
-    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+def _joint_index(model: mujoco.MjModel, name: str) -> int:
+    """Return the index of a joint of a compiled model; a RobotError lists the joints."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if index < 0:
-        names = ", ".join(getattr(model, kind)(i).name for i in range(count))
-        raise RobotError(f"the model has no {kind} {name!r}; it has {names}.")
+        names = [model.joint(number).name for number in range(model.njnt)]
+        raise RobotError(f"the model has no joint {name!r}; it has {', '.join(names)}.")
+    return int(index)
+
+
+def _actuator_index(model: mujoco.MjModel, name: str) -> int:
+    """Return the index of an actuator of a compiled model; a RobotError lists the actuators."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+    if index < 0:
+        names = [model.actuator(number).name for number in range(model.nu)]
+        raise RobotError(f"the model has no actuator {name!r}; it has {', '.join(names)}.")
     return int(index)
 
 
 def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
-    """Controller gains in volts that make the torque law `stiffness`, `damping`."""
+    """Return the controller gains in volts that make the torque law `stiffness`, `damping`."""
     constant, resistance = drive.motor
-    return resistance * stiffness / constant, resistance * damping / constant - constant
+    stiffness_gain = resistance * stiffness / constant
+    damping_gain = resistance * damping / constant - constant
+    return stiffness_gain, damping_gain
 
 
 def _set_passive(spec: mujoco.MjSpec, joint: Joint) -> None:
     """Give a joint of a spec the armature and friction of its drive."""
-    hinge, drive = spec.joint(joint.name), joint.drive
-    hinge.armature, hinge.frictionloss = drive.armature, drive.frictionloss
-    hinge.damping = [drive.viscous_damping, 0.0, 0.0]
+    hinge = spec.joint(joint.name)
+    hinge.armature = joint.drive.armature
+    hinge.frictionloss = joint.drive.frictionloss
+    hinge.damping = [joint.drive.viscous_damping, 0.0, 0.0]
 
 
 def _remove_other_branches(
-    spec: mujoco.MjSpec, body: Any, wanted: set[str], joint_name: str
+    spec: mujoco.MjSpec, body: Any, bench_joints: set[str], joint_name: str
 ) -> None:
-    """Delete, below a body that is still, every branch that moves without the wanted joints."""
+    """Delete, below a body that is still, every branch that has none of the bench's joints."""
     for child in list(body.bodies):
         joints = {joint.name for joint in child.find_all("joint")}
-        if joints and not joints & wanted:
+        strangers = joints - bench_joints
+        if joints and not joints & bench_joints:
             spec.delete(child)
-        elif strangers := joints - wanted:
+        elif strangers:
             raise RobotError(
                 f"{', '.join(sorted(strangers))} can move when {joint_name} is excited; name them "
                 "in its chain (held by their drives) or among its clamped joints."
@@ -260,27 +335,31 @@ def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:
     """Fix a hinge at an angle: turn its body about the hinge, then delete the hinge."""
     joint = spec.joint(joint_name)
     body = joint.parent
-    turn, turned = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, joint.axis / np.linalg.norm(joint.axis), angle)
-    mujoco.mju_mulQuat(turned, body.quat, turn)
-    before, after = np.zeros(3), np.zeros(3)
-    mujoco.mju_rotVecQuat(before, joint.pos, body.quat)
-    mujoco.mju_rotVecQuat(after, joint.pos, turned)
-    body.pos = body.pos + before - after
-    body.quat = turned
+    rotation = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(rotation, joint.axis / np.linalg.norm(joint.axis), angle)
+    quat = np.zeros(4)
+    mujoco.mju_mulQuat(quat, body.quat, rotation)
+    # The hinge stays where it is, so the body moves by what its rotation moves the hinge.
+    hinge_before = np.zeros(3)
+    mujoco.mju_rotVecQuat(hinge_before, joint.pos, body.quat)
+    hinge_after = np.zeros(3)
+    mujoco.mju_rotVecQuat(hinge_after, joint.pos, quat)
+    body.pos = body.pos + hinge_before - hinge_after
+    body.quat = quat
     spec.delete(joint)
 
 
 def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
-    """Keyframe `default`: the default pose and its commands, the base where the model puts it."""
+    """Add keyframe `default`: the default pose, its commands, and the base as the model has it."""
     model = spec.compile()
     qpos = model.qpos0.copy()
     for joint in robot.joints:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint.name)
         if index >= 0:
             qpos[model.jnt_qposadr[index]] = joint.default_position
-    names = [model.actuator(i).name for i in range(model.nu)]
-    ctrl = [robot.joint(name).default_position for name in names]
+    ctrl = []
+    for index in range(model.nu):
+        ctrl.append(robot.joint(model.actuator(index).name).default_position)
     spec.add_key(name="default", qpos=qpos, ctrl=ctrl)
 
 
