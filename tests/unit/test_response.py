@@ -24,7 +24,7 @@ from pronk.identify.response import (
     save,
 )
 from pronk.identify.response.grid import Grid, grid_over, held_mean
-from pronk.identify.response.h1 import Layout, layout, sums
+from pronk.identify.response.h1 import Layout, layout, sum_spectra
 from synthetic_joint import (
     AMPLITUDE,
     HIP,
@@ -295,12 +295,12 @@ def laid_out() -> tuple[Layout, np.ndarray]:
 def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> None:
     rng, (where, excited) = np.random.default_rng(7), laid_out()
     clean = KNEE_JOINT(chirp_command("chirp", 200.0)[1], 200.0)
-    known = sums(excited, where.spectra(clean), where).response(where.omega, 200.0)
+    known = sum_spectra(excited, where.spectra(clean), where).response(where.omega, 200.0)
     hits = []
     for _ in range(150):
         white = 4e-3 * rng.standard_normal(len(clean))
         noise = white if colour == "white" else coloured(rng, (len(clean),), 8e-3)
-        s = sums(excited, where.spectra(clean + noise), where)
+        s = sum_spectra(excited, where.spectra(clean + noise), where)
         found = s.response(where.omega, 200.0)
         parts = {"coherence": s.coherence(), "averages": s.averages(), "repeats": found[None]}
         hits.append(covered(where.omega, known, response=found, **parts)[0])
@@ -310,7 +310,7 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
 def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
     rng, (where, excited) = np.random.default_rng(3), laid_out()
     noise = [rng.standard_normal(where.grid.count) for _ in range(150)]
-    each = [sums(excited, where.spectra(one), where) for one in noise]
+    each = [sum_spectra(excited, where.spectra(one), where) for one in noise]
     raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in each], axis=0)
     assert float((raw * each[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
     # Nor is a single noisy repeat coherent by construction.

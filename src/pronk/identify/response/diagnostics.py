@@ -31,8 +31,9 @@ from pronk.identify.response.periodic import read_steps
 from pronk.identify.response.response import Estimator, FrequencyResponse
 
 _TOP_HZ = 25.0
+"""Highest frequency that takes part in the fit of the delay [Hz]."""
 _COHERENT = 0.8
-"""Highest frequency [Hz] and least coherence that take part in the fit of the delay."""
+"""Least coherence of a frequency that takes part in the fit of the delay."""
 _FLOOR = 1e-3
 """Incoherence that no frequency falls below: a perfect bin must not dominate the fit."""
 _FEWEST = 8
@@ -44,21 +45,24 @@ at 1 Hz (the ramp itself reads as 0.008); three times 4 Hz is inside the bandwid
 _FEWEST_CYCLES = 3.0
 """Fewest cycles of the signal inside the band that separate f from 3 f."""
 _SAMPLES_A_TURN = 25
-"""At the top of the band: eight at three times it, and no more than that to be fitted."""
-_SHAPE = {1: 4, 2: 2, 3: 2}
-"""Harmonic and degree of the polynomial that its size and phase follow over the band."""
+"""Samples in a cycle at the top of the band, at least: eight at three times the frequency."""
+_DEGREES = {1: 4, 2: 2, 3: 2}
+"""Degree of the polynomial that the size and phase of each harmonic follow over the band."""
+_FEWEST_SAMPLES = 50
+"""Fewest samples in the band: two for each of the 24 columns of the fit."""
 
 
 def fit_delay(response: FrequencyResponse) -> float:
-    """Delay beyond a second-order joint [s]; NaN if too few frequencies are coherent.
+    """Fit the delay beyond a second-order joint [s]; NaN if too few frequencies are coherent.
 
     Frequencies weigh `coherence / (1 - coherence)`.
     """
-    use = response.band(0.0, _TOP_HZ, _COHERENT) & (response.gain > 0.0)
-    if int(use.sum()) < _FEWEST:
+    coherent = response.band(0.0, _TOP_HZ, _COHERENT) & (response.gain > 0.0)
+    if int(coherent.sum()) < _FEWEST:
         return math.nan
-    omega, values = response.omega[use], response.response[use]
-    coherence = response.coherence[use]
+    omega = response.omega[coherent]
+    values = response.response[coherent]
+    coherence = response.coherence[coherent]
     weight = np.sqrt(coherence / np.maximum(1.0 - coherence, _FLOOR))
     weight = weight / weight.mean()
     # The natural frequency is near where the phase passes -90 degrees.
@@ -71,11 +75,12 @@ def fit_delay(response: FrequencyResponse) -> float:
         with np.errstate(all="ignore"):
             x = 1j * omega / np.exp(log_natural)
             second_order = x**2 + 2.0 * np.exp(log_zeta) * x + 1.0
-            off = np.log(values / (np.exp(log_ratio - 1j * omega * delay) / second_order))
-        return np.asarray(np.concatenate([weight * off.real, weight * off.imag]))
+            model = np.exp(log_ratio - 1j * omega * delay) / second_order
+            deviation = np.log(values / model)
+        return np.asarray(np.concatenate([weight * deviation.real, weight * deviation.imag]))
 
-    found = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 1e-3], method="trf")
-    return float(found.x[3])
+    fit = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 1e-3], method="trf")
+    return float(fit.x[3])
 
 
 def third_harmonic(excitation: Excitation) -> float:
@@ -99,35 +104,44 @@ def third_harmonic(excitation: Excitation) -> float:
 
 
 def _of_chirp(time: Array, position: Array, frequency: Array) -> float:
-    """Third harmonic of a chirp, the phase being the integral of its frequency.
+    """Measure the third harmonic of a chirp, the phase being the integral of its frequency.
 
     The position is fitted by the first three harmonics, each with a size and phase that change
-    smoothly over the band, and by a straight line.
+    smoothly over the band, and by a straight line. Arrays have shape (n,).
     """
-    known = np.nan_to_num(frequency, nan=-1.0)
+    filled = np.nan_to_num(frequency, nan=-1.0)
     low, high = _LOW_BAND_HZ
-    inside = (known >= low) & (known <= high)
-    if int(inside.sum()) < 50:
+    inside = (filled >= low) & (filled <= high)
+    if int(inside.sum()) < _FEWEST_SAMPLES:
         return math.nan
     # The longest stretch: a chirp passes the band once.
     stretches = np.flatnonzero(np.diff(np.pad(inside, 1))).reshape(-1, 2)
-    first, stop = stretches[int(np.argmax(stretches[:, 1] - stretches[:, 0]))]
-    t, y, f = time[first:stop], position[first:stop], frequency[first:stop]
-    phase = 2.0 * np.pi * cumulative_trapezoid(f, t, initial=0)
-    thin = max(1, int(len(t) / ((t[-1] - t[0]) * high * _SAMPLES_A_TURN)))
-    t, y, f, phase = t[::thin], y[::thin], f[::thin], phase[::thin]
-    if phase[-1] < 2.0 * np.pi * _FEWEST_CYCLES or np.ptp(f) == 0.0:
+    start, stop = stretches[int(np.argmax(stretches[:, 1] - stretches[:, 0]))]
+    phase = cumulative_trapezoid(frequency[start:stop], time[start:stop], initial=0)
+    phase = 2.0 * np.pi * phase
+    samples_needed = (time[stop - 1] - time[start]) * high * _SAMPLES_A_TURN
+    stride = max(1, int((stop - start) / samples_needed))
+    phase = phase[::stride]
+    hz = frequency[start:stop:stride]
+    motion = position[start:stop:stride]
+    if phase[-1] < 2.0 * np.pi * _FEWEST_CYCLES or np.ptp(hz) == 0.0:
         return math.nan
-    x = 2.0 * (f - f.min()) / np.ptp(f) - 1.0
-    line = np.linspace(-1.0, 1.0, len(t))
-    columns, harmonics = [np.ones_like(line), line], [0, 0]
-    for harmonic, degree in _SHAPE.items():
-        for shape in np.polynomial.legendre.legvander(x, degree).T:
-            columns += [shape * np.cos(harmonic * phase), shape * np.sin(harmonic * phase)]
+    scaled_hz = 2.0 * (hz - hz.min()) / np.ptp(hz) - 1.0
+    line = np.linspace(-1.0, 1.0, len(motion))
+    columns = [np.ones_like(line), line]
+    harmonics = [0, 0]
+    for harmonic, degree in _DEGREES.items():
+        for polynomial in np.polynomial.legendre.legvander(scaled_hz, degree).T:
+            columns.append(polynomial * np.cos(harmonic * phase))
+            columns.append(polynomial * np.sin(harmonic * phase))
             harmonics += [harmonic, harmonic]
     basis = np.stack(columns, axis=1)
-    parts = basis * np.linalg.lstsq(basis, y, rcond=None)[0]
-    first, third = (
-        float(np.sqrt(np.mean(parts[:, np.equal(harmonics, n)].sum(axis=1) ** 2))) for n in (1, 3)
-    )
-    return third / first if first > 0.0 else math.nan
+    parts = basis * np.linalg.lstsq(basis, motion, rcond=None)[0]
+    fundamental_rms = _rms_of(parts[:, np.equal(harmonics, 1)])
+    third_rms = _rms_of(parts[:, np.equal(harmonics, 3)])
+    return third_rms / fundamental_rms if fundamental_rms > 0.0 else math.nan
+
+
+def _rms_of(parts: Array) -> float:
+    """Root mean square of the sum of some columns."""
+    return float(np.sqrt(np.mean(parts.sum(axis=1) ** 2)))

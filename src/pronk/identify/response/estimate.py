@@ -19,22 +19,36 @@ from pronk.identify.response.response import Estimator, FrequencyResponse
 
 
 def log_rate(excitations: Sequence[Excitation]) -> float:
-    """One rate of the analysis grid for all excitations, so that they share frequencies [Hz]."""
+    """Return one rate of the analysis grid for excitations, so that they share frequencies [Hz]."""
     return analysis_rate([excitation.time for excitation in excitations])
 
 
 def estimate(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[FrequencyResponse]:
-    """Responses of one joint, from its held command to its position; largest amplitude first.
+    """Estimate the responses of one joint, from its held command to its position.
 
     Chirps and excitations of unknown kind are averaged over segments (Welch); multisines and sine
-    steps are read line by line. Repeats are combined by averaging their spectra, and kept one by
-    one in `repeats`. A single long excitation is one repeat: its segments are its averages. Several
-    kinds of one amplitude are several responses. LogError for a joint that was not excited or did
-    not move, and for segments that are too short.
+    steps are read line by line. Repeats are combined by averaging their spectra, and each repeat's
+    response is kept in `repeats`. A single long excitation is one repeat: its segments are its
+    averages. Several kinds of signals with one amplitude are several responses.
+
+        log = pronk.read_log("logs/FR_knee.mcap")
+        loudest = pronk.response(log, "FR_knee")[0]
+        loudest.plot().savefig("FR_knee.png")
+
+    Args:
+        log: The log.
+        joint: Name of an excited joint, one of `log.excited_joints`.
+        estimator: Segments, window and band; the defaults suit a chirp of 0.1 to 25 Hz in 20 s.
+
+    Returns:
+        One response an amplitude and kind of signal, the largest amplitude first.
+
+    Raises:
+        LogError: The joint was not excited or did not move, or its segments are too short.
     """
-    settings = estimator or Estimator()
+    settings = Estimator() if estimator is None else estimator
     excitations = log.excitations(joint)
     rate_hz = log_rate(excitations)
     responses = []
@@ -53,9 +67,15 @@ def estimate(
 
 
 def operator(excitation: Excitation, estimator: Estimator, rate_hz: float) -> H1Operator:
-    """The estimate of one excitation as a matrix; equal repeats share it.
+    """Return the estimate of one excitation as a linear map; equal repeats share it.
 
-    `rate_hz` is that of `log_rate`. PronkError for sine steps, which have no common grid.
+    Args:
+        excitation: The excitation.
+        estimator: Segments, window and band.
+        rate_hz: Rate of the analysis grid, by `log_rate` [Hz].
+
+    Raises:
+        PronkError: The signal is sine steps, which have no common grid.
     """
     segment = excitation.segment
     time = excitation.time
@@ -73,8 +93,8 @@ def operator(excitation: Excitation, estimator: Estimator, rate_hz: float) -> H1
 def operators(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
-    """Return the `operator` of every repeat of every response of `estimate`."""
-    settings = estimator or Estimator()
+    """Return the `operator` of every repeat, a row for each response of `estimate`."""
+    settings = Estimator() if estimator is None else estimator
     excitations = log.excitations(joint)
     rate_hz = log_rate(excitations)
     rows = []

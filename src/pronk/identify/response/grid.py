@@ -35,7 +35,9 @@ class Grid:
     start: float
     """First instant, on the clock of the log [s]."""
     rate_hz: float
+    """Instants in a second [Hz]."""
     count: int
+    """Number of instants."""
 
     @property
     def edges(self) -> Array:
@@ -43,22 +45,26 @@ class Grid:
         return np.asarray(self.start + np.arange(self.count + 1) / self.rate_hz)
 
     def within(self, time: Array) -> Array:
-        """The instants, none before the first or after the last of `time` [s], shape (count,)."""
+        """Return the instants, moved into the span of `time` at its ends [s], shape (count,)."""
         return np.clip(self.edges[:-1], time[0], time[-1])
 
 
 def analysis_rate(times: Sequence[Array]) -> float:
-    """Mean rate inside several stretches of timestamps, to four significant digits [Hz].
+    """Return the mean rate inside several stretches of timestamps, to four digits [Hz].
 
-    Rounding gives repeats of one excitation the same grid although their jitter differs; what it
-    shifts (5e-5 of the time at most) the interpolation undoes.
+    Rounding gives repeats of one excitation the same grid although their jitter differs; the
+    interpolation undoes the shift that it causes (5e-5 of the time at most).
     """
-    span = sum(float(time[-1] - time[0]) for time in times)
-    return float(f"{sum(len(time) - 1 for time in times) / span:.4g}")
+    span = 0.0
+    intervals = 0
+    for time in times:
+        span += float(time[-1] - time[0])
+        intervals += len(time) - 1
+    return float(f"{intervals / span:.4g}")
 
 
 def grid_over(time: Array, rate_hz: float | None = None) -> Grid:
-    """The grid from the first to the last timestamp; at their own rate if none is given [Hz]."""
+    """Return the grid from the first timestamp [s] to the last; at their own rate if None."""
     rate = analysis_rate([time]) if rate_hz is None else rate_hz
     # A hundredth of an interval forgives the rounding of the rate and of the timestamps.
     count = int(np.floor((time[-1] - time[0]) * rate + 0.01)) + 1
@@ -66,32 +72,50 @@ def grid_over(time: Array, rate_hz: float | None = None) -> Grid:
 
 
 def held_mean(time: Array, command: Array, edges: Array) -> Array:
-    """Mean over each interval of a command that is held from each timestamp to the next [rad].
+    """Average a command that is held from each timestamp to the next over intervals.
 
-    Timestamps [s] and commands have shape (n,), edges of the intervals [s] shape (m + 1,), means
-    (m,). Before the first timestamp the first command holds, after the last one the last.
+    Before the first timestamp the first command holds, after the last one the last.
+
+    Args:
+        time: Timestamps of the commands [s], shape (n,).
+        command: Commands [rad], shape (n,).
+        edges: Edges of the intervals [s], shape (m + 1,).
+
+    Returns:
+        Mean of the command over each interval [rad], shape (m,).
     """
-    before, after = min(edges[0], time[0]) - 1.0, max(edges[-1], time[-1]) + 1.0
+    before = min(edges[0], time[0]) - 1.0
+    after = max(edges[-1], time[-1]) + 1.0
     knots = np.concatenate(([before], time, [after]))
-    # About its own mean, so that the integral stays small and its differences exact.
+    # About the mean, so that the integral stays small and its differences exact.
     mean = float(command.mean())
-    about = np.concatenate((command[:1], command)) - mean
-    area = np.concatenate(([0.0], np.cumsum(about * np.diff(knots))))
+    deviation = np.concatenate((command[:1], command)) - mean
+    area = np.concatenate(([0.0], np.cumsum(deviation * np.diff(knots))))
     return np.asarray(np.diff(np.interp(edges, knots, area)) / np.diff(edges) + mean)
 
 
 def interpolate(time: Array, values: Array, grid: Grid) -> Array:
-    """Cubic spline through `values` (shape (n, ...) at `time`), read on the grid."""
+    """Read the cubic spline through `values`, shape (n, ...), at `time` [s] on the grid."""
     spline = make_interp_spline(time, values, k=min(3, len(time) - 1))
     return np.asarray(spline(grid.within(time)))
 
 
 def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
-    """Carry weights, shape (grid.count, f), over to samples at instants [s], shape (n,): (n, f).
+    """Carry weights of the grid over to the samples that are interpolated onto it.
 
     `values @ pull_back(weights, time, grid) == interpolate(time, values, grid) @ weights`, at the
-    cost of one banded solve, whatever number of `values` follows. LogError if the samples do not
-    span the grid.
+    cost of one banded solve, whatever number of `values` follows.
+
+    Args:
+        weights: Weights of the grid's instants, shape (grid.count, f).
+        time: Instants of the samples [s], shape (n,).
+        grid: The grid.
+
+    Returns:
+        Weights of the samples, shape (n, f).
+
+    Raises:
+        LogError: The samples do not span the grid.
     """
     require_span(time, grid)
     degree = min(3, len(time) - 1)
@@ -116,6 +140,9 @@ def require_span(time: Array, grid: Grid) -> None:
 
 
 def hold(omega: Array, rate_hz: float) -> ComplexArray:
-    """Grid factor `exp(-j w D/2) sinc(f D)`, D = 1/rate: see the head of this module."""
+    """Return the grid factor `exp(-j w D/2) sinc(f D)`, D = 1/rate, shape (f,).
+
+    The head of this module derives it; `omega` holds angular frequencies [rad/s], shape (f,).
+    """
     turns = omega / (2.0 * np.pi * rate_hz)
     return np.asarray(np.exp(-1j * np.pi * turns) * np.sinc(turns))

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
-from operator import add
+from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -49,7 +48,7 @@ _AT_CENTRE = 0.05
 
 
 def rests(command: Array, rate_hz: float) -> bool:
-    """True if a command [rad] ends constant, and starts where it ends: the joint is at rest."""
+    """Return True if a command [rad] starts where it ends, and ends at rest."""
     tail = max(2, round(_SETTLED_S * rate_hz))
     amplitude = float(np.ptp(command)) / 2.0
     if len(command) <= tail or amplitude == 0.0:
@@ -68,7 +67,7 @@ class Layout:
     starts: NDArray[np.intp]
     """First sample of each segment, increasing; negative or beyond the end where padded, (k,)."""
     window: Array
-    """Shape (samples,)."""
+    """Window of a segment, shape (samples,)."""
     bins: NDArray[np.intp]
     """Numbers of the frequencies in the transform of a segment, shape (f,)."""
 
@@ -85,7 +84,7 @@ class Layout:
         return max(0, -int(self.starts[0])), max(0, last - self.grid.count)
 
     def spectra(self, values: Array) -> ComplexArray:
-        """Windowed transform of each segment, its mean taken away, shape (k, f).
+        """Transform each segment, its mean taken away and windowed, shape (k, f).
 
         The first and the last value, shape (grid.count,), are repeated in the padding. The phase
         counts from the first sample of each segment.
@@ -97,8 +96,18 @@ class Layout:
 
 
 def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
-    """Lay the segments over a grid; LogError if it is too short, or no frequency is left."""
-    samples, rate_hz = round(estimator.segment_s * grid.rate_hz), grid.rate_hz
+    """Lay the segments over a grid.
+
+    Args:
+        grid: The analysis grid of one excitation.
+        estimator: Length, overlap and window of the segments, and the band.
+        padded: True to let segments reach over the ends.
+
+    Raises:
+        LogError: The grid is too short for two segments, or the band holds no frequency.
+    """
+    rate_hz = grid.rate_hz
+    samples = round(estimator.segment_s * rate_hz)
     span = grid.count / rate_hz
     if samples < 8 or grid.count < samples:
         raise LogError(
@@ -113,16 +122,18 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
         phase_shift=None,
     )
     if padded:
-        slices = int(transform.p_min), int(transform.p_max(grid.count))
+        first = int(transform.p_min)
+        stop = int(transform.p_max(grid.count))
     else:
-        last = transform.upper_border_begin(grid.count)[1]
-        slices = int(transform.lower_border_end[1]), int(last)
-    if slices[1] - slices[0] < 2:
+        first = int(transform.lower_border_end[1])
+        stop = int(transform.upper_border_begin(grid.count)[1])
+    if stop - first < 2:
         raise LogError(
             f"an excitation of {span:.2f} s holds a single segment of {estimator.segment_s:g} s, "
             "of which coherence is always 1; choose a shorter Estimator.segment_s."
         )
-    hz, top_hz = np.asarray(transform.f), estimator.top_hz(rate_hz)
+    hz = np.asarray(transform.f)
+    top_hz = estimator.top_hz(rate_hz)
     # From the second line on: the main lobe of the window at the first reaches the mean.
     chosen = (hz >= max(estimator.min_hz, hz[2]) - 1e-9) & (hz <= top_hz + 1e-9)
     if not chosen.any():
@@ -132,7 +143,7 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
         )
     return Layout(
         grid=grid,
-        starts=np.arange(*slices) * transform.hop - transform.m_num_mid,
+        starts=np.arange(first, stop) * transform.hop - transform.m_num_mid,
         window=window,
         bins=np.flatnonzero(chosen),
     )
@@ -140,12 +151,14 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
 
 @dataclass(frozen=True, kw_only=True)
 class Sums:
-    """Auto and cross spectra summed over segments. Sums of several excitations add up."""
+    """Auto and cross spectra summed over segments; those of several excitations can be added."""
 
     uu: Array
+    """Power of the command, `|U|^2`, shape (f,)."""
     uy: ComplexArray
-    """conj(U) Y, shape (f,)."""
+    """Cross spectrum, `conj(U) Y`, shape (f,)."""
     yy: Array
+    """Power of the position, `|Y|^2`, shape (f,)."""
     segments: float
     """Number of segments, those that reach into the padding in part."""
     spread: Array
@@ -153,28 +166,34 @@ class Sums:
 
     def __add__(self, other: Sums) -> Sums:
         """Sums over the segments of both."""
-        return Sums(**{name: value + vars(other)[name] for name, value in vars(self).items()})
+        return Sums(
+            uu=self.uu + other.uu,
+            uy=self.uy + other.uy,
+            yy=self.yy + other.yy,
+            segments=self.segments + other.segments,
+            spread=self.spread + other.spread,
+        )
 
     def response(self, omega: Array, rate_hz: float) -> ComplexArray:
-        """Response by H1 = Suy / Suu, from the held command; the noise is on the position."""
+        """Return H1 = Suy / Suu from the held command, for noise on the position, shape (f,)."""
         h1 = self.uy / np.maximum(self.uu, _TINY)
         return np.asarray(h1 / hold(omega, rate_hz))
 
     def coherence(self) -> Array:
-        """Magnitude-squared coherence; 0 where the frequency was not excited, shape (f,).
+        """Return the magnitude-squared coherence, 0 where nothing was excited, shape (f,).
 
-        The share of the position's power over the whole log that the command explains: every
+        It is the share of the position's power in all segments that the command explains: every
         segment counts, also those in which a chirp is elsewhere, which bring the noise alone. A
         single passage of a chirp in a single segment would be 1 by construction.
         """
         raw = np.abs(self.uy) ** 2 / np.maximum(self.uu * self.yy, _TINY)
-        beside = np.pad(self.uu, 1)
-        leaked = self.uu < _LEAKED * np.maximum(beside[:-2], beside[2:])
+        padded = np.pad(self.uu, 1)
+        leaked = self.uu < _LEAKED * np.maximum(padded[:-2], padded[2:])
         excited = (self.uu >= _SILENT * self.uu.max()) & ~leaked
         return np.where(excited, np.clip(raw, 0.0, 1.0), 0.0)
 
     def averages(self) -> Array:
-        """Effective number of independent averages that the coherence rests on, shape (f,).
+        """Return the effective number of independent averages behind the coherence, shape (f,).
 
         `segments sum P / sum_s,t conj(U_s) U_t r_st`, P = |U|^2 and r_st the overlap of windows s
         and t inside the excitation: the number n for which `(1 - coherence) / (2 n coherence)` is
@@ -184,22 +203,31 @@ class Sums:
         return np.asarray(self.segments * self.uu / np.maximum(self.spread, _TINY))
 
 
-def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
-    """Sum the spectra of one excitation (`Layout.spectra`) over its segments."""
+def sum_spectra(command: ComplexArray, position: ComplexArray, segments: Layout) -> Sums:
+    """Sum the spectra of one excitation over its segments.
+
+    Args:
+        command: Spectra of the command, by `Layout.spectra`, shape (k, f).
+        position: Spectra of the position, shape (k, f).
+        segments: Where the segments lie.
+    """
     # Phase from a common instant, in which the noise of two segments correlates by their overlap.
-    turn = np.exp(-1j * np.outer(where.starts / where.grid.rate_hz, where.omega))
-    aligned, power = command * turn, float(where.window @ where.window)
+    turn = np.exp(-1j * np.outer(segments.starts / segments.grid.rate_hz, segments.omega))
+    aligned = command * turn
+    power = float(segments.window @ segments.window)
     # The windows are zero in the padding.
-    samples = where.starts[:, None] + np.arange(len(where.window))
-    windows = np.where((samples >= 0) & (samples < where.grid.count), where.window, 0.0)
-    segments, spread = 0.0, np.zeros(len(where.bins))
-    for i, start in enumerate(where.starts):
-        own = float(windows[i] @ windows[i]) / power
-        segments += own
-        spread += own * np.abs(aligned[i]) ** 2
-        for j in range(i + 1, len(where.starts)):
-            shift = int(where.starts[j] - start)
-            if shift >= len(where.window):
+    samples = segments.starts[:, None] + np.arange(len(segments.window))
+    inside = (samples >= 0) & (samples < segments.grid.count)
+    windows = np.where(inside, segments.window, 0.0)
+    count = 0.0
+    spread = np.zeros(len(segments.bins))
+    for i, start in enumerate(segments.starts):
+        share = float(windows[i] @ windows[i]) / power
+        count += share
+        spread += share * np.abs(aligned[i]) ** 2
+        for j in range(i + 1, len(segments.starts)):
+            shift = int(segments.starts[j] - start)
+            if shift >= len(segments.window):
                 break
             overlap = float(windows[i][shift:] @ windows[j][:-shift]) / power
             spread += 2.0 * overlap * (np.conj(aligned[i]) * aligned[j]).real
@@ -207,7 +235,7 @@ def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
         uu=np.asarray((np.abs(command) ** 2).sum(axis=0)),
         uy=np.asarray((np.conj(command) * position).sum(axis=0)),
         yy=np.asarray((np.abs(position) ** 2).sum(axis=0)),
-        segments=segments,
+        segments=count,
         spread=np.asarray(np.maximum(spread, 0.0)),
     )
 
@@ -217,27 +245,36 @@ def estimate_averaged(
 ) -> FrequencyResponse:
     """Estimate H1 over the segments of all repeats of one excitation."""
     first = repeats[0]
-    each, padded = [], []
+    sums_of_repeats = []
+    ends = "reaching over the ends at rest"
     for repeat in repeats:
         grid = grid_over(repeat.time, rate_hz)
         command = held_mean(repeat.time, repeat.command, grid.edges)
         position = interpolate(repeat.time, repeat.position, grid)
-        padded.append(rests(command, rate_hz))
-        where = layout(grid, estimator, padded=padded[-1])
-        each.append(sums(where.spectra(command), where.spectra(position), where))
-    whole, omega = reduce(add, each), where.omega
-    ends = "reaching over the ends at rest" if all(padded) else "inside the excitation"
+        padded = rests(command, rate_hz)
+        if not padded:
+            ends = "inside the excitation"
+        segments = layout(grid, estimator, padded=padded)
+        sums_of_repeats.append(
+            sum_spectra(segments.spectra(command), segments.spectra(position), segments)
+        )
+    total = sums_of_repeats[0]
+    for sums in sums_of_repeats[1:]:
+        total = total + sums
+    omega = segments.omega
     return FrequencyResponse(
         joint=first.joint,
         amplitude=first.amplitude,
         omega=omega,
-        response=whole.response(omega, rate_hz),
-        coherence=whole.coherence(),
-        averages=whole.averages(),
-        repeats=np.array([one.response(omega, rate_hz) for one in each]),
+        response=total.response(omega, rate_hz),
+        coherence=total.coherence(),
+        averages=total.averages(),
+        repeats=np.array([sums.response(omega, rate_hz) for sums in sums_of_repeats]),
         estimator="H1",
-        window=f"{estimator.window} {estimator.segment_s:g} s, {100.0 * estimator.overlap:.0f} % "
-        f"overlap, {ends}, mean of each segment removed",
+        window=(
+            f"{estimator.window} {estimator.segment_s:g} s, {100.0 * estimator.overlap:.0f} % "
+            f"overlap, {ends}, mean of each segment removed"
+        ),
         segment_s=estimator.segment_s,
         virtual=first.log.virtual,
         source=first.source,
@@ -254,6 +291,7 @@ class H1Operator:
     time: Array
     """Measured timestamps of the log it was built for [s], shape (n,)."""
     layout: Layout
+    """Where the segments lie on the analysis grid."""
     command: ComplexArray
     """Transforms of the command, shape (k, f)."""
 
@@ -261,63 +299,89 @@ class H1Operator:
     def build(
         cls, time: Array, command: Array, estimator: Estimator, *, rate_hz: float | None = None
     ) -> H1Operator:
-        """Compute the map for one command [rad] in force from timestamps [s], both of shape (n,).
+        """Compute the map for one command.
 
-        The analysis grid has the rate of the timestamps if none is given. LogError as of `layout`.
+        Args:
+            time: Timestamps [s], shape (n,).
+            command: Command in force from each timestamp [rad], shape (n,).
+            estimator: Segments, window and band.
+            rate_hz: Rate of the analysis grid [Hz]; that of the timestamps if None.
+
+        Raises:
+            LogError: The excitation is too short, or the band holds no frequency.
         """
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
-        where = layout(grid, estimator, padded=rests(held, grid.rate_hz))
-        return cls(time=time, layout=where, command=where.spectra(held))
+        segments = layout(grid, estimator, padded=rests(held, grid.rate_hz))
+        return cls(time=time, layout=segments, command=segments.spectra(held))
 
     @property
     def omega(self) -> Array:
-        """[rad/s], shape (f,)."""
+        """Angular frequencies [rad/s], shape (f,)."""
         return self.layout.omega
 
     @property
     def excitation(self) -> Array:
-        """Sum of |U|^2: the weight of this excitation among repeats, shape (f,)."""
+        """Power of the command, the weight of this excitation among repeats, shape (f,)."""
         return np.asarray((np.abs(self.command) ** 2).sum(axis=0))
 
     @cached_property
     def scale(self) -> ComplexArray:
-        """What the transform of each segment counts in the response, shape (k, f)."""
+        """Factor of the transform of each segment in the response, shape (k, f)."""
         factor = hold(self.omega, self.layout.grid.rate_hz)
         return np.conj(self.command) / (np.maximum(self.excitation, _TINY) * factor)
 
     def weights(self, chosen: Mask | slice = slice(None)) -> ComplexArray:
-        """Map from positions on the grid to the chosen frequencies, shape (grid.count, chosen)."""
-        where, samples = self.layout, np.arange(len(self.layout.window))
+        """Return the map from positions on the grid to the chosen frequencies, (count, chosen)."""
+        segments = self.layout
+        samples = np.arange(len(segments.window))
         turn = np.exp(-2j * np.pi * samples / len(samples))
-        kernel = where.window[:, None] * turn[np.outer(samples, where.bins[chosen]) % len(samples)]
+        turns = turn[np.outer(samples, segments.bins[chosen]) % len(samples)]
+        kernel = segments.window[:, None] * turns
         # Taking the mean of a segment away is taking the mean of the kernel away.
         kernel -= kernel.mean(axis=0)
-        # Padding repeats the first and last sample; its weights gather on them.
-        (before, after), count = where.padding, where.grid.count
-        spread = np.zeros((before + count + after, kernel.shape[1]), dtype=np.complex128)
+        before, after = segments.padding
+        count = segments.grid.count
+        padded = np.zeros((before + count + after, kernel.shape[1]), dtype=np.complex128)
         term = np.empty_like(kernel)
-        for start, row in zip(where.starts + before, self.scale[:, chosen], strict=True):
-            spread[start : start + len(kernel)] += np.multiply(kernel, row, out=term)
-        out = spread[before : before + count]
-        out[0] += spread[:before].sum(axis=0)
-        out[-1] += spread[before + count :].sum(axis=0)
-        return out
+        for start, factors in zip(segments.starts + before, self.scale[:, chosen], strict=True):
+            padded[start : start + len(kernel)] += np.multiply(kernel, factors, out=term)
+        # Padding repeats the first and last sample; its weights gather on them.
+        weights = padded[before : before + count]
+        weights[0] += padded[:before].sum(axis=0)
+        weights[-1] += padded[before + count :].sum(axis=0)
+        return weights
 
     def matrix(self, sample_times: Array, chosen: Mask | slice = slice(None)) -> ComplexArray:
-        """Map from positions at other instants, `H = positions @ matrix`, shape (m, chosen).
+        """Return the map from positions at other instants, `H = positions @ matrix`.
 
-        `sample_times` [s], shape (m,), are increasing instants on the clock of the log; the cubic
-        interpolation onto the analysis grid is included. LogError if they do not span the
-        excitation.
+        The cubic interpolation onto the analysis grid is included.
+
+        Args:
+            sample_times: Increasing instants on the clock of the log [s], shape (m,).
+            chosen: The frequencies, as a mask of shape (f,).
+
+        Returns:
+            The map, shape (m, chosen).
+
+        Raises:
+            LogError: The instants do not span the excitation.
         """
         return pull_back(self.weights(chosen), sample_times, self.layout.grid)
 
     def response(self, sample_times: Array, position: Array) -> ComplexArray:
-        """`position @ matrix(sample_times)`, shape (f,), by transforms: faster for a few positions.
+        """Return `position @ matrix(sample_times)` by transforms, faster for few positions.
 
-        Shapes (m,); LogError as of `matrix`.
+        Args:
+            sample_times: Increasing instants on the clock of the log [s], shape (m,).
+            position: Positions at these instants [rad], shape (m,).
+
+        Returns:
+            The response, shape (f,).
+
+        Raises:
+            LogError: The instants do not span the excitation.
         """
         require_span(sample_times, self.layout.grid)
-        found = self.layout.spectra(interpolate(sample_times, position, self.layout.grid))
-        return np.asarray((self.scale * found).sum(axis=0))
+        spectra = self.layout.spectra(interpolate(sample_times, position, self.layout.grid))
+        return np.asarray((self.scale * spectra).sum(axis=0))

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -48,31 +49,41 @@ _SAME_HZ = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Spectra:
-    """What was read at the lines of one excitation."""
+    """Spectra of one excitation at its lines."""
 
     omega: Array
-    """[rad/s], increasing, shape (f,)."""
+    """Angular frequencies of the lines [rad/s], increasing, shape (f,)."""
     command: ComplexArray
-    """Per period (or block of periods), shape (p, f)."""
+    """Spectrum of the command in each period (or block of periods), shape (p, f)."""
     position: ComplexArray
-    """Over the grid factor of each line (`grid.hold`), shape (p, f)."""
+    """Spectrum of the position, over the grid factor of each line (`grid.hold`), shape (p, f)."""
     third: Array = field(default_factory=lambda: np.empty(0))
-    """Of steps: position at three times the frequency over that at it, shape (f,)."""
+    """Position at three times the frequency over the position at it, for steps, shape (f,)."""
 
 
 def multisine_operator(
     time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
 ) -> H1Operator:
-    """`estimate_periodic` of one multisine as a matrix, for a fixed command.
+    """Return the estimate of one multisine as a linear map, for a fixed command.
 
     A segment lies over each period in which the command repeats the period before; ramps fall out
     by themselves, and the first steady period is dropped as the transient. Frequencies are the
-    lines excited in them.
+    lines that are excited in these periods.
+
+    Args:
+        time: Timestamps [s], shape (n,).
+        command: Command in force from each timestamp [rad], shape (n,).
+        period_s: Period of the signal [s].
+        estimator: The band.
+        rate_hz: Rate of the analysis grid, about [Hz]; a period is whole samples.
+
+    Raises:
+        LogError: The signal does not repeat itself often enough, or has no line in the band.
     """
     samples = max(round(period_s * rate_hz), 1)
-    fine = samples / period_s
-    whole = grid_over(time, fine)
-    held = held_mean(time, command, whole.edges)
+    rate = samples / period_s
+    log_grid = grid_over(time, rate)
+    held = held_mean(time, command, log_grid.edges)
     first, stop = _steady_periods(held, samples)
     if stop - first < 3:
         raise LogError(
@@ -80,50 +91,54 @@ def multisine_operator(
             f"{time[-1] - time[0]:.2f} s; 3 equal periods are needed (1 to settle, 2 to compare)."
         )
     grid = Grid(
-        start=whole.start + (first + 1) * period_s,
-        rate_hz=fine,
+        start=log_grid.start + (first + 1) * period_s,
+        rate_hz=rate,
         count=(stop - first - 1) * samples,
     )
     numbers = np.arange(1, samples // 2)
-    hz = numbers * fine / samples
-    numbers = numbers[(hz >= estimator.min_hz - 1e-9) & (hz <= estimator.top_hz(fine) + 1e-9)]
+    hz = numbers * rate / samples
+    top_hz = estimator.top_hz(rate)
+    numbers = numbers[(hz >= estimator.min_hz - 1e-9) & (hz <= top_hz + 1e-9)]
     if len(numbers) == 0:
         raise LogError(
             f"a signal of period {period_s:g} s has no line between {estimator.min_hz:g} and "
-            f"{estimator.top_hz(fine):g} Hz."
+            f"{top_hz:g} Hz."
         )
-    where = Layout(
+    segments = Layout(
         grid=grid,
         starts=np.arange(0, grid.count, samples),
         window=np.full(samples, 1.0 / samples),
         bins=numbers,
     )
-    u = where.spectra(held_mean(time, command, grid.edges))
-    size = np.abs(u).mean(axis=0)
-    excited = size >= _EXCITED * size.max()
-    where = replace(where, bins=numbers[excited])
-    return H1Operator(time=time, layout=where, command=u[:, excited])
+    spectra = segments.spectra(held_mean(time, command, grid.edges))
+    amplitude = np.abs(spectra).mean(axis=0)
+    excited = amplitude >= _EXCITED * amplitude.max()
+    segments = replace(segments, bins=numbers[excited])
+    return H1Operator(time=time, layout=segments, command=spectra[:, excited])
 
 
 def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
     """First and one-past-last period of the longest run in which the command repeats itself."""
-    whole = len(command) // samples
-    periods = command[: whole * samples].reshape(whole, samples)
-    size = float(np.sqrt(np.mean((periods - periods.mean()) ** 2))) if whole else 0.0
-    best, first = (0, 0), 0
-    for p in range(1, whole):
-        change = float(np.sqrt(np.mean((periods[p] - periods[p - 1]) ** 2)))
-        if change > _SAME_PERIOD * size:
-            first = p
-        if p + 1 - first > best[1] - best[0]:
-            best = (first, p + 1)
-    return best
+    count = len(command) // samples
+    if count == 0:
+        return 0, 0
+    periods = command[: count * samples].reshape(count, samples)
+    deviation = float(np.sqrt(np.mean((periods - periods.mean()) ** 2)))
+    longest = (0, 0)
+    first = 0
+    for period in range(1, count):
+        change = float(np.sqrt(np.mean((periods[period] - periods[period - 1]) ** 2)))
+        if change > _SAME_PERIOD * deviation:
+            first = period
+        if period + 1 - first > longest[1] - longest[0]:
+            longest = (first, period + 1)
+    return longest
 
 
 def read_periods(excitation: Excitation, estimator: Estimator, rate_hz: float) -> Spectra:
-    """Spectra of the steady periods of one multisine at its excited lines.
+    """Read the steady periods of one multisine at its excited lines.
 
-    `rate_hz` is about that of the analysis grid. LogError without three equal periods.
+    `rate_hz` is the rate of the analysis grid, about [Hz]. LogError without three equal periods.
     """
     time = excitation.time
     period = excitation.segment.period_s
@@ -133,20 +148,20 @@ def read_periods(excitation: Excitation, estimator: Estimator, rate_hz: float) -
             "gives no period_s; name it, or call the segment `unknown` to have it averaged by "
             "segments."
         )
-    found = multisine_operator(time, excitation.command, period, estimator, rate_hz)
-    where, omega = found.layout, found.omega
-    position = where.spectra(interpolate(time, excitation.position, where.grid))
-    factor = hold(omega, where.grid.rate_hz)
-    return Spectra(omega=omega, command=found.command, position=position / factor)
+    periods = multisine_operator(time, excitation.command, period, estimator, rate_hz)
+    grid = periods.layout.grid
+    position = periods.layout.spectra(interpolate(time, excitation.position, grid))
+    factor = hold(periods.omega, grid.rate_hz)
+    return Spectra(omega=periods.omega, command=periods.command, position=position / factor)
 
 
-def _runs(frequency: Array) -> list[tuple[int, int]]:
+def _steps(frequency: Array) -> list[tuple[int, int]]:
     """First and one-past-last sample of each stretch of constant frequency."""
-    known = np.isfinite(frequency) & (frequency > 0.0)
-    filled = np.where(known, frequency, -1.0)
-    new = np.flatnonzero(np.abs(np.diff(filled)) > _SAME_HZ * np.abs(filled[1:])) + 1
-    edges = [0, *new.tolist(), len(filled)]
-    return [(a, b) for a, b in pairwise(edges) if filled[a] > 0.0]
+    excited = np.isfinite(frequency) & (frequency > 0.0)
+    filled = np.where(excited, frequency, -1.0)
+    changes = np.flatnonzero(np.abs(np.diff(filled)) > _SAME_HZ * np.abs(filled[1:])) + 1
+    edges = [0, *changes.tolist(), len(filled)]
+    return [(first, stop) for first, stop in pairwise(edges) if filled[first] > 0.0]
 
 
 def _steady_step(
@@ -160,83 +175,123 @@ def _steady_step(
     samples = max(4, round(rate_hz / hz))
     grid = Grid(start=float(time[0]), rate_hz=samples * hz, count=samples * periods)
     turn = np.exp(-2j * np.pi * np.arange(samples) / samples)
-    found = held_mean(time, command, grid.edges).reshape(periods, samples) @ turn
+    spectrum = held_mean(time, command, grid.edges).reshape(periods, samples) @ turn
     # Smoothed, or the images of a held command would make single periods look unlike.
-    size = np.abs(uniform_filter1d(found, settle, mode="nearest"))
-    even = np.flatnonzero(np.abs(size - np.median(size)) <= _STEADY * np.median(size))
-    if len(even) == 0:
+    amplitude = np.abs(uniform_filter1d(spectrum, settle, mode="nearest"))
+    median = np.median(amplitude)
+    steady = np.flatnonzero(np.abs(amplitude - median) <= _STEADY * median)
+    if len(steady) == 0:
         return settle, settle
-    end = int(even[-1]) + 1
-    return int(even[0]) + settle, end if end == periods else end - settle
+    first = int(steady[0]) + settle
+    stop = int(steady[-1]) + 1
+    if stop < periods:
+        stop -= settle
+    return first, stop
+
+
+class _Step(NamedTuple):
+    """One sine of an excitation by steps."""
+
+    hz: float
+    """Frequency [Hz]."""
+    samples: slice
+    """Samples of the step, and three more."""
+    settling: int
+    """Periods at its head that are dropped."""
+    steady: int
+    """Periods that are measured."""
 
 
 def read_steps(excitation: Excitation, estimator: Estimator, rate_hz: float) -> Spectra:
     """Read every step of one excitation by sine steps inside the band.
 
-    `rate_hz` is about that of the grid; each step takes a whole number of samples a period.
-    LogError without a channel of the frequency or steps of three periods in the band.
+    Args:
+        excitation: The excitation.
+        estimator: The band.
+        rate_hz: Rate of the grid, about [Hz]; each step has whole samples in a period.
+
+    Raises:
+        LogError: The log has no channel of the frequency, or a step lasts too few periods.
     """
-    where = excitation.source or "log"
-    if excitation.frequency is None:
+    source = excitation.source or "log"
+    frequency = excitation.frequency
+    if frequency is None:
         raise LogError(
-            f"{where}: sine steps without the channel of instantaneous frequency; give it, or call "
-            "the segment `unknown` to have it averaged by segments."
+            f"{source}: sine steps without the channel of instantaneous frequency; give it, or "
+            "call the segment `unknown` to have it averaged by segments."
         )
     time = excitation.time
     command = excitation.command
     position = excitation.position
-    frequency = excitation.frequency
+    top_hz = estimator.top_hz(rate_hz)
     steps = []
-    for first, stop in _runs(frequency):
+    for first, stop in _steps(frequency):
         hz = float(frequency[first])
-        if not estimator.min_hz - 1e-9 <= hz <= estimator.top_hz(rate_hz) + 1e-9:
+        if not estimator.min_hz - 1e-9 <= hz <= top_hz + 1e-9:
             continue
         # The last sample's interval belongs to the step as well.
         span = float(time[stop - 1] - time[first]) + 1.0 / rate_hz
-        inside = slice(first, min(stop + 3, len(time)))
-        dropped, end = _steady_step(time[inside], command[inside], span, hz, rate_hz)
-        steps.append((hz, inside, dropped, end - dropped))
+        samples = slice(first, min(stop + 3, len(time)))
+        settling, steady_stop = _steady_step(time[samples], command[samples], span, hz, rate_hz)
+        steps.append(_Step(hz, samples, settling, steady_stop - settling))
     if not steps:
         raise LogError(
-            f"{where}: no sine step of {excitation.joint} between {estimator.min_hz:g} and "
-            f"{estimator.top_hz(rate_hz):g} Hz."
+            f"{source}: no sine step of {excitation.joint} between {estimator.min_hz:g} and "
+            f"{top_hz:g} Hz."
         )
-    hz, _, dropped, periods = min(steps, key=lambda step: step[3])
-    if periods < 2:
+    shortest = min(steps, key=lambda step: step.steady)
+    if shortest.steady < 2:
         raise LogError(
-            f"{where}: the step at {hz:g} Hz lasts {dropped + max(periods, 0)} periods; "
-            f"{dropped + 2} are needed ({dropped} to settle, 2 to compare)."
+            f"{source}: the step at {shortest.hz:g} Hz lasts "
+            f"{shortest.settling + max(shortest.steady, 0)} periods; {shortest.settling + 2} are "
+            f"needed ({shortest.settling} to settle, 2 to compare)."
         )
     # Two periods a block where there are four, for the window below.
-    blocks = max(2, min(periods // 2, _MOST_BLOCKS))
-    rows = []
-    for hz, inside, dropped, periods in sorted(steps, key=lambda step: step[0]):
-        each = periods // blocks
-        samples = round(_FINE * each * rate_hz / hz)
+    blocks = max(2, min(shortest.steady // 2, _MOST_BLOCKS))
+    steps.sort(key=lambda step: step.hz)
+    command_rows = []
+    position_rows = []
+    third = []
+    for step in steps:
+        hz = step.hz
+        step_time = time[step.samples]
+        periods = step.steady // blocks
+        count = round(_FINE * periods * rate_hz / hz)
+        # The last whole blocks: the joint has settled longest.
+        skipped = step.settling + step.steady - blocks * periods
         grid = Grid(
-            # The last whole blocks: the joint has settled longest.
-            start=float(time[inside][0]) + (dropped + periods - blocks * each) / hz,
-            rate_hz=samples * hz / each,
-            count=samples * blocks,
+            start=float(step_time[0]) + skipped / hz,
+            rate_hz=count * hz / periods,
+            count=count * blocks,
         )
-        u = held_mean(time[inside], command[inside], grid.edges).reshape(blocks, samples)
-        y = interpolate(time[inside], position[inside], grid).reshape(blocks, samples)
+        step_command = held_mean(step_time, command[step.samples], grid.edges)
+        step_position = interpolate(step_time, position[step.samples], grid)
+        command_blocks = step_command.reshape(blocks, count)
+        position_blocks = step_position.reshape(blocks, count)
         # The held command has images that are not whole periods of a block; a window keeps them
         # out. It needs two periods to keep the mean out as well.
-        window = get_window("hann", samples) if each >= 2 else np.ones(samples)
-        turn = 2j * np.pi * each * np.arange(samples) / samples
-        once, thrice = window * np.exp(-turn), window * np.exp(-3.0 * turn)
+        window = get_window("hann", count) if periods >= 2 else np.ones(count)
+        phase = 2j * np.pi * periods * np.arange(count) / count
+        at_frequency = window * np.exp(-phase)
+        at_third = window * np.exp(-3.0 * phase)
         factor = hold(2.0 * np.pi * np.array([hz]), grid.rate_hz)
-        third = abs((y @ thrice).mean()) / abs((y @ once).mean())
-        known = third if 3.0 * hz < rate_hz / 2.0 else float("nan")
-        rows.append((hz, u @ once, y @ once / factor, known))
-    lines_hz, commands, positions, thirds = map(np.array, zip(*rows, strict=True))
+        command_rows.append(command_blocks @ at_frequency)
+        position_rows.append(position_blocks @ at_frequency / factor)
+        if 3.0 * hz < rate_hz / 2.0:
+            harmonic = abs((position_blocks @ at_third).mean())
+            third.append(harmonic / abs((position_blocks @ at_frequency).mean()))
+        else:
+            third.append(np.nan)
     return Spectra(
-        omega=2.0 * np.pi * lines_hz, command=commands.T, position=positions.T, third=thirds
+        omega=2.0 * np.pi * np.array([step.hz for step in steps]),
+        command=np.array(command_rows).T,
+        position=np.array(position_rows).T,
+        third=np.array(third),
     )
 
 
 def _h1(command: ComplexArray, position: ComplexArray) -> ComplexArray:
+    """Return H1 over the periods, shapes (p, f) to (f,)."""
     cross = (np.conj(command) * position).sum(axis=0)
     return np.asarray(cross / (np.abs(command) ** 2).sum(axis=0))
 
@@ -244,45 +299,54 @@ def _h1(command: ComplexArray, position: ComplexArray) -> ComplexArray:
 def estimate_periodic(
     excitations: Sequence[Excitation], estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
-    """Response to multisines or sine steps, averaged over the periods of every excitation.
+    """Estimate the response to multisines or sine steps over the periods of every excitation.
 
-    `repeats` holds one row per excitation if there are three or more (other random phases are then
-    part of the scatter), one per period (of steps, per block of periods) otherwise. LogError as of
-    `read_periods` and `read_steps`, and for repeats of different frequencies.
+    `repeats` of the response has one row per excitation if there are three or more (other random
+    phases are then part of the scatter), one per period (of steps, per block of periods) otherwise.
+
+    Args:
+        excitations: Repeats of one excitation.
+        estimator: The band.
+        rate_hz: Rate of the analysis grid, about [Hz].
+
+    Raises:
+        LogError: Periods are missing, as of `read_periods` and `read_steps`, or the repeats excite
+            different frequencies.
     """
-    segment = excitations[0].segment
-    if segment.kind == "multisine":
-        read = [read_periods(excitation, estimator, rate_hz) for excitation in excitations]
-        length = float(segment.period_s or 0.0)
+    first = excitations[0]
+    if first.segment.kind == "multisine":
+        spectra = [read_periods(excitation, estimator, rate_hz) for excitation in excitations]
+        length = float(first.segment.period_s or 0.0)
         window = f"whole periods of {length:g} s, ramps and the first steady period dropped"
     else:
-        read = [read_steps(excitation, estimator, rate_hz) for excitation in excitations]
-        length = float(2.0 * np.pi / read[0].omega[0])
+        spectra = [read_steps(excitation, estimator, rate_hz) for excitation in excitations]
+        length = float(2.0 * np.pi / spectra[0].omega[0])
         window = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
-    omega = read[0].omega
-    if any(one.omega.shape != omega.shape or not np.allclose(one.omega, omega) for one in read):
-        raise LogError(
-            f"{excitations[0].source or 'log'}: the repeats of {excitations[0].joint} excite "
-            "different frequencies; give them the same period, band and steps."
-        )
-    u = np.concatenate([one.command for one in read])
-    y = np.concatenate([one.position for one in read])
-    repeats = y / u
-    if len(read) >= _ENOUGH_REPEATS:
-        repeats = np.array([_h1(one.command, one.position) for one in read])
-    power = (np.abs(u) ** 2).sum(axis=0) * (np.abs(y) ** 2).sum(axis=0)
-    cross = np.abs((np.conj(u) * y).sum(axis=0)) ** 2
+    omega = spectra[0].omega
+    for repeat in spectra:
+        if repeat.omega.shape != omega.shape or not np.allclose(repeat.omega, omega):
+            raise LogError(
+                f"{first.source or 'log'}: the repeats of {first.joint} excite different "
+                "frequencies; give them the same period, band and steps."
+            )
+    command = np.concatenate([repeat.command for repeat in spectra])
+    position = np.concatenate([repeat.position for repeat in spectra])
+    repeats = position / command
+    if len(spectra) >= _ENOUGH_REPEATS:
+        repeats = np.array([_h1(repeat.command, repeat.position) for repeat in spectra])
+    power = (np.abs(command) ** 2).sum(axis=0) * (np.abs(position) ** 2).sum(axis=0)
+    cross = np.abs((np.conj(command) * position).sum(axis=0)) ** 2
     return FrequencyResponse(
-        joint=excitations[0].joint,
-        amplitude=excitations[0].amplitude,
+        joint=first.joint,
+        amplitude=first.amplitude,
         omega=omega,
-        response=_h1(u, y),
+        response=_h1(command, position),
         coherence=np.clip(cross / np.maximum(power, np.finfo(np.float64).tiny), 0.0, 1.0),
-        averages=np.full(len(omega), float(len(u))),
+        averages=np.full(len(omega), float(len(command))),
         repeats=repeats,
         estimator="periodic",
         window=window,
         segment_s=length,
-        virtual=excitations[0].log.virtual,
-        source=excitations[0].source,
+        virtual=first.log.virtual,
+        source=first.source,
     )
