@@ -41,7 +41,7 @@ def probe(
     acting_stiffness = probed_joint.stiffness * result.stiffness_factor
     acting_damping = probed_joint.damping * result.damping_factor
     # Adding 0 makes -0 a 0.
-    viscous_damping = round(result.viscous_damping, 6) + 0.0
+    viscous_damping = round(result.viscous_damping, 4) + 0.0
     delay_ms = round(1e3 * result.delay_s, 4) + 0.0
     table = Table(
         title=f"{result.joint} in {info.engine} {info.version}",
