@@ -7,11 +7,10 @@ the training simulator, whose gains are then matched.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from benchmarks.runner import finish
 from pronk.cli import console
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.match.magnitude import refine
@@ -20,6 +19,7 @@ from pronk.identify.match.settings import MatchSettings
 from pronk.identify.simulators.mujoco import MujocoSimulator
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from pronk.tables import Column, Table
 from tests.synthetic_log import Excitation, synthetic_log
 
 ROBOT = "mini_cheetah"
@@ -35,8 +35,11 @@ class EngineGap:
     matched_gains: tuple[float, float]
     """Those that give the training simulator the response of the fine one."""
     equal_gains_rms_db: float
+    """RMS of the difference with the gains of the drive [dB]."""
     equal_gains_max_db: float
+    """Largest difference with the gains of the drive [dB]."""
     matched_rms_db: float
+    """RMS of the difference with the matched gains [dB]."""
 
 
 def engine_gap(
@@ -51,8 +54,10 @@ def engine_gap(
     Both get the same command, the paper's chirp if None, held at the policy's rate, and go through
     the same estimator.
     """
-    settings, chirp, drive = MatchSettings(threads=2), signal or Chirp(), robot.joint(joint)
-    gains = drive.stiffness, drive.damping
+    settings = MatchSettings(threads=2)
+    chirp = signal or Chirp()
+    drive = robot.joint(joint)
+    gains = (drive.stiffness, drive.damping)
     tick = robot.timestep_s * robot.decimation
     fine = replace(robot, timestep_s=fine_timestep_s, decimation=round(tick / fine_timestep_s))
     excitation = Excitation(offsets=chirp.samples(1.0 / tick), band_hz=chirp.band_hz)
@@ -78,23 +83,35 @@ def engine_gap(
 
 def engine() -> console.Outcome:
     """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after."""
-    robot, gaps = load_robot(ROBOT), {}
+    robot = load_robot(ROBOT)
+    figures = {}
+    rows = []
     with console.progress() as report:
-        for k, joint in enumerate(JOINTS, start=1):
-            gaps[joint] = engine_gap(robot, joint)
-            report("engine", k / len(JOINTS))
-    rows = [
-        (
-            joint,
-            "{:g} / {:g}".format(*gap.gains),
-            f"{gap.equal_gains_rms_db:.2f} ({gap.equal_gains_max_db:.2f})",
-            "{:.2f} / {:.3f}".format(*gap.matched_gains),
-            f"{gap.matched_rms_db:.3f}",
-        )
-        for joint, gap in gaps.items()
-    ]
-    columns = ["joint", "gains of the drive", "gap with equal gains, RMS (largest) [dB]"]
-    columns += ["matched gains", "gap after the match, RMS [dB]"]
-    title = "The same drive at a 0.25 ms step and in the 5 ms training simulator"
-    figures = {joint: {"joint": joint} | vars(gap) for joint, gap in gaps.items()}
-    return finish(figures, console.table(title, columns, rows))
+        for number, joint in enumerate(JOINTS, start=1):
+            gap = engine_gap(robot, joint)
+            figures[joint] = {"joint": joint, **asdict(gap)}
+            rows.append(
+                (
+                    joint,
+                    "{:g} / {:g}".format(*gap.gains),
+                    gap.equal_gains_rms_db,
+                    gap.equal_gains_max_db,
+                    "{:.2f} / {:.3f}".format(*gap.matched_gains),
+                    gap.matched_rms_db,
+                )
+            )
+            report("engine", number / len(JOINTS))
+    table = Table(
+        title="The same drive at a 0.25 ms step and in the 5 ms training simulator",
+        columns=(
+            Column(heading="joint"),
+            Column(heading="gains of the drive"),
+            Column(heading="gap with equal gains, RMS", unit="dB", digits=2),
+            Column(heading="largest", unit="dB", digits=2),
+            Column(heading="matched gains"),
+            Column(heading="gap after the match, RMS", unit="dB"),
+        ),
+        rows=tuple(rows),
+    )
+    console.show(table)
+    return console.Outcome(figures=figures)

@@ -61,22 +61,29 @@ def test_gains_of_a_framework_are_replayed_and_not_trained_with(tmp_path: Path) 
 
 def test_frameworks_with_one_law_need_the_same_gains() -> None:
     log = recorded("mjlab")
-    own = match([log], ROBOT).gains.joints["FR_knee"]
+    robot_gains = match([log], ROBOT).gains.joints["FR_knee"]
     for name, engine in (("mjlab", "mujoco"), ("isaaclab-explicit", "physx")):
         result = match([log], ROBOT, name)
         gains = result.gains.joints["FR_knee"]
-        assert gains.stiffness.value == pytest.approx(own.stiffness.value, rel=1e-6)
-        assert gains.damping.value == pytest.approx(own.damping.value, rel=1e-6)
+        assert gains.stiffness.value == pytest.approx(robot_gains.stiffness.value, rel=1e-6)
+        assert gains.damping.value == pytest.approx(robot_gains.damping.value, rel=1e-6)
         assert result.simulator.engine == engine
 
 
 def test_profiles_are_named_with_other_steps_and_iterations() -> None:
-    found = profile("isaaclab-implicit,timestep_s=0.0025,iterations=8")
-    assert (found.timestep_s, found.iterations, found.name) == (0.0025, 8, "isaaclab-implicit")
-    assert found.robot(ROBOT).decimation == 8
-    assert profile_of(found.info) == found
-    wrong = ("step=1", "timestep_s=x", "timestep_s=-1", "friction=low")
-    for text in ("isaac", *(f"drake,{setting}" for setting in wrong)):
+    changed = profile("isaaclab-implicit,timestep_s=0.0025,iterations=8")
+    assert changed.name == "isaaclab-implicit"
+    assert changed.timestep_s == 0.0025
+    assert changed.iterations == 8
+    assert changed.robot(ROBOT).decimation == 8
+    assert profile_of(changed.info) == changed
+    for text in (
+        "isaac",
+        "drake,step=1",
+        "drake,timestep_s=x",
+        "drake,timestep_s=-1",
+        "drake,friction=low",
+    ):
         with pytest.raises(PronkError, match="expected"):
             profile(text)
     with pytest.raises(PronkError, match="iterations"):
@@ -92,10 +99,11 @@ def test_the_command_line_writes_a_folder_for_each_framework(tmp_path: Path) -> 
     words = ["match", tmp_path / "knee.mcap", "--robot", "mini_cheetah"]
     text = accepted(*words, "--for", "mjlab-builtin", "--out", tmp_path / "out" / "gains.yaml")
     assert "mjlab-builtin" in text
-    own = load_gains(tmp_path / "out" / "gains.yaml").joints["FR_knee"]
-    other = load_gains(tmp_path / "out" / "mjlab-builtin" / "gains.yaml").joints["FR_knee"]
-    assert other.stiffness.value == pytest.approx(GAINS[0], rel=0.005)
-    assert own.stiffness.value < 0.95 * other.stiffness.value
+    robot_gains = load_gains(tmp_path / "out" / "gains.yaml").joints["FR_knee"]
+    framework_file = tmp_path / "out" / "mjlab-builtin" / "gains.yaml"
+    framework_gains = load_gains(framework_file).joints["FR_knee"]
+    assert framework_gains.stiffness.value == pytest.approx(GAINS[0], rel=0.005)
+    assert robot_gains.stiffness.value < 0.95 * framework_gains.stiffness.value
     assert (tmp_path / "out" / "mjlab-builtin" / "match.html").is_file()
     listed = accepted("profiles")
     assert all(name in listed for name in load_profiles())
