@@ -174,7 +174,7 @@ def checks(rows: dict[str, Row]) -> list[Check]:
     """The limits for the loop as `pronk deploy` runs it, on an idle computer."""
     return [
         Check(
-            what=f"{case.name}: {name}, 99 %",
+            name=f"{case.name}: {name}, 99 %",
             value=rows[case.name]["ways"][WAYS[-1]][name]["p99_ms"],
             sense="<=",
             limit=limit,
@@ -213,7 +213,7 @@ def latency(
     measured = console.table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells)
     found = checks(rows)
     limits = [
-        (c.what, f"{c.value:.3f}", f"{c.sense} {c.limit:g}", "yes" if c.passed else "NO")
+        (c.name, f"{c.value:.3f}", f"{c.sense} {c.limit:g}", "yes" if c.passed else "NO")
         for c in found
     ]
     columns = ["what", "measured [ms]", "limit [ms]", "passed"]

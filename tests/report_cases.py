@@ -228,10 +228,10 @@ def jump_capture(flight: int, scale: float) -> Capture:
     return replace(capture, angular_velocity=rate, joint_velocity=velocity, torque=0.5 * velocity)
 
 
-def of_kind(kind: RunKind, names: tuple[str, ...], **changes: Any) -> TrialResults:
+def of_kind(run_kind: RunKind, names: tuple[str, ...], **changes: Any) -> TrialResults:
     """Return results of some policies; `changes` replace or add fields."""
     fields: dict[str, Any] = {
-        "kind": kind,
+        "run_kind": run_kind,
         "robot": ROBOT.name,
         "subjects": tuple(subject(name) for name in names),
         "joint_names": ROBOT.joint_names,
@@ -335,7 +335,7 @@ def crossings() -> TrialResults:
         ("matched",),
         cases=(case,),
         rows=tuple(rows),
-        settings={"kinds": ["gap", "up"], "runs": 5, "enough": 4},
+        settings={"shapes": ["gap", "up"], "runs": 5, "enough": 4},
     )
 
 

@@ -223,4 +223,4 @@ def test_the_command_writes_the_page_and_its_figures(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").exists()
     parts = json.loads(figures.read_text())["parts"]
     assert [one["source"] for one in parts] == ["trial/summary.json"]
-    assert parts[0]["checks"][0]["what"] == "forward 1: height"
+    assert parts[0]["checks"][0]["name"] == "forward 1: height"

@@ -120,7 +120,7 @@ def test_figures_are_those_of_the_recorded_motion(observed: SimpleNamespace) -> 
     found = observed.evaluation
     results = (*found.walks, *found.jumps)
     assert [r["uncommanded"].n for r in results] == [2, 2, 2]
-    highest = [r["uncommanded"].most for r in results]
+    highest = [r["uncommanded"].maximum for r in results]
     assert highest == pytest.approx([DROP] * 3, abs=2e-3)
     # The standing one of the two jumping robots.
     on = next(sample for sample, _, jump in observed.reads if jump[4])

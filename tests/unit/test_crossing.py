@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,16 @@ import pytest
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
 from pronk.jump.trial import crossing
-from pronk.jump.trial.crossing import Attempt, CrossingFigures, CrossingPlan, Ladder, Obstacle
+from pronk.jump.trial.crossing import (
+    Attempt,
+    CrossingFigures,
+    CrossingPlan,
+    Ladder,
+    Obstacle,
+    climb_ladders,
+    climbs,
+    measure_crossing,
+)
 from pronk.jump.trial.jumps import JumpRules
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.results import TrialResults, TrialRun, load_results
@@ -26,53 +35,71 @@ from report_cases import of_kind, subject
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
 RULES = JumpRules.of(ROBOT)
-FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+FORWARD = (2.0, 0.0, 0.0)
+BACK = (-2.0, 0.0, 0.0)
+TO_THE_LEFT = (0.0, 1.0, 0.0)
 # At 2 m/s the trunk of `seen_jump` is at 4.0 m at the jump input and at 4.4 m at lift-off; the
 # flight of 2 * 2.0 / g = 0.408 s takes it to 5.216 m. Feet stand 0.21 m before and behind it.
 SEEN = seen_jump(up=2.0, speed=2.0)
-TOOK_OFF, LANDED = 4.398 + 0.21, 5.216 - 0.21
+TOOK_OFF = 4.398 + 0.21
+"""Front-most last foothold [m]."""
+LANDED = 5.216 - 0.21
+"""Hind-most first foothold [m]."""
 EDGE = 4.65
+"""Place of the edge [m]."""
 
 
-def obstacle(kind: crossing.Shape = "gap", **changes: Any) -> Obstacle:
-    return Obstacle(kind=kind, **({"size": 0.3, "command": FORWARD, "edge": EDGE} | changes))
+def obstacle(
+    shape: crossing.Shape = "gap",
+    *,
+    size: float = 0.3,
+    command: tuple[float, float, float] = FORWARD,
+    edge: float = EDGE,
+) -> Obstacle:
+    return Obstacle(shape=shape, size=size, command=command, edge=edge)
 
 
-GAP = obstacle()
-
-
-def settled(
-    seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
+def measured(
+    capture: Capture, obstacle: Obstacle, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return crossing.measure_crossing(seen, obstacle, 0.65, triggered=triggered, rules=RULES)
+    return measure_crossing(capture, obstacle, 0.65, triggered=triggered, rules=RULES)
 
 
 # --- The course ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("kind", "between", "after"),
+    ("shape", "between", "after"),
     [("gap", -crossing.DEPTH, 0.0), ("up", 0.3, 0.3), ("down", -0.3, -0.3)],
 )
-@pytest.mark.parametrize(("command", "way"), [(FORWARD, (1, 0)), (BACK, (-1, 0)), (LEFT, (0, 1))])
+@pytest.mark.parametrize(
+    ("command", "direction"), [(FORWARD, (1, 0)), (BACK, (-1, 0)), (TO_THE_LEFT, (0, 1))]
+)
 def test_the_floor_is_where_it_should_be(
-    kind: crossing.Shape, between: float, after: float, command: Any, way: tuple[int, int]
+    shape: crossing.Shape,
+    between: float,
+    after: float,
+    command: tuple[float, float, float],
+    direction: tuple[int, int],
 ) -> None:
-    own = Ground(friction=0.55, stiffness=20e3)
-    ground = obstacle(kind, command=command, edge=2.0).on(own)
+    ground = obstacle(shape, command=command, edge=2.0).on(Ground(friction=0.55, stiffness=20e3))
     assert (ground.friction, ground.stiffness) == (0.55, 20e3)
-    places = {0.0: 0.0, 1.99: 0.0, 2.01: between, 2.29: between, 2.31: after, 8.0: after}
+    heights = {0.0: 0.0, 1.99: 0.0, 2.01: between, 2.29: between, 2.31: after, 8.0: after}
     for side in (0.0, 3.0):
-        for s, expected in places.items():
-            x, y = s * way[0] + side * way[1], s * way[1] + side * way[0]
-            assert ground.height(x, y) == pytest.approx(expected)
-    assert obstacle("flat", command=command).on(Ground()) == Ground()
+        for along, height in heights.items():
+            x = along * direction[0] + side * direction[1]
+            y = along * direction[1] + side * direction[0]
+            assert ground.height(x, y) == pytest.approx(height)
 
 
-def test_a_course_leads_straight_on() -> None:
-    for command in ((1.0, 1.0, 0.0), STILL):
-        with pytest.raises(PronkError, match="course"):
-            crossing.direction(command)
+def test_flat_ground_has_no_blocks() -> None:
+    assert obstacle("flat").on(Ground()) == Ground()
+
+
+@pytest.mark.parametrize("command", [(1.0, 1.0, 0.0), STILL])
+def test_a_course_leads_straight_on(command: tuple[float, float, float]) -> None:
+    with pytest.raises(PronkError, match="course"):
+        crossing.direction(command)
 
 
 def test_the_operator_looks_at_the_trunk() -> None:
@@ -87,57 +114,79 @@ def test_the_operator_looks_at_the_trunk() -> None:
     assert operator(1.02) == (FORWARD, True)
     assert operator.triggered == 1.02
     place = 0.0  # never taken back
-    after = [operator(t) for t in (1.40, 1.43, 1.63)]
-    assert after == [(FORWARD, True), (FORWARD, False), (STILL, False)]
+    assert operator(1.40) == (FORWARD, True)
+    assert operator(1.43) == (FORWARD, False)
+    assert operator(1.63) == (STILL, False)
+
+
+# --- What counts as crossed ---------------------------------------------------------------------
 
 
 def test_a_gap_that_was_crossed() -> None:
-    found = settled(SEEN)
-    assert found.take_off == pytest.approx(EDGE - TOOK_OFF, abs=1e-9)
-    assert found.reach == pytest.approx(TOOK_OFF - 4.0, abs=1e-9)
-    assert found.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
-    assert found.landing == pytest.approx(LANDED - EDGE - 0.3, abs=2e-3)
-    assert found.speed == pytest.approx(2.0)
-    aside = settled(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), obstacle(command=LEFT))
-    assert aside.landing == pytest.approx(found.landing)
+    figures = measured(SEEN, obstacle())
+    assert figures.success
+    assert figures.take_off == pytest.approx(EDGE - TOOK_OFF, abs=1e-9)
+    assert figures.reach == pytest.approx(TOOK_OFF - 4.0, abs=1e-9)
+    assert figures.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
+    assert figures.landing == pytest.approx(LANDED - EDGE - 0.3, abs=2e-3)
+    assert figures.speed == pytest.approx(2.0)
+
+
+def test_a_course_to_the_side_is_measured_alike() -> None:
+    sideways = seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2)
+    figures = measured(sideways, obstacle(command=TO_THE_LEFT))
+    assert figures.landing == pytest.approx(measured(SEEN, obstacle()).landing)
 
 
 def span(begin: float, end: float | None = None) -> slice:
+    """Samples between two times [s]."""
     return slice(round(begin * 1000), None if end is None else round(end * 1000))
 
 
 LOW = changed(SEEN, "foot_position", (span(3.4, 3.45), 0), [4.8, 0.0, -0.01])
 """A foot's centre is under the floor while it is over the gap."""
 LEANT = changed(SEEN, "orientation", span(5.5), [0.9, 0.0, 0.4359, 0.0])
+"""It leans too far from half a second after the landing on."""
 LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
 """Upright at the end, but it lay on its side meanwhile."""
+TOUCHED = changed(SEEN, "other_contact", 4000, True)
+"""A shank touched the ground."""
+WENT_BACK = changed(SEEN, "position", (span(5.0), 0), 4.9)
+"""The trunk is before the far edge at the end."""
 
 
 @pytest.mark.parametrize(
-    ("seen", "size", "why", "ends"),
+    ("capture", "size", "why", "is_lost"),
     [
         (SEEN, 0.3, "", False),
         (LOW, 0.3, crossing.STEPPED_IN, True),
-        (changed(SEEN, "other_contact", 4000, True), 0.3, crossing.NON_FOOT_CONTACT, False),
+        (TOUCHED, 0.3, crossing.NON_FOOT_CONTACT, False),
         (SEEN, 0.4, crossing.NOT_OVER, False),  # the hind feet land 6 mm before the far edge
         (LEANT, 0.3, crossing.FELL, False),
         (LAY, 0.3, crossing.FELL, True),
-        (changed(SEEN, "position", (span(5.0), 0), 4.9), 0.3, crossing.NOT_OVER, False),  # back
+        (WENT_BACK, 0.3, crossing.NOT_OVER, False),
     ],
 )
-def test_why_a_gap_was_not_crossed(seen: Capture, size: float, why: str, ends: bool) -> None:
-    assert settled(seen, obstacle(size=size)).why == why
-    assert crossing.is_lost(seen, obstacle(size=size)) is ends
+def test_why_a_gap_was_not_crossed(capture: Capture, size: float, why: str, is_lost: bool) -> None:
+    gap = obstacle(size=size)
+    assert measured(capture, gap).why == why
+    assert crossing.is_lost(capture, gap) is is_lost
 
 
-def test_what_happens_elsewhere_does_not_count() -> None:
+def test_a_touch_elsewhere_does_not_count() -> None:
     # A foot pressed into the floor beside the gap, a shank that touched before the jump.
     low = changed(SEEN, "foot_position", (span(3.7, 3.75), 0, 2), -0.001)
-    assert settled(changed(low, "other_contact", span(0.0, 2.9), True)).success
-    assert settled(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
-    # Steps have no bottom to fall into.
-    assert settled(LOW, obstacle("down")).success
-    assert settled(LOW, obstacle("up")).landing == pytest.approx(LANDED - EDGE, abs=2e-3)
+    capture = changed(low, "other_contact", span(0.0, 2.9), True)
+    assert measured(capture, obstacle()).success
+
+
+def test_a_jump_that_was_never_commanded() -> None:
+    assert measured(SEEN, obstacle(), triggered=None).why == crossing.NOT_TRIGGERED
+
+
+def test_steps_have_no_bottom_to_fall_into() -> None:
+    assert measured(LOW, obstacle("down")).success
+    assert measured(LOW, obstacle("up")).landing == pytest.approx(LANDED - EDGE, abs=2e-3)
     assert not crossing.is_lost(LOW, obstacle("up"))
 
 
@@ -149,66 +198,98 @@ LADDER = Ladder((0.1, 0.2, 0.3, 0.4), (0.0, 0.1))
 PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2)
 
 
-def climb(
-    crossed: dict[tuple[float, float], int], plan: CrossingPlan = PLAN, reach: float = 0.5
-) -> tuple[list[TrialRun], list[Attempt]]:
-    """Climb with a robot that crosses so many runs of each size and lead beyond its reach."""
-    done: list[Attempt] = []
+@dataclass
+class Climber:
+    """A robot that crosses so many runs of each size and lead beyond its reach."""
 
-    def run(tasks: list[Attempt]) -> list[TrialRun]:
-        done.extend(tasks)
-        return [replace(task.row, figures=figures(task)) for task in tasks]
+    crossed: dict[tuple[float, float], int] = field(default_factory=dict)
+    reach: float = 0.5
+    """Reach of its first run of practice; each further one reaches 0.1 m further [m]."""
+    attempts: list[Attempt] = field(default_factory=list)
 
-    def figures(task: Attempt) -> CrossingFigures:
-        kind, size, number = task.obstacle.kind, task.obstacle.size, task.row.number
-        if kind == "flat":
-            return CrossingFigures(size=0.0, lead=0.0, reach=reach + 0.1 * number)
-        good = number < crossed[size, round(task.lead - 0.55, 6)]
-        why = "" if good else crossing.NON_FOOT_CONTACT
-        return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
+    def climb(self, plan: CrossingPlan = PLAN) -> list[TrialRun]:
+        return climb_ladders([subject("matched")], plan, SETUP, run=self._run)
 
-    return crossing.climb_ladders([subject("matched")], plan, SETUP, run=run), done
+    def _run(self, attempts: list[Attempt]) -> list[TrialRun]:
+        self.attempts += attempts
+        rows = []
+        for attempt in attempts:
+            rows.append(replace(attempt.row, figures=self._figures(attempt)))
+        return rows
+
+    def _figures(self, attempt: Attempt) -> CrossingFigures:
+        number = attempt.row.number
+        obstacle = attempt.obstacle
+        if obstacle.shape == "flat":
+            return CrossingFigures(size=0.0, lead=0.0, reach=self.reach + 0.1 * number)
+        beyond = round(attempt.lead - 0.55, 6)  # the mean reach of practice
+        is_crossed = number < self.crossed[obstacle.size, beyond]
+        return CrossingFigures(
+            obstacle=obstacle.shape,
+            size=obstacle.size,
+            lead=attempt.lead,
+            why="" if is_crossed else crossing.NON_FOOT_CONTACT,
+        )
 
 
 def result(rows: list[TrialRun]) -> TrialResults:
-    settings = {"kinds": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough}
-    rest: Any = {"rows": tuple(rows), "settings": settings}
-    return of_kind(crossing.CROSSING, ("matched",), cases=(CASE,), **rest)
+    settings = {"shapes": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough}
+    return of_kind(
+        crossing.CROSSING, ("matched",), cases=(CASE,), rows=tuple(rows), settings=settings
+    )
 
 
 def test_sizes_grow_until_no_lead_does() -> None:
-    crossed = {(0.1, 0.0): 1, (0.1, 0.1): 3, (0.2, 0.0): 2, (0.2, 0.1): 2}
-    crossed |= {(0.3, 0.0): 0, (0.3, 0.1): 1}
-    rows, _ = climb(crossed)
+    climber = Climber(
+        crossed={
+            (0.1, 0.0): 1,
+            (0.1, 0.1): 3,
+            (0.2, 0.0): 2,
+            (0.2, 0.1): 2,
+            (0.3, 0.0): 0,
+            (0.3, 0.1): 1,
+        }
+    )
+    rows = climber.climb()
     # Two jumps of practice, then three runs for each of two leads at three sizes.
     assert len(rows) == 2 + 3 * 2 * 3
-    (found,) = crossing.climbs(result(rows))
-    assert [rung.size for rung in found.rungs] == [0.1, 0.2, 0.3]
-    assert [(rung.crossed, rung.runs) for rung in found.rungs] == [(3, 3), (2, 3), (1, 3)]
-    assert [rung.lead for rung in found.rungs] == pytest.approx([0.65, 0.55, 0.65])
-    assert found.rungs[0].reasons == {crossing.NON_FOOT_CONTACT: 2}
-    assert (found.largest, found.ever) == (0.2, 0.3)
-    # A larger gap does not count without the smaller.
-    rows, _ = climb({(0.1, 0.0): 0, (0.1, 0.1): 1})
-    more = [replace(row, figures=replace(row.figures, size=0.2, why="")) for row in rows[2:]]
-    (found,) = crossing.climbs(result([*rows, *more]))
-    assert (found.largest, found.ever) == (0.0, 0.2)
+    (climb,) = climbs(result(rows))
+    assert [rung.size for rung in climb.rungs] == [0.1, 0.2, 0.3]
+    assert [(rung.crossed, rung.runs) for rung in climb.rungs] == [(3, 3), (2, 3), (1, 3)]
+    assert [rung.lead for rung in climb.rungs] == pytest.approx([0.65, 0.55, 0.65])
+    assert climb.rungs[0].reasons == {crossing.NON_FOOT_CONTACT: 2}
+    assert (climb.largest, climb.ever) == (0.2, 0.3)
+
+
+def test_a_larger_gap_does_not_count_without_the_smaller() -> None:
+    rows = Climber(crossed={(0.1, 0.0): 0, (0.1, 0.1): 1}).climb()
+    larger = []
+    for row in rows[PLAN.practice :]:
+        larger.append(replace(row, figures=replace(row.figures, size=0.2, why="")))
+    (climb,) = climbs(result([*rows, *larger]))
+    assert (climb.largest, climb.ever) == (0.0, 0.2)
 
 
 def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
-    rows, _ = climb({}, reach=math.nan)
+    rows = Climber(reach=math.nan).climb()
     assert len(rows) == PLAN.practice
-    assert crossing.climbs(result(rows))[0].rungs == ()
+    (climb,) = climbs(result(rows))
+    assert climb.rungs == ()
+
+
+def starts(plan: CrossingPlan) -> list[Any]:
+    """Starts and noise seeds of the runs of practice."""
+    climber = Climber(reach=math.nan)
+    climber.climb(plan)
+    return [(attempt.start, attempt.row.seed) for attempt in climber.attempts]
 
 
 def test_starts_depend_on_command_and_number_alone() -> None:
-    def starts(plan: CrossingPlan) -> list[object]:
-        return [(a.start, a.row.seed) for a in climb({}, plan, reach=math.nan)[1]]
-
-    other = Case(name="back 2", command=BACK)
-    both = starts(replace(PLAN, cases=(other, CASE)))
-    assert both[2:] == starts(PLAN) != starts(replace(PLAN, seed=1))
-    for start, _ in both[2:]:  # type: ignore[misc]
+    back = Case(name="back 2", command=BACK)
+    both_commands = starts(replace(PLAN, cases=(back, CASE)))
+    assert both_commands[2:] == starts(PLAN)
+    assert both_commands[2:] != starts(replace(PLAN, seed=1))
+    for start, _ in both_commands[2:]:
         assert -crossing.PHASE_S * 2.0 <= start.position[0] <= 0.0
 
 
@@ -221,8 +302,8 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     slow = Case(name="forward", command=(0.2, 0.0, 0.0))
     script = Script(command=slow.command, stand_s=0.1)
     plan = replace(PLAN, cases=(slow,), practice=1, script=script)
-    found = crossing.add_crossings([policy], plan, replace(SETUP, out=tmp_path))
-    assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
-    assert crossing.climbs(found)[0].largest == 0.0
-    assert repr(load_results(tmp_path, crossing.CROSSING).rows) == repr(found.rows)
-    assert np.isnan(found.rows[0].figures.reach)
+    results = crossing.add_crossings([policy], plan, replace(SETUP, out=tmp_path))
+    assert [row.figures.why for row in results.rows] == [crossing.NOT_TRIGGERED]
+    assert climbs(results)[0].largest == 0.0
+    assert repr(load_results(tmp_path, crossing.CROSSING).rows) == repr(results.rows)
+    assert np.isnan(results.rows[0].figures.reach)

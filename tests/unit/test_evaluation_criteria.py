@@ -21,7 +21,7 @@ DT, ROBOT = 0.005, load_robot("mini_cheetah")
 
 
 def spread(mean: float, std: float = 0.01) -> Spread:
-    return Spread(mean=mean, std=std, p05=mean, p95=mean, most=mean, n=10)
+    return Spread(mean=mean, std=std, p05=mean, p95=mean, maximum=mean, n=10)
 
 
 GOOD_WALK = {"speed_error": 0.1, "yaw_error": 0.1, "speed_error_averaged": 0.04, "fell": 0.0}
@@ -47,7 +47,7 @@ def evaluation(**changes: Any) -> sim.Evaluation:
 
 
 def failed(whole: sim.Evaluation) -> list[str]:
-    return [check.what for check in evaluation_checks(whole) if not check.passed]
+    return [check.name for check in evaluation_checks(whole) if not check.passed]
 
 
 # --- Acceptance criteria ------------------------------------------------------------------------

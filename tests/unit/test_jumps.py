@@ -188,15 +188,17 @@ def test_the_highest_flight_without_a_jump_input() -> None:
 
 
 @given(hnp.arrays(bool, st.tuples(st.integers(0, 60), st.just(4))), st.integers(1, 5))
-def test_flights_are_the_longest_stretches_without_contact(contact: np.ndarray, least: int) -> None:
+def test_flights_are_the_longest_stretches_without_contact(
+    contact: np.ndarray, min_samples: int
+) -> None:
     line = "".join("g" if feet.any() else "a" for feet in contact)
     expected = []
     begin = 0
     for stretch in line.split("g")[:-1]:
-        if len(stretch) >= least:
+        if len(stretch) >= min_samples:
             expected.append((begin, begin + len(stretch)))
         begin += len(stretch) + 1
-    phases = flights(contact, least=least)
+    phases = flights(contact, min_samples=min_samples)
     assert [(phase.liftoff, phase.touchdown) for phase in phases] == expected
 
 

@@ -110,10 +110,10 @@ def test_a_cell_by_hand() -> None:
     assert height.n == 3
     assert height.mean == pytest.approx(0.44)
     assert height.std == pytest.approx(0.04)
-    assert (height.least, height.p50, height.most) == pytest.approx(HEIGHTS)
+    assert (height.minimum, height.p50, height.maximum) == pytest.approx(HEIGHTS)
     assert cell.figures["gap"].n == 0
     assert math.isnan(cell.figures["gap"].mean)
-    assert cell.joints["peak_torque"]["FR_knee"].most == pytest.approx(2 * 0.48)
+    assert cell.joints["peak_torque"]["FR_knee"].maximum == pytest.approx(2 * 0.48)
 
 
 def test_the_ratio_is_that_of_the_mean_scatter() -> None:
@@ -193,7 +193,7 @@ def test_a_saved_trial_is_loaded_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize("results", [walks(), crossings()])
 def test_walks_and_crossings_are_loaded_as_they_were(results: TrialResults, tmp_path: Path) -> None:
     save_results(tmp_path, results)
-    loaded = load_results(tmp_path, results.kind)
+    loaded = load_results(tmp_path, results.run_kind)
     assert repr((loaded.rows, loaded.cells)) == repr((results.rows, results.cells))
 
 
@@ -301,7 +301,7 @@ def test_the_tables_of_walks_and_crossings() -> None:
 
 
 def test_criteria_by_hand() -> None:
-    checks = {check.what: check for check in trial_checks(trial())}
+    checks = {check.name: check for check in trial_checks(trial())}
     assert checks["forward 2: height"].passed  # .44 against .244
     for failed in (
         "forward 2: height, std",  # .04 against .013

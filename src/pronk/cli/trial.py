@@ -175,14 +175,14 @@ def _trial_of_jumps(
             walks = add_walks(policies, setup, seed=plan.seed, progress=report.bar("walking"))
             for subject in walks.subjects:
                 study_tables.append(tables.walk_table(walks, subject.name))
-            wrote.append(output.out / walks.kind.table)
+            wrote.append(output.out / walks.run_kind.table)
         if study.crossing:
             crossing_plan = CrossingPlan(seed=plan.seed)
             crossings = add_crossings(
                 policies, crossing_plan, setup, progress=report.bar("crossing")
             )
             study_tables.append(tables.crossing_table(crossings))
-            wrote.append(output.out / crossings.kind.table)
+            wrote.append(output.out / crossings.run_kind.table)
         page, _ = write_report(output.out, report)
     for table in study_tables:
         console.show(table)

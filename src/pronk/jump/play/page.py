@@ -66,9 +66,9 @@ def free_port(host: str, port: int) -> int:
         raise PronkError(f"--port {port}; expected a number from 1 to 65535, as in 8080.")
     end = min(port + _PORTS, 65536)
     try:
-        family, kind, _, _, _ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, socket_type, _, _, _ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         for candidate in range(port, end):
-            if _can_bind(family, kind, host, candidate):
+            if _can_bind(family, socket_type, host, candidate):
                 return candidate
     except OSError as error:
         raise PronkError(
@@ -78,9 +78,9 @@ def free_port(host: str, port: int) -> int:
     raise PronkError(f"ports {port} to {end - 1} are all taken; name another with --port.")
 
 
-def _can_bind(family: int, kind: int, host: str, port: int) -> bool:
+def _can_bind(family: int, socket_type: int, host: str, port: int) -> bool:
     """Return whether a port is free; an OSError if the address is none of this machine."""
-    with socket.socket(family, kind) as probe:
+    with socket.socket(family, socket_type) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
@@ -271,8 +271,8 @@ class WebPage:
 
     def _send_velocity(self) -> None:
         """Command what the sliders say."""
-        forward, left, yaw_rate = (float(slider.value) for slider in self.sliders)
-        self._joystick.set_velocity((forward, left, yaw_rate))
+        forward, sideways, yaw_rate = (float(slider.value) for slider in self.sliders)
+        self._joystick.set_velocity((forward, sideways, yaw_rate))
 
     def _nudge(self, index: int, sign: int) -> None:
         """Move a slider by a quarter of the way to the end of its range."""

@@ -298,8 +298,7 @@ def velocity_error(row: TrialRun) -> float:
 
     Both are along the command; NaN where none is commanded, or the robot fell before.
     """
-    forward, left, _ = row.script.command
-    commanded = math.hypot(forward, left)
+    commanded = math.hypot(*row.script.command[:2])
     return abs(row.figures.approach.speed - commanded) if commanded else math.nan
 
 

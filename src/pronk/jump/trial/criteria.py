@@ -40,8 +40,8 @@ COST = 1.10
 class Check:
     """A number beside its limit."""
 
-    what: str
-    """What the number is, with its command."""
+    name: str
+    """Name of the number, with its command."""
     value: float
     sense: Sense
     limit: float
@@ -57,7 +57,7 @@ class Check:
     def row(self) -> dict[str, Any]:
         """Return the check as JSON has it."""
         return {
-            "what": self.what,
+            "name": self.name,
             "value": self.value,
             "sense": self.sense,
             "limit": self.limit,
@@ -120,7 +120,7 @@ def evaluation_checks(evaluation: Evaluation) -> list[Check]:
         checks += _jump_checks(jump)
     for moment, results in (("walking", evaluation.walks), ("around jumps", evaluation.jumps)):
         if results:
-            flights = [result["uncommanded"].most for result in results]
+            flights = [result["uncommanded"].maximum for result in results]
             # Commands without such a flight have NaN; without any, its height is 0.
             highest = max((flight for flight in flights if not math.isnan(flight)), default=0.0)
             checks.append(Check(f"flight without a jump input, {moment}", highest, "<=", RISE, "m"))

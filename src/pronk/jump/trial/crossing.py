@@ -102,7 +102,7 @@ FELL = "not upright 2 s later"
 class Obstacle:
     """A gap or a step on the way of a command."""
 
-    kind: Shape
+    shape: Shape
     size: float = 0.0
     """Width of a gap, height of a step [m]."""
     command: Velocity
@@ -113,18 +113,18 @@ class Obstacle:
     @property
     def far(self) -> float:
         """Place where the floor goes on, along the course [m]."""
-        return self.edge + self.size if self.kind == "gap" else self.edge
+        return self.edge + self.size if self.shape == "gap" else self.edge
 
     def on(self, ground: Ground) -> Ground:
         """Put the obstacle on a ground, whose friction and stiffness stay."""
-        if self.kind == "flat":
+        if self.shape == "flat":
             return replace(ground, floor=0.0, terrain=())
-        if self.kind == "gap":
+        if self.shape == "gap":
             floor = -DEPTH
             near_block = self._box(-BEHIND, self.edge, floor, 0.0)
             far_block = self._box(self.far, self.far + BEYOND, floor, 0.0)
             terrain: tuple[Box, ...] = (near_block, far_block)
-        elif self.kind == "up":
+        elif self.shape == "up":
             floor = 0.0
             terrain = (self._box(self.far, self.far + BEYOND, floor, self.size),)
         else:
@@ -144,12 +144,12 @@ class Obstacle:
 
 def direction(command: Velocity) -> Array:
     """Return the unit vector of a command straight forward, back or to a side. (2,)."""
-    forward, left, _ = command
-    if bool(forward) == bool(left):
+    forward, sideways, _ = command
+    if bool(forward) == bool(sideways):
         raise PronkError(
             f"command {command} on a course; expected one straight forward, back or to a side."
         )
-    return np.array([np.sign(forward), np.sign(left)])
+    return np.array([np.sign(forward), np.sign(sideways)])
 
 
 # ---- one run ----
@@ -186,7 +186,7 @@ class CrossingFigures:
     """One run at an obstacle."""
 
     obstacle: str = "flat"
-    """Kind of the obstacle; `flat` for practice."""
+    """Shape of the obstacle; `flat` for practice."""
     why: str = ""
     """First condition that was not met; empty if the obstacle was crossed."""
     size: float = figure("m", "width of the gap, height of the step")
@@ -250,7 +250,7 @@ def measure_crossing(
     """
     if triggered is None:
         return CrossingFigures(
-            obstacle=obstacle.kind, size=obstacle.size, lead=lead, why=NOT_TRIGGERED
+            obstacle=obstacle.shape, size=obstacle.size, lead=lead, why=NOT_TRIGGERED
         )
     way = direction(obstacle.command)
     count = len(capture.time)
@@ -271,13 +271,13 @@ def measure_crossing(
         stood = np.where(before.any(axis=0), foot_place[last_stance, legs], -np.inf)
         front = float(stood.max())
         reach = front - float(trunk_place[on])
-        if obstacle.kind != "flat":
+        if obstacle.shape != "flat":
             take_off = obstacle.edge - front
     landing = math.nan
-    if landed < count and obstacle.kind != "flat":
+    if landed < count and obstacle.shape != "flat":
         landing = float(foot_place[touched, legs].min()) - obstacle.far
     return CrossingFigures(
-        obstacle=obstacle.kind,
+        obstacle=obstacle.shape,
         size=obstacle.size,
         lead=lead,
         why=_why_not_crossed(capture, obstacle, on=on, landed=landed, rules=rules),
@@ -371,7 +371,7 @@ def run_attempt(attempt: Attempt) -> TrialRun:
 
 
 class Ladder(NamedTuple):
-    """The sizes of one kind of obstacle, and the leads beyond the reach of practice [m]."""
+    """The sizes of one shape of obstacle, and the leads beyond the reach of practice [m]."""
 
     sizes: tuple[float, ...]
     leads: tuple[float, ...]
@@ -395,7 +395,7 @@ class CrossingPlan:
 
     cases: tuple[Case, ...] = named("forward 2", "back 2", "side +1", "side -1")
     ladders: Mapping[Shape, Ladder] = field(default_factory=lambda: dict(LADDERS))
-    """Sizes and leads by kind of obstacle."""
+    """Sizes and leads by shape of obstacle."""
     runs: int = 5
     """Number of runs for each size and lead."""
     enough: int = 4
@@ -414,7 +414,7 @@ class _OpenClimb:
 
     subject: TriedPolicy
     case: Case
-    kind: Shape
+    shape: Shape
     reach: float
     """Mean reach of practice [m]."""
 
@@ -441,7 +441,7 @@ def climb_ladders(
     for subject in subjects:
         for case in plan.cases:
             practice += _plan_attempts(
-                subject, case, plan, setup, kind="flat", size=0.0, lead=0.0, runs=plan.practice
+                subject, case, plan, setup, shape="flat", size=0.0, lead=0.0, runs=plan.practice
             )
     rows = run(practice)
     climbing: list[_OpenClimb] = []
@@ -454,26 +454,26 @@ def climb_ladders(
                     reaches.append(row.figures.reach)
             # Without a jump there is nothing to cross.
             if reaches:
-                for kind in plan.ladders:
+                for shape in plan.ladders:
                     climbing.append(
                         _OpenClimb(
-                            subject=subject, case=case, kind=kind, reach=float(np.mean(reaches))
+                            subject=subject, case=case, shape=shape, reach=float(np.mean(reaches))
                         )
                     )
     for rung in itertools.count():
-        climbing = [climb for climb in climbing if rung < len(plan.ladders[climb.kind].sizes)]
+        climbing = [climb for climb in climbing if rung < len(plan.ladders[climb.shape].sizes)]
         if not climbing:
             break
         attempts: list[Attempt] = []
         for climb in climbing:
-            sizes, leads = plan.ladders[climb.kind]
+            sizes, leads = plan.ladders[climb.shape]
             for beyond in leads:
                 attempts += _plan_attempts(
                     climb.subject,
                     climb.case,
                     plan,
                     setup,
-                    kind=climb.kind,
+                    shape=climb.shape,
                     size=sizes[rung],
                     lead=round(climb.reach + beyond, 4),
                     runs=plan.runs,
@@ -487,7 +487,7 @@ def climb_ladders(
                 if (row.policy, row.case, row.figures.obstacle) == (
                     climb.subject.name,
                     climb.case.name,
-                    climb.kind,
+                    climb.shape,
                 ):
                     climb_rows.append(row)
             if rung_of(climb_rows).crossed >= plan.enough:
@@ -502,14 +502,14 @@ def _plan_attempts(
     plan: CrossingPlan,
     setup: TrialSetup,
     *,
-    kind: Shape,
+    shape: Shape,
     size: float,
     lead: float,
     runs: int,
 ) -> list[Attempt]:
     """Plan runs at one obstacle; their starts are alike for all obstacles and leads."""
     speed = math.hypot(*case.command[:2])
-    obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
+    obstacle = Obstacle(shape=shape, size=size, command=case.command, edge=RUN_UP_S * speed)
     ground = obstacle.on(setup.sim_params.ground)
     course_setup = replace(setup, sim_params=replace(setup.sim_params, ground=ground))
     attempts = []
@@ -529,7 +529,7 @@ def _plan_attempts(
             Attempt(
                 row=row,
                 subject=subject,
-                kind=CROSSING,
+                run_kind=CROSSING,
                 setup=course_setup,
                 start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
                 obstacle=obstacle,
@@ -574,7 +574,7 @@ def add_crossings(
     rows = climb_ladders(subjects, plan, setup, run=run)
     progress(1.0)
     results = TrialResults(
-        kind=CROSSING,
+        run_kind=CROSSING,
         rows=tuple(rows),
         robot=setup.robot.name,
         subjects=subjects,
@@ -583,7 +583,7 @@ def add_crossings(
         sim_params=setup.about,
         script=plan.script,
         rules=asdict(JumpRules.of(setup.robot)),
-        settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
+        settings={"shapes": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
         versions=software_versions(),
         timing={"seconds": time.perf_counter() - begun},
     )
@@ -612,7 +612,7 @@ class Climb(NamedTuple):
 
     policy: str
     case: str
-    kind: str
+    shape: str
     rungs: tuple[Rung, ...]
     largest: float
     """Largest size crossed in `enough` of its runs, as were all smaller ones; 0 for none [m]."""
@@ -643,25 +643,25 @@ def rung_of(rows: Sequence[TrialRun]) -> Rung:
 
 
 def climbs(results: TrialResults) -> tuple[Climb, ...]:
-    """Sum up every policy with every command and kind of obstacle."""
+    """Sum up every policy with every command and shape of obstacle."""
     summed_climbs = []
     for subject in results.subjects:
         for case in results.cases:
             rows = results.of(subject.name, case.name)
-            for kind in results.settings["kinds"]:
-                obstacle_rows = [row for row in rows if row.figures.obstacle == kind]
+            for shape in results.settings["shapes"]:
+                obstacle_rows = [row for row in rows if row.figures.obstacle == shape]
                 summed_climbs.append(
                     _sum_up_climb(
-                        subject.name, case.name, kind, obstacle_rows, results.settings["enough"]
+                        subject.name, case.name, shape, obstacle_rows, results.settings["enough"]
                     )
                 )
     return tuple(summed_climbs)
 
 
 def _sum_up_climb(
-    policy: str, case: str, kind: str, rows: Sequence[TrialRun], enough: int
+    policy: str, case: str, shape: str, rows: Sequence[TrialRun], enough: int
 ) -> Climb:
-    """Sum up all sizes of one kind of obstacle."""
+    """Sum up all sizes of one shape of obstacle."""
     rungs = []
     largest = 0.0
     is_unbroken = True
@@ -675,7 +675,7 @@ def _sum_up_climb(
     return Climb(
         policy=policy,
         case=case,
-        kind=kind,
+        shape=shape,
         rungs=tuple(rungs),
         largest=largest,
         ever=max(crossed_sizes, default=0.0),

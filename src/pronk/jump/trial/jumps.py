@@ -188,19 +188,19 @@ class JumpFlights(NamedTuple):
         return max(self.high, key=lambda flight: flight.samples, default=None)
 
 
-def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
+def flights(contact: Mask, *, min_samples: int) -> tuple[Flight, ...]:
     """Return the flight phases of some length that have ended, in their order.
 
     Args:
         contact: Feet on the ground. (T, 4)
-        least: Shortest flight phase in samples.
+        min_samples: Shortest flight phase in samples.
     """
     airborne = ~np.asarray(contact, dtype=bool).any(axis=-1)
     edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0)).tolist()
     phases = []
     # A flight that has not ended has an edge without a partner.
     for liftoff, touchdown in zip(edges[0::2], edges[1::2], strict=False):
-        if touchdown - liftoff >= least:
+        if touchdown - liftoff >= min_samples:
             phases.append(Flight(liftoff, touchdown))
     return tuple(phases)
 
@@ -219,7 +219,7 @@ def jump_flights(capture: Capture, on: int | None, rules: JumpRules, end: int) -
     commanded = []
     high = []
     uncommanded = []
-    for flight in flights(capture.contact[:end], least=steps(capture, rules.flight_s)):
+    for flight in flights(capture.contact[:end], min_samples=steps(capture, rules.flight_s)):
         if on is None or not on <= flight.liftoff <= latest:
             uncommanded.append(flight)
             continue
@@ -390,10 +390,10 @@ class JumpFigures:
         return self.upright and not self.non_foot_contact
 
 
-def figures_of(kind: type[Any]) -> dict[str, Figure]:
+def figures_of(figures_class: type[Any]) -> dict[str, Figure]:
     """Return the figures of a dataclass, and of the parts it has, by name."""
     figures = {}
-    for entry in fields(kind):
+    for entry in fields(figures_class):
         if "part" in entry.metadata:
             for inner_entry in fields(entry.metadata["part"]):
                 figures[inner_entry.name] = Figure(
@@ -404,9 +404,9 @@ def figures_of(kind: type[Any]) -> dict[str, Figure]:
     return figures
 
 
-def flags_of(kind: type[Any]) -> list[str]:
+def flags_of(figures_class: type[Any]) -> list[str]:
     """Return the names of the fields of a dataclass of figures that are flags or texts."""
-    return [entry.name for entry in fields(kind) if not entry.metadata]
+    return [entry.name for entry in fields(figures_class) if not entry.metadata]
 
 
 FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
@@ -443,14 +443,12 @@ def measure_jump(
     phases = jump_flights(capture, on, rules, count)
     main = phases.main
     if main is None:
-        last = on + steps(capture, rules.search_s)
-        end = min(last, count - 1)
+        end = min(on + steps(capture, rules.search_s), count - 1)
         settled = end
         flight = FlightFigures()
         upright = False
     else:
-        last = main.touchdown + steps(capture, rules.tail_s)
-        end = min(last, count - 1)
+        end = min(main.touchdown + steps(capture, rules.tail_s), count - 1)
         settled = main.touchdown + steps(capture, rules.upright_s)
         flight = _measure_flight(capture, script, on, main, end, rules, body.foot_radius)
         upright = settled < count and bool(

@@ -166,11 +166,11 @@ class Spread:
     mean: float = math.nan
     std: float = math.nan
     """Standard deviation with n - 1; NaN for one run."""
-    least: float = math.nan
+    minimum: float = math.nan
     p05: float = math.nan
     p50: float = math.nan
     p95: float = math.nan
-    most: float = math.nan
+    maximum: float = math.nan
     n: int = 0
 
     @classmethod
@@ -180,15 +180,15 @@ class Spread:
         numbers = numbers[np.isfinite(numbers)]
         if not len(numbers):
             return cls()
-        least, p05, p50, p95, most = np.quantile(numbers, [0.0, 0.05, 0.5, 0.95, 1.0]).tolist()
+        minimum, p05, p50, p95, maximum = np.quantile(numbers, [0.0, 0.05, 0.5, 0.95, 1.0]).tolist()
         return cls(
             mean=float(numbers.mean()),
             std=float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan,
-            least=least,
+            minimum=minimum,
             p05=p05,
             p50=p50,
             p95=p95,
-            most=most,
+            maximum=maximum,
             n=len(numbers),
         )
 
@@ -249,7 +249,7 @@ class ScatterRatio:
 class TrialResults:
     """The runs of one kind, and what was run."""
 
-    kind: RunKind = JUMPS
+    run_kind: RunKind = JUMPS
     rows: tuple[TrialRun, ...] = ()
     """Runs by policy, then command, then number."""
     robot: str
@@ -299,7 +299,7 @@ class TrialResults:
 
     def values(self, policy: str, case: str, figure: str) -> Array:
         """Return the finite values of one figure, of the jumps that there were. (n,)."""
-        definition = figures_of(self.kind.figures)[figure]
+        definition = figures_of(self.run_kind.figures)[figure]
         values = []
         for row in self.of(policy, case):
             if row.figures.found:
@@ -342,7 +342,7 @@ class TrialResults:
                 with_jump.append(figures)
         spreads: dict[str, Spread] = {}
         joint_spreads: dict[str, dict[str, Spread]] = {}
-        for name, definition in figures_of(self.kind.figures).items():
+        for name, definition in figures_of(self.run_kind.figures).items():
             values = [definition.value(figures) for figures in with_jump]
             if definition.joints:
                 joint_spreads[name] = self._joint_spreads(name, values)
@@ -383,7 +383,7 @@ class TrialResults:
         """Scatter of every other policy over that of the first, altogether and by command."""
         ratios = []
         for other in self.subjects[1:]:
-            for figure in self.kind.compared:
+            for figure in self.run_kind.compared:
                 ratios.append(self._ratio(other.name, figure, None))
                 for case in self.cases:
                     ratios.append(self._ratio(other.name, figure, case.name))
@@ -494,9 +494,9 @@ def _csv_row(results: TrialResults, row: TrialRun) -> dict[str, Any]:
         "run_s": row.script.run_s,
         "began_s": row.began,
     }
-    for name in flags_of(results.kind.figures):
+    for name in flags_of(results.run_kind.figures):
         cells[name] = getattr(row.figures, name)
-    for name, definition in figures_of(results.kind.figures).items():
+    for name, definition in figures_of(results.run_kind.figures).items():
         value = definition.value(row.figures)
         if not definition.joints:
             cells[definition.column] = value
@@ -562,8 +562,8 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
 
 def save_results(folder: Path, results: TrialResults) -> tuple[Path, Path]:
     """Write table and summary, each whole or not at all, the summary last; return the files."""
-    kind = results.kind
-    table = folder / kind.table
+    run_kind = results.run_kind
+    table = folder / run_kind.table
     write_text(table, to_csv(results))
     body = {
         "rows": results.rows,
@@ -581,34 +581,34 @@ def save_results(folder: Path, results: TrialResults) -> tuple[Path, Path]:
         "settings": results.settings,
         "versions": results.versions,
         "timing": results.timing,
-        "definitions": figures_of(kind.figures),
+        "definitions": figures_of(run_kind.figures),
         "cells": results.cells,
         "ratios": results.ratios,
     }
-    return table, save_json(folder / kind.summary, kind.schema, body)
+    return table, save_json(folder / run_kind.summary, run_kind.schema, body)
 
 
-def load_results(folder: Path, kind: RunKind = JUMPS) -> TrialResults:
+def load_results(folder: Path, run_kind: RunKind = JUMPS) -> TrialResults:
     """Read the summary that `save_results` wrote; the table is for other readers.
 
     Raises:
         ArtefactError: The summary is missing, of another schema or damaged.
     """
-    with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
-        rows = tuple(load_run(stored, kind.figures) for stored in body.pop("rows"))
+    with load_json(folder / run_kind.summary, run_kind.schema, run_kind.writer) as body:
+        rows = tuple(load_run(stored, run_kind.figures) for stored in body.pop("rows"))
         sums = body.pop("cells")
         for name in ("schema", "definitions", "ratios"):
             del body[name]
-        results = replace(msgspec.convert(body, TrialResults), kind=kind, rows=rows)
+        results = replace(msgspec.convert(body, TrialResults), run_kind=run_kind, rows=rows)
         for stored, cell in zip(sums, results.cells, strict=True):
             if (stored["policy"], stored["case"], stored["n"]) != (cell.policy, cell.case, cell.n):
                 raise ValueError("runs and sums do not fit together")
         return results
 
 
-def load_run(stored: Mapping[str, Any], kind: type[Any]) -> TrialRun:
+def load_run(stored: Mapping[str, Any], figures_class: type[Any]) -> TrialRun:
     """Return a run of a JSON file, whose figures are of a class of figures."""
-    figures = msgspec.convert(_without_nulls(stored["figures"]), kind)
+    figures = msgspec.convert(_without_nulls(stored["figures"]), figures_class)
     run = msgspec.convert({**stored, "figures": None}, TrialRun)
     return replace(run, figures=figures)
 

@@ -230,9 +230,9 @@ def drive_loads(trial: TrialResults) -> Table:
             margins = []
             for cell in trial.cells_of(subject.name):
                 if cell.found:
-                    torques.append(cell.joints["peak_torque"][joint].most)
-                    speeds.append(cell.joints["peak_speed"][joint].most)
-                    margins.append(cell.joints["torque_margin"][joint].least)
+                    torques.append(cell.joints["peak_torque"][joint].maximum)
+                    speeds.append(cell.joints["peak_speed"][joint].maximum)
+                    margins.append(cell.joints["torque_margin"][joint].minimum)
             rows.append(
                 (
                     f"{subject.name}: {joint}",
@@ -263,14 +263,14 @@ def check_table(title: str, checks: Sequence[Check], notes: Sequence[str] = ()) 
         if math.isfinite(check.value):
             measured = f"{check.value:.4f} {check.unit}".strip()
         limit = f"{check.sense} {check.limit:g} {check.unit}".strip()
-        rows.append((check.what, measured, limit, "yes" if check.passed else "NO"))
+        rows.append((check.name, measured, limit, "yes" if check.passed else "NO"))
         if check.passed:
             passed_count += 1
     passed = f"{passed_count} of {len(checks)} acceptance criteria passed"
     return Table(
         title=title,
         columns=(
-            Column(heading="what"),
+            Column(heading="criterion"),
             Column(heading="measured"),
             Column(heading="limit"),
             Column(heading="passed"),
@@ -317,7 +317,7 @@ def scatter_table(trial: TrialResults, other: str) -> Table:
         if command not in commands:
             commands.append(command)
     rows: list[tuple[Cell, ...]] = []
-    for figure in trial.kind.compared:
+    for figure in trial.run_kind.compared:
         texts = []
         for ratio in ratios:
             if ratio.figure == figure:
@@ -429,8 +429,8 @@ def crossing_table(crossings: TrialResults) -> Table:
     ]
     rows: list[tuple[Cell, ...]] = []
     for climb in climbs(crossings):
-        obstacle = f"{climb.policy}: {_OBSTACLES.get(climb.kind, climb.kind)}, {climb.case}"
-        published = PAPER_GAPS.get(climb.case) if climb.kind == "gap" else None
+        obstacle = f"{climb.policy}: {_OBSTACLES.get(climb.shape, climb.shape)}, {climb.case}"
+        published = PAPER_GAPS.get(climb.case) if climb.shape == "gap" else None
         failed_at = _failed_at(climb)
         rows.append((obstacle, climb.largest, climb.ever, published, failed_at))
         if failed_at is not None:

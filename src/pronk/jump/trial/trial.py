@@ -160,7 +160,7 @@ class TrialJob:
     subject: TriedPolicy
     setup: TrialSetup
     start: Start
-    kind: RunKind
+    run_kind: RunKind
 
     def build(self, share: float = 1.0) -> VirtualRobot:
         """Build the virtual robot, not connected, at a share of the joint offsets."""
@@ -217,7 +217,7 @@ def run_job(job: TrialJob) -> TrialRun:
     if not steps:
         raise HardwareError("the policy made no step; let it run for one tick or more.")
     capture = machine.capture()
-    figures = job.kind.measure(capture, script, robot, began=began)
+    figures = job.run_kind.measure(capture, script, robot, began=began)
     if job.row.capture:
         captures.save_capture(job.setup.out / job.row.capture, capture)
     return replace(job.row, figures=figures, began=began)
@@ -257,7 +257,7 @@ def plan_jobs(
     subjects: Sequence[TriedPolicy],
     plan: TrialPlan,
     setup: TrialSetup,
-    kind: RunKind = JUMPS,
+    run_kind: RunKind = JUMPS,
     *,
     keeps_capture: Callable[[Case, int], bool] = lambda case, number: False,
 ) -> list[TrialJob]:
@@ -267,7 +267,7 @@ def plan_jobs(
         subjects: The policies.
         plan: Commands, numbers of runs and seed.
         setup: What the runs are on.
-        kind: What is measured.
+        run_kind: What is measured.
         keeps_capture: Called with command and number of a run; whether its capture is kept.
     """
     jobs = []
@@ -289,7 +289,9 @@ def plan_jobs(
                     capture=capture,
                 )
                 jobs.append(
-                    TrialJob(row=row, subject=subject, setup=setup, start=drawn.start, kind=kind)
+                    TrialJob(
+                        row=row, subject=subject, setup=setup, start=drawn.start, run_kind=run_kind
+                    )
                 )
     return jobs
 
@@ -299,7 +301,7 @@ def run_trial(
     plan: TrialPlan,
     setup: TrialSetup,
     *,
-    kind: RunKind = JUMPS,
+    run_kind: RunKind = JUMPS,
     keep_captures: bool = False,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -310,7 +312,7 @@ def run_trial(
         policies: Files of the policies; scatter is compared with that of the first.
         plan: Commands, numbers of runs and seed.
         setup: What the runs are on.
-        kind: What is measured. Jumps make a new folder, other kinds are added to it.
+        run_kind: What is measured. Jumps make a new folder, other kinds are added to it.
         keep_captures: Keep the captures of all jumps, not only of the first with each command and
             of those at `RATES`.
         overwrite: Replace a trial in the folder.
@@ -320,14 +322,14 @@ def run_trial(
         PronkError: A policy, parameter or folder is impossible; nothing was run then.
     """
     robot = setup.robot
-    subjects = load_subjects(policies, robot, jump=kind.jump)
+    subjects = load_subjects(policies, robot, jump=run_kind.jump)
 
     def keeps_capture(case: Case, number: int) -> bool:
-        return kind is JUMPS and (keep_captures or number == 0 or case not in plan.cases)
+        return run_kind is JUMPS and (keep_captures or number == 0 or case not in plan.cases)
 
-    jobs = plan_jobs(subjects, plan, setup, kind, keeps_capture=keeps_capture)
+    jobs = plan_jobs(subjects, plan, setup, run_kind, keeps_capture=keeps_capture)
     jobs[0].build()  # refuses impossible parameters
-    if kind is JUMPS:
+    if run_kind is JUMPS:
         prepare_folder(setup.out, overwrite=overwrite)
     begun = time.perf_counter()
     timed_runs = in_processes(_run_timed, jobs, processes=setup.processes, progress=progress)
@@ -335,7 +337,7 @@ def run_trial(
     rows = tuple(run.row for run in timed_runs)
     simulated_s = sum(row.script.seconds for row in rows)
     results = TrialResults(
-        kind=kind,
+        run_kind=run_kind,
         rows=rows,
         robot=robot.name,
         subjects=subjects,

@@ -118,32 +118,32 @@ def measure_walk(
     start = min(sample_at(capture, began + script.start), count)
     end = min(sample_at(capture, began + script.stop), count)
     first = start + round(settle_s / dt)
-    last = min(down, end)
+    stop = min(down, end)
     fell = down < end
-    non_foot_contact = bool(capture.other_contact[start:last].any())
-    lasted = max(0, last - start) * dt
+    non_foot_contact = bool(capture.other_contact[start:stop].any())
+    lasted = max(0, stop - start) * dt
     uncommanded = uncommanded_height(capture, None, rules or JumpRules.of(robot))
-    if first >= last:
+    if first >= stop:
         return WalkFigures(
             fell=fell, non_foot_contact=non_foot_contact, lasted=lasted, uncommanded=uncommanded
         )
     # Forward and left velocity and yaw rate, in the trunk's frame.
-    turns = Rotation.from_quat(capture.orientation[:last], scalar_first=True)
-    motion = turns.apply(capture.velocity[:last], inverse=True)
-    motion[:, 2] = capture.angular_velocity[:last, 2]
+    turns = Rotation.from_quat(capture.orientation[:stop], scalar_first=True)
+    motion = turns.apply(capture.velocity[:stop], inverse=True)
+    motion[:, 2] = capture.angular_velocity[:stop, 2]
     averaged = _moving_average(motion, round(AVERAGE_S / dt))[first:]
     motion = motion[first:]
     error = motion - np.asarray(script.command)
     averaged_error = averaged - np.asarray(script.command)
-    forward, left, yaw_rate = motion.mean(axis=0).tolist()
-    rates = capture.angular_velocity[first:last, :2]
+    forward, sideways, yaw_rate = motion.mean(axis=0).tolist()
+    rates = capture.angular_velocity[first:stop, :2]
     roll_rate_rms, pitch_rate_rms = np.sqrt(np.mean(rates**2, axis=0)).tolist()
-    power = float(capture.electrical_power[first:last].mean())
+    power = float(capture.electrical_power[first:stop].mean())
     path = float(np.hypot(averaged[:, 0], averaged[:, 1]).sum() * dt)
     cost_of_transport = math.nan
     if path > NO_PATH and any(script.command[:2]):
         weight = legged(robot.source).total_mass * GRAVITY
-        cost_of_transport = power * (last - first) * dt / (weight * path)
+        cost_of_transport = power * (stop - first) * dt / (weight * path)
     return WalkFigures(
         fell=fell,
         non_foot_contact=non_foot_contact,
@@ -153,7 +153,7 @@ def measure_walk(
         yaw_error=float(np.abs(error[:, 2]).mean()),
         yaw_error_averaged=float(np.abs(averaged_error[:, 2]).mean()),
         forward=forward,
-        left=left,
+        left=sideways,
         yaw_rate=yaw_rate,
         roll_rate_rms=roll_rate_rms,
         pitch_rate_rms=pitch_rate_rms,
@@ -206,4 +206,4 @@ def add_walks(
     """
     script = walk_script(STILL, seconds=seconds)
     plan = TrialPlan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    return run_trial(policies, plan, setup, kind=WALK, progress=progress)
+    return run_trial(policies, plan, setup, run_kind=WALK, progress=progress)

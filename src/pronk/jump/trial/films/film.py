@@ -182,9 +182,8 @@ def _direction(capture: Capture, events: JumpEvents | None, begin: float, end: f
     if events is not None:
         spans.insert(0, (events.liftoff, events.touchdown))
     for start, stop in spans:
-        first = capture.position[_sample(capture, start)]
-        last = capture.position[_sample(capture, stop)]
-        x, y, _ = last - first
+        origin = capture.position[_sample(capture, start)]
+        x, y, _ = capture.position[_sample(capture, stop)] - origin
         if math.hypot(x, y) >= _MEASURED:
             return math.atan2(y, x)
     return float(heading(capture.orientation[_sample(capture, begin)]))

@@ -170,11 +170,11 @@ def tape_points(film: Film, side: float) -> dict[int, Array]:
     along = np.array([math.cos(film.direction), math.sin(film.direction), 0.0])
     across = np.array([-along[1], along[0], 0.0])
     travelled = (film.qpos[:, :2] - film.origin) @ along[:2]
-    first = math.floor(travelled.min() / TAPE_M) - 2
-    last = math.ceil(travelled.max() / TAPE_M) + 4
+    begin = math.floor(travelled.min() / TAPE_M) - 2
+    end = math.ceil(travelled.max() / TAPE_M) + 5
     origin = np.array([*film.origin, 0.0])
     points = {}
-    for mark in range(first, last + 1):
+    for mark in range(begin, end):
         points[mark] = origin + mark * TAPE_M * along + side * TAPE_HALF_M * across
     return points
 
@@ -284,10 +284,10 @@ def _draw_label(
     margin = 0.35 * size
     font = _font(size)
     align = "center" if anchor[0] == "m" else "left"
-    left, top, right, bottom = draw.multiline_textbbox(
+    x_min, y_min, x_max, y_max = draw.multiline_textbbox(
         corner, text, font=font, anchor=anchor, align=align
     )
-    box = (left - margin, top - margin, right + margin, bottom + margin)
+    box = (x_min - margin, y_min - margin, x_max + margin, y_max + margin)
     draw.rounded_rectangle(box, margin, fill=fill)
     draw.multiline_text(corner, text, fill=ink, font=font, anchor=anchor, align=align)
 
@@ -305,10 +305,10 @@ def _draw_title(draw: ImageDraw.ImageDraw, film: Film, size: tuple[int, int]) ->
 class _HeightPlot(NamedTuple):
     """A small plot of the trunk's height over time, in the lower right corner of an image."""
 
-    left: float
-    top: float
-    right: float
-    bottom: float
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
     """Edges of its box [px]."""
     margin: float
     """Width of the box around the plot [px]."""
@@ -329,10 +329,10 @@ class _HeightPlot(NamedTuple):
         right = width - 10.0 * scale
         bottom = height - 10.0 * scale
         return cls(
-            left=right - 150.0 * scale,
-            top=bottom - 54.0 * scale,
-            right=right,
-            bottom=bottom,
+            x_min=right - 150.0 * scale,
+            y_min=bottom - 54.0 * scale,
+            x_max=right,
+            y_max=bottom,
             margin=6.0 * scale,
             begin=float(film.time[0]),
             seconds=max(float(film.time[-1] - film.time[0]), 1e-9),
@@ -342,20 +342,20 @@ class _HeightPlot(NamedTuple):
 
     def point(self, time: float, height: float) -> Point:
         """Return the place of a time [s] and a height [m] in the image."""
-        width = self.right - self.left - 2.0 * self.margin
-        depth = self.bottom - self.top - 2.0 * self.margin
-        x = self.left + self.margin + width * (time - self.begin) / self.seconds
-        y = self.bottom - self.margin - depth * height / self.highest
+        width = self.x_max - self.x_min - 2.0 * self.margin
+        depth = self.y_max - self.y_min - 2.0 * self.margin
+        x = self.x_min + self.margin + width * (time - self.begin) / self.seconds
+        y = self.y_max - self.margin - depth * height / self.highest
         return x, y
 
     def draw_on(self, draw: ImageDraw.ImageDraw, film: Film, frame: int) -> None:
         """Draw it, with the present frame marked."""
-        box = (self.left, self.top, self.right, self.bottom)
+        box = (self.x_min, self.y_min, self.x_max, self.y_max)
         draw.rounded_rectangle(box, self.margin, fill=_PANEL)
         if film.events is not None:
-            left, top = self.point(film.events.liftoff, self.highest)
-            right, bottom = self.point(film.events.touchdown, 0.0)
-            draw.rectangle((left, top, right, bottom), fill=_FLIGHT)
+            x_min, y_min = self.point(film.events.liftoff, self.highest)
+            x_max, y_max = self.point(film.events.touchdown, 0.0)
+            draw.rectangle((x_min, y_min, x_max, y_max), fill=_FLIGHT)
         points = []
         for time, height in zip(film.time.tolist(), film.qpos[:, 2].tolist(), strict=True):
             points.append(self.point(time, height))
@@ -426,8 +426,8 @@ def render_film(film: Film, files: Mapping[str, Path]) -> None:
             mp4.send(None)
         for index, image in enumerate(images(film)):
             if index >= len(film.time):
-                left = (WIDTH - STRIP_WIDTH) // 2
-                strip_parts.append(np.asarray(image)[:, left : left + STRIP_WIDTH])
+                margin = (WIDTH - STRIP_WIDTH) // 2
+                strip_parts.append(np.asarray(image)[:, margin : margin + STRIP_WIDTH])
                 continue
             if index in gif_indices:
                 size = (GIF_WIDTH, GIF_WIDTH * HEIGHT // WIDTH)

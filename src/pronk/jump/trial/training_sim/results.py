@@ -108,7 +108,7 @@ def _walk_row(walk: CommandResult) -> tuple[Cell, ...]:
         f"{forward}, {left}, {yaw_rate}",
         walk["drift"].mean,
         percent(walk["fell"].mean),
-        percent(walk["uncommanded"].most),
+        percent(walk["uncommanded"].maximum),
     )
 
 
