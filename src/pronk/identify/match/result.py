@@ -81,15 +81,20 @@ class DriveFit:
     amplitude_gains: Array = field(default_factory=lambda: _no_numbers(0, 3))
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
     rmse: float = NAN
-    """Root mean square error of the position where several joints moved together [rad]."""
+    """Root mean square error of the position in time, weighted as the fit weights it [rad]."""
     nominal_rmse: float = NAN
-    """The same error with the nominal gains [rad]."""
+    """Root mean square error of the position in time with the nominal gains [rad]."""
     settled: bool = True
     """False if the search ended without reaching its tolerance."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
     """Parameters of the drive by a torque channel."""
     flags: tuple[str, ...] = ()
     """Sentences that warn of this fit."""
+
+    @property
+    def moved_together(self) -> bool:
+        """True if the joint was fitted in time while other joints moved."""
+        return bool(np.isfinite(self.rmse)) and len(self.amplitude_gains) == 0
 
     def __post_init__(self) -> None:
         """Refuse arrays of other shapes."""

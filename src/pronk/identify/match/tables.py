@@ -142,7 +142,7 @@ def positions_table(result: MatchResult) -> Table:
     """Make the table of position errors where several joints moved at once."""
     rows: list[tuple[Cell, ...]] = []
     for name, joint in result.joints.items():
-        if np.isfinite(joint.fit.rmse):
+        if joint.fit.moved_together:
             rows.append((name, joint.fit.nominal_rmse, joint.fit.rmse))
     columns = (
         Column(heading="joint"),
