@@ -36,39 +36,56 @@ TOLERANCE = 1e-5
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that a run is computed with."""
-    modules = ("mjlab", "mujoco", "mujoco_warp", "warp", "torch", "rsl_rl", "numpy")
-    packages = {"warp": "warp-lang", "rsl_rl": "rsl-rl-lib"}
-    found = {"python": platform.python_version(), "pronk": VERSION}
-    return found | {name: metadata.version(packages.get(name, name)) for name in modules}
+    """Return the versions of the packages that a run is computed with."""
+    return {
+        "python": platform.python_version(),
+        "pronk": VERSION,
+        "mjlab": metadata.version("mjlab"),
+        "mujoco": metadata.version("mujoco"),
+        "mujoco_warp": metadata.version("mujoco_warp"),
+        "warp": metadata.version("warp-lang"),
+        "torch": metadata.version("torch"),
+        "rsl_rl": metadata.version("rsl-rl-lib"),
+        "numpy": metadata.version("numpy"),
+    }
 
 
 def contract_for(
     cfg: ManagerBasedRlEnvCfg, *, jump: bool, provenance: Mapping[str, Any]
 ) -> Contract:
-    """The contract of a policy that was trained in an environment, with or without jump input."""
-    command, action = cfg.commands[commands.NAME], cfg.actions[actions.NAME]
-    robot, gains = load_robot(command.robot), command.gains
-    groups = [gains.groups[joint.group] for joint in robot.joints]
-    low, high = (steps * robot.timestep_s for steps in action.delay_steps)
-    limits = zip(COMMANDS, command.limits, strict=True)
+    """Return the contract of a policy.
+
+    Args:
+        cfg: Configuration of the environment that it was trained in.
+        jump: Whether the policy has the jump input.
+        provenance: Entries on the training.
+    """
+    command = cfg.commands[commands.NAME]
+    action = cfg.actions[actions.NAME]
+    robot = load_robot(command.robot)
+    gains = command.gains
+    joint_gains = [gains.groups[joint.group] for joint in robot.joints]
+    shortest_delay, longest_delay = action.delay_steps
+    command_ranges = {}
+    for name, limit in zip(COMMANDS, command.limits, strict=True):
+        command_ranges[name] = (-limit, limit)
     return Contract(
         robot=robot.name,
         joint_names=robot.joint_names,
         default_position=tuple(joint.default_position for joint in robot.joints),
         action_scale=(float(action.scale),) * len(robot.joints),
-        stiffness=tuple(group.stiffness for group in groups),
-        damping=tuple(group.damping for group in groups),
+        stiffness=tuple(group_gains.stiffness for group_gains in joint_gains),
+        damping=tuple(group_gains.damping for group_gains in joint_gains),
         gains=gains.name,
-        # A contract has the hash of gains alone, not of the ranges about naive ones.
+        # A contract has the hash of gains alone, not of the ranges about nominal ones.
         gains_sha256=gains.sha256 if gains.name == "matched" else "",
         virtual=gains.virtual,
         observation=measured_layout(robot.policy_rate_hz),
         policy_rate_hz=robot.policy_rate_hz,
         timestep_s=robot.timestep_s,
         decimation=robot.decimation,
-        delay_range_s=(low, high),
-        command_ranges={name: (-limit, limit) for name, limit in limits},
+        delay_range_s=(shortest_delay * robot.timestep_s, longest_delay * robot.timestep_s),
+        command_ranges=command_ranges,
         jump=jump,
         lift_off_velocity=command.settings.liftoff_velocity if jump else None,
         provenance=dict(provenance),
@@ -77,53 +94,73 @@ def contract_for(
 
 
 def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None:
-    """Write `policy.onnx`, whole or not at all; without jump input the actor's is zero."""
+    """Write `policy.onnx`, whole or not at all.
+
+    Args:
+        actor: The actor; without jump input in the contract its jump input is zero.
+        contract: The contract.
+        path: The file.
+    """
     import onnx
 
-    inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
+    input_sizes = {"measured": MEASURED_SIZE}
+    does = "walks"
+    if contract.jump:
+        input_sizes["jump"] = 1
+        does = "walks and jumps"
     outputs = ["action", *ESTIMATE]
-    with written_whole(path) as aside:
+    with written_whole(path) as temporary_path:
         with warnings.catch_warnings():
             # mjlab uses the same exporter; newer versions of torch announce another.
             warnings.simplefilter("ignore", DeprecationWarning)
             torch.onnx.export(
-                _Exported(actor),
-                tuple(torch.zeros(2, size) for size in inputs.values()),
-                aside,
-                input_names=list(inputs),
+                _ExportedActor(actor),
+                tuple(torch.zeros(2, size) for size in input_sizes.values()),
+                temporary_path,
+                input_names=list(input_sizes),
                 output_names=outputs,
-                dynamic_axes={name: {0: "batch"} for name in (*inputs, *outputs)},
+                dynamic_axes={name: {0: "batch"} for name in (*input_sizes, *outputs)},
                 opset_version=OPSET,
                 dynamo=False,
             )
-        model = onnx.load(aside)
-        model.producer_name, model.producer_version = "pronk", VERSION
+        model = onnx.load(temporary_path)
+        model.producer_name = "pronk"
+        model.producer_version = VERSION
         model.doc_string = (
-            f"{contract.robot}: {'walks and jumps' if contract.jump else 'walks'}; trained with "
-            f"{contract.gains} gains; the contract is JSON in the metadata under {METADATA_KEY}."
+            f"{contract.robot}: {does}; trained with {contract.gains} gains; the contract is JSON "
+            f"in the metadata under {METADATA_KEY}."
         )
         onnx.helper.set_model_props(model, {METADATA_KEY: to_json(contract)})
         onnx.checker.check_model(model)
-        onnx.save(model, aside)
+        onnx.save(model, temporary_path)
 
 
 def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]) -> float:
-    """Largest absolute difference of all outputs between an exported policy and its actor.
+    """Compare an exported policy with its actor.
 
-    Both compute on the CPU: a GPU may round matrix products to TF32. `observations` has "measured"
-    (N, 105) and, for a policy that jumps, "jump" (N, 1).
+    Both compute on the CPU: a GPU may round matrix products to TF32.
+
+    Args:
+        path: The exported policy.
+        actor: The actor.
+        observations: `measured` (N, 105) and, for a policy that jumps, `jump` (N, 1).
+
+    Returns:
+        Largest absolute difference of all outputs.
     """
     policy = load_policy(path)
     names = ("measured", "jump") if policy.contract.jump else ("measured",)
     inputs = [observations[name].detach().to("cpu", torch.float32) for name in names]
-    found = policy.infer(*(value.numpy() for value in inputs))
+    inference = policy.infer(*(value.numpy() for value in inputs))
     with torch.no_grad():
-        expected = torch.cat(_Exported(actor)(*inputs), dim=-1)
-    got = np.concatenate([found.action, found.contact, found.linear_velocity], axis=-1)
-    return float((torch.from_numpy(got) - expected).abs().max())
+        expected = torch.cat(_ExportedActor(actor)(*inputs), dim=-1)
+    outputs = np.concatenate(
+        [inference.action, inference.contact, inference.linear_velocity], axis=-1
+    )
+    return float((torch.from_numpy(outputs) - expected).abs().max())
 
 
-class _Exported(nn.Module):
+class _ExportedActor(nn.Module):
     """Action and estimate in one pass: the estimate is the one that the actor reads."""
 
     def __init__(self, actor: EstimatorActor) -> None:
@@ -136,7 +173,12 @@ class _Exported(nn.Module):
         self.to("cpu", torch.float32).eval()
 
     def forward(self, measured: Tensor, jump: Tensor | None = None) -> tuple[Tensor, ...]:
-        """(N, 105) and, for policies that jump, (N, 1) to (N, 12), (N, 4), (N, 3)."""
+        """Return action (N, 12), contact (N, 4) and velocity (N, 3).
+
+        Args:
+            measured: The measured vector, (N, 105).
+            jump: The jump input of policies that jump, (N, 1).
+        """
         if jump is None:
             jump = measured[:, :1].clamp(0.0, 0.0)  # zeros of the size of the batch
         latent = self.actor.get_latent({"measured": measured, "jump": jump})

@@ -38,15 +38,25 @@ _SIGNS = {
     "linear_velocity": (1.0, -1.0, 1.0),
     "command": (1.0, -1.0, -1.0),
 }
-"""Factors of vectors, in the trunk's frame."""
+"""Factors of the components of vectors, in the trunk's frame."""
 _JOINTS = ("joint_position", "joint_velocity", "action")
+"""Quantities by joint."""
 _CONTACTS = ("contact", "foot_contact", "foot_force", "foot_height")
 _LEGS = (*_CONTACTS, "shank_length", "stiffness", "damping")
 """Quantities by leg; stiffness and damping are those of one joint group after the other."""
 
 
 def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
-    """The mirror image of (..., size) in a group of `GROUPS`; applied twice it is the identity."""
+    """Return the mirror image of a group; applied twice it is the identity.
+
+    Args:
+        group: Name of a group of `GROUPS`.
+        x: Its numbers, (..., size).
+        body: The robot, of which legs and joints are read.
+
+    Raises:
+        PronkError: A group whose layout is not known.
+    """
     if group not in GROUPS:
         raise PronkError(
             f"the observation group {group!r} has no known layout; expected one of "
@@ -60,40 +70,60 @@ def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
 def _mirror(
     group: str, legs: tuple[str, ...], joints: tuple[str, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Index and sign of the number of the original that each number of the image is."""
-    other_leg = [legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]]) for leg in legs]
-    source: list[int] = []
+    """Return index and sign of the original's number that each number of the image is."""
+    leg_indices = [legs.index(_other_side(leg)) for leg in legs]
+    joint_indices = []
+    joint_signs = []
+    for leg_index in leg_indices:
+        for i, joint in enumerate(joints):
+            joint_indices.append(leg_index * len(joints) + i)
+            joint_signs.append(-1.0 if joint == "hip_roll" else 1.0)
+    sources: list[int] = []
     signs: list[float] = []
     for name, size in GROUPS[group].items():
-        indices, factors = [0], [1.0]
+        quantity_indices = [0]
+        quantity_signs = [1.0]
         if name in _SIGNS:
-            indices, factors = [0, 1, 2], list(_SIGNS[name])
+            quantity_indices = [0, 1, 2]
+            quantity_signs = list(_SIGNS[name])
         elif name in _LEGS:
-            indices, factors = other_leg, [1.0] * len(legs)
+            quantity_indices = leg_indices
+            quantity_signs = [1.0] * len(legs)
         elif name in _JOINTS:
-            indices = [leg * len(joints) + i for leg in other_leg for i in range(len(joints))]
-            factors = [-1.0 if joint == "hip_roll" else 1.0 for _ in legs for joint in joints]
+            quantity_indices = joint_indices
+            quantity_signs = joint_signs
         # A part longer than its quantity is a history of it, or one for each joint group.
-        for _ in range(size // len(indices)):
-            start = len(source)
-            source += [start + i for i in indices]
-            signs += factors
-    return torch.tensor(source, device=device), torch.tensor(signs, device=device)
+        for _ in range(size // len(quantity_indices)):
+            start = len(sources)
+            sources += [start + index for index in quantity_indices]
+            signs += quantity_signs
+    return torch.tensor(sources, device=device), torch.tensor(signs, device=device)
+
+
+def _other_side(leg: str) -> str:
+    """Return the leg on the other side, as HL for HR."""
+    return leg[0] + ("L" if leg[1] == "R" else "R")
 
 
 def with_mirror_image(
     env: Any, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """A batch, then its mirror image, for rsl_rl's symmetry extension; None stays None.
+    """Append its mirror image to a batch, for rsl_rl's symmetry extension.
 
-    N rows of groups of observations, (N, size) each, and of actions, (N, 12), become 2 N.
+    Args:
+        env: The environment.
+        obs: Groups of observations, (N, size) each, or None.
+        actions: Actions, (N, 12), or None.
+
+    Returns:
+        The batch, then its mirror image, 2 N rows; None stays None.
     """
     body = motion_command(env.unwrapped).body
-
-    def both(group: str, x: Tensor) -> Tensor:
-        return torch.cat([x, mirrored(group, x, body)])
-
     if obs is not None:
-        groups = {name: both(name, x) for name, x in obs.to_dict().items()}
+        groups = {}
+        for name, x in obs.to_dict().items():
+            groups[name] = torch.cat([x, mirrored(name, x, body)])
         obs = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
-    return obs, None if actions is None else both("action", actions)
+    if actions is not None:
+        actions = torch.cat([actions, mirrored("action", actions, body)])
+    return obs, actions
