@@ -25,8 +25,8 @@ def deployed_with(folder: str, size: str, tmp_path: Path, *words: str) -> Any:
     if shutil.which("unshare") is None or subprocess.run([*unshare, small + "true"]).returncode:
         pytest.skip("file systems cannot be mounted here")
     policy = write_hopper(tmp_path / "policy.onnx")
-    given = f"{sys.executable} -m pronk.cli.main deploy {policy} --script 0,0 {' '.join(words)}"
-    return subprocess.run([*unshare, small + given], capture_output=True, text=True)
+    command = f"{sys.executable} -m pronk.cli.main deploy {policy} --script 0,0 {' '.join(words)}"
+    return subprocess.run([*unshare, small + command], capture_output=True, text=True)
 
 
 def test_too_little_shared_memory_is_one_sentence(tmp_path: Path) -> None:

@@ -91,14 +91,14 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     [why] = deployment.summary.faults
     assert why.startswith("another program commands the joints")
     assert "\n" not in why
-    found = read_deploy_log(tmp_path / "run.mcap")
-    assert found.complete, found.damage
-    [event] = [event for event in found.events if event.kind == "fault"]
+    run_log = read_deploy_log(tmp_path / "run.mcap")
+    assert run_log.complete, run_log.damage
+    [event] = [event for event in run_log.events if event.kind == "fault"]
     assert (event.text, event.reason, event.level) == (why, "LINK", "LATCH")
-    struck = np.flatnonzero(found.ticks.damped & (found.ticks.begun > wire.began))[0]
-    assert found.ticks.begun[struck] - wire.began <= DAMPED_S
-    assert found.ticks.damped[struck:].all()
-    assert found.ticks.mode[struck - 5] == Mode.POLICY
+    struck = np.flatnonzero(run_log.ticks.damped & (run_log.ticks.begun > wire.began))[0]
+    assert run_log.ticks.begun[struck] - wire.began <= DAMPED_S
+    assert run_log.ticks.damped[struck:].all()
+    assert run_log.ticks.mode[struck - 5] == Mode.POLICY
 
 
 def test_the_standby_damps_after_a_servo_that_stopped(
@@ -124,8 +124,9 @@ def test_the_standby_damps_after_a_servo_that_stopped(
                 # One that goes on ends the tick in which it stopped, and names what has damped.
                 os.kill(deployment.servo.pid or 0, signal.SIGCONT)
                 hold(deployment, 0.2)
-                seen = [each.reason for each in deployment.events_seen() if each.kind == "fault"]
-                assert seen == ["STANDBY"]
+                events = deployment.events_seen()
+                reasons = [event.reason for event in events if event.kind == "fault"]
+                assert reasons == ["STANDBY"]
         assert deployment.summary.standby
         assert deployment.summary.servo == {}
         time.sleep(0.2)

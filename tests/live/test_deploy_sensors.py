@@ -49,7 +49,8 @@ def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> Non
     rows = measure(robot, POLICY, link, faults, 0, **patient)
     assert {row["fault"] for row in rows} == set(faults)
     for row in rows:
-        fault, reason = row["fault"], row["reason"]
+        fault = row["fault"]
+        reason = row["reason"]
         if fault in PROCESSES:
             expected = {"STANDBY" if fault.startswith("servo") else "EXPIRED"}
         elif fault in SWAPPED:

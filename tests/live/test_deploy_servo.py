@@ -21,7 +21,7 @@ from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.poses import RunTiming
-from pronk.deploy.runtime.records import ACTIONS, OPERATOR, TICK
+from pronk.deploy.runtime.records import ACTIONS, OPERATOR, TICK, Event
 from pronk.deploy.runtime.servo import Servo
 from pronk.errors import HardwareError
 from virtual_robot import POSE
@@ -53,15 +53,17 @@ class Run:
         return not self._thread.is_alive()
 
     def until(
-        self, there: Callable[[], bool], request: OperatorRequest = OperatorRequest.NONE
+        self, condition: Callable[[], bool], request: OperatorRequest = OperatorRequest.NONE
     ) -> None:
         """Hold the dead-man button until something is so."""
-        record, end = self._record, time.monotonic() + 20.0
+        record = self._record
+        end = time.monotonic() + 20.0
         record["request"] = request
         record["requests"] += request is not OperatorRequest.NONE
-        while not there():
+        while not condition():
             assert time.monotonic() < end, (self.servo.modes.mode, self.said)
-            record["time"], record["held"] = time.monotonic(), 1
+            record["time"] = time.monotonic()
+            record["held"] = 1
             self.shared.operator.write(record)
             self._receive()
             time.sleep(0.005)
@@ -74,23 +76,24 @@ class Run:
     def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
         self.until(lambda: self.servo.modes.mode is mode, request)
 
-    def texts(self, kind: str) -> list[str]:
-        return [text for which, text in self.said if which == kind]
+    def texts(self, event_kind: str) -> list[str]:
+        """Texts of the events of a kind."""
+        return [text for said_kind, text in self.said if said_kind == event_kind]
 
     def leave(self) -> None:
         self.until(lambda: self.over, OperatorRequest.QUIT)
         self._thread.join()
 
     def _receive(self) -> None:
-        self.said += [
-            (each["kind"].decode(), each["text"].decode())
-            for each in self.shared.events_seen.take()
-        ]
+        for record in self.shared.events_seen.take():
+            event = Event.of(record)
+            self.said.append((event.kind, event.text))
 
 
 @contextmanager
 def flown(link: Any, **more: Any) -> Iterator[Run]:
-    shared, before = Shared(), sys.getswitchinterval()
+    shared = Shared()
+    switch_interval = sys.getswitchinterval()
     plan = RunPlan(
         link=link, policy=NOWHERE, timing=QUICK, real_time=False, operator_timeout_s=10.0, **more
     )
@@ -102,7 +105,7 @@ def flown(link: Any, **more: Any) -> Iterator[Run]:
         run.leave()
         shared.close()
         # Real-time scheduling is left out here.
-        sys.setswitchinterval(before)
+        sys.setswitchinterval(switch_interval)
         gc.unfreeze()
         gc.enable()
 
@@ -185,7 +188,8 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
 
 
 def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> None:
-    number, paused = 0, False
+    number = 0
+    paused = False
     with flown(link, ages=PATIENT, ignore_latency=True) as run:
 
         def action() -> np.ndarray | None:
@@ -195,7 +199,8 @@ def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> No
                 time.sleep(0.015)
             number += 1
             record = np.zeros((), ACTIONS)
-            state, now = run.shared.state.read(), time.monotonic()
+            state = run.shared.state.read()
+            now = time.monotonic()
             if state is None:
                 return None
             record["sequence"] = number
@@ -211,6 +216,7 @@ def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> No
         run.mode(Mode.DAMP)
         run.mode(Mode.STAND, OperatorRequest.STAND)
         run.mode(Mode.POLICY, OperatorRequest.WALK)
-        paused, begun = True, number
+        paused = True
+        begun = number
         run.until(lambda: number > begun + 30 or bool(run.texts("fault")))
         assert run.texts("fault") == []

@@ -36,7 +36,8 @@ class Flight:
     """A deployment by a script, leader of a terminal's processes."""
 
     def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
-        self.process, self.log = process, log
+        self.process = process
+        self.log = log
 
     def says(self, word: str) -> None:
         assert self.process.stdout is not None
@@ -59,9 +60,9 @@ class Flight:
 @contextmanager
 def flown(policy: Path, log: Path) -> Iterator[Flight]:
     words = [sys.executable, str(PROGRAM), str(policy), str(log)]
-    one = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen(words, **pipes, start_new_session=True, env=one) as process:
+    with subprocess.Popen(words, **pipes, start_new_session=True, env=environment) as process:
         flight = Flight(process, log)
         try:
             flight.says("POLICY")

@@ -63,9 +63,9 @@ def swept(plan: SweepPlan, out: Path, port: int, **more: Any) -> dict[str, Any]:
     return record_wire(plan, out, link, real_time=True, **more)
 
 
-def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:
+def await_(condition: Callable[[], bool], seconds: float = 60.0) -> None:
     until = time.monotonic() + seconds
-    while not what():
+    while not condition():
         assert time.monotonic() < until
         time.sleep(0.05)
 
@@ -76,6 +76,12 @@ def written(path: Path) -> JointLog | None:
         return read_mcap(path, None, ReadOptions())
     except LogError:
         return None
+
+
+def has_segment(path: Path) -> bool:
+    """Whether a log that is being written has the begin of an excitation."""
+    log = written(path)
+    return log is not None and bool(log.segments)
 
 
 def test_a_robot_with_another_number_of_joints_is_swept(tmp_path: Path) -> None:
@@ -117,7 +123,8 @@ def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
 def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
     port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], reason: str
 ) -> None:
-    plan, begun = plan_of("FR_hip_roll"), []
+    plan = plan_of("FR_hip_roll")
+    begun: list[float] = []
     if reason == "rad/s":
         slow = (replace(j, drive=replace(j.drive, no_load_speed=3.0)) for j in ROBOT.joints)
         plan = replace(plan, robot=replace(ROBOT, joints=tuple(slow)))
@@ -167,7 +174,7 @@ def test_a_killed_program_leaves_the_joints_damped_and_a_log(port: int, tmp_path
     running = get_context("spawn").Process(target=owner, args=(tmp_path, port))
     with over_lcm(port) as wire:
         running.start()
-        await_(lambda: bool((log := written(path)) and log.segments))
+        await_(lambda: has_segment(path))
         killed = time.monotonic()
         running.kill()
         running.join()

@@ -42,17 +42,17 @@ def test_what_is_ignored_stays_ignored() -> None:
 
 def test_another_thread_hears_nothing_and_changes_nothing() -> None:
     before = {number: signal.getsignal(number) for number in ENDING}
-    found: list[bool] = []
+    unchanged: list[bool] = []
 
     def enter() -> None:
         with Interrupts() as interrupts:
             interrupts.check()
-            found.append({number: signal.getsignal(number) for number in ENDING} == before)
+            unchanged.append({number: signal.getsignal(number) for number in ENDING} == before)
 
     thread = threading.Thread(target=enter)
     thread.start()
     thread.join()
-    assert found == [True]
+    assert unchanged == [True]
 
 
 BORN = "import sys; print('up', flush=True); sys.stdin.readline(); print('alive', flush=True)"
@@ -77,8 +77,8 @@ def test_a_process_that_moves_a_robot_outlives_its_terminal(
     with process:
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
-        own = os.getsid(process.pid) == process.pid
-        assert own is not blocked_at_start
+        leads_session = os.getsid(process.pid) == process.pid
+        assert leads_session is not blocked_at_start
         for number in TERMINAL:
             process.send_signal(number)
         out, _ = process.communicate("\n")

@@ -138,7 +138,8 @@ def test_warm_ups_lie_in_the_last_two_milliseconds(took: float) -> None:
         begun.append(time.monotonic())
         time.sleep(took)
 
-    least, most = (1 if took > LEAD_S else 2), 0
+    fewest = 1 if took > LEAD_S else 2
+    largest_count = 0
     for _ in range(50):
         begun.clear()
         deadline = time.monotonic() + 5e-3
@@ -146,11 +147,14 @@ def test_warm_ups_lie_in_the_last_two_milliseconds(took: float) -> None:
         assert time.monotonic() >= deadline
         assert count == len(begun)
         assert all(deadline - LEAD_S <= when < deadline for when in begun)
-        most = max(most, count)
-        if most >= least:
+        largest_count = max(largest_count, count)
+        if largest_count >= fewest:
             break
-    # One that takes longer than the time left is not done a second time.
-    assert most == 1 if took > LEAD_S else most >= 2
+    if took > LEAD_S:
+        # One that takes longer than the remaining time is not done a second time.
+        assert largest_count == 1
+    else:
+        assert largest_count >= 2
     # None for a deadline that has passed, or with less time than the first one needs.
-    for left in (-1.0, 5e-4):
-        assert warm_up_until(time.monotonic() + left, pytest.fail) == 0  # type: ignore[arg-type]
+    for seconds in (-1.0, 5e-4):
+        assert warm_up_until(time.monotonic() + seconds, pytest.fail) == 0  # type: ignore[arg-type]
