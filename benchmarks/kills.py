@@ -26,7 +26,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks import sensor_faults
 from pronk.cli import console
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.lcm.codec import CHEETAH, decode_command
@@ -40,6 +39,7 @@ from pronk.identify.logs.readers import read_log
 from pronk.identify.match import result as match_file
 from pronk.jump.trial import results
 from pronk.jump.virtual import capture
+from tests.deploy_strikes import TIMING, WALKING_ROBOT, begin_to_walk, drive_until, motion_of
 
 Program = Literal["sweep", "sweep-lcm", "match", "trial", "deploy"]
 PROGRAMS: tuple[Program, ...] = ("sweep", "sweep-lcm", "match", "trial", "deploy")
@@ -56,16 +56,23 @@ _POLICY = Path(__file__).parents[1] / "policies" / "matched" / "policy.onnx"
 
 def operate(port: int, log: str) -> None:
     """Walk a virtual robot over LCM until SIGTERM; prints its processes when it walks."""
-    link = Link(robot=sensor_faults.ROBOT, address=Address(kind="lcm", options={"port": port}))
-    timing = sensor_faults.TIMING
-    plan = RunPlan(link=link, policy=_POLICY, timing=timing, ignore_latency=True, log=Path(log))
+    link = Link(robot=WALKING_ROBOT, address=Address(kind="lcm", options={"port": port}))
+    plan = RunPlan(link=link, policy=_POLICY, timing=TIMING, ignore_latency=True, log=Path(log))
     with Deployment(plan) as deployment:
-        if not sensor_faults._walk(deployment):
+        if not begin_to_walk(deployment):
             sys.exit("it does not walk")
-        each = ("servo", "policy", "logger", "standby")
-        pids = {name: getattr(deployment, name).pid for name in each}
-        print(json.dumps({"operator": os.getpid()} | pids), flush=True)
-        sensor_faults._until(deployment, 30.0, (), command=sensor_faults._motion(deployment))
+        pids = {"operator": os.getpid()}
+        for name, process in (
+            ("servo", deployment.servo),
+            ("policy", deployment.policy),
+            ("logger", deployment.logger),
+            ("standby", deployment.standby),
+        ):
+            assert process is not None
+            assert process.pid is not None
+            pids[name] = process.pid
+        print(json.dumps(pids), flush=True)
+        drive_until(deployment, 30.0, (), command=motion_of(deployment))
 
 
 def _words(program: Program, folder: Path, port: int) -> list[str]:
@@ -78,7 +85,8 @@ def _words(program: Program, folder: Path, port: int) -> list[str]:
     joints = [word for joint in _JOINTS for word in ("--joints", joint)]
     short = ["--signal", "log-chirp", "--amplitude", "0.25", "--repeats", "1"]
     out = ["--out", str(folder / ("gains.yaml" if program == "match" else "out"))]
-    name, wire = sensor_faults.ROBOT, ["--link", "lcm", "--port", str(port), "--yes"]
+    name = WALKING_ROBOT
+    wire = ["--link", "lcm", "--port", str(port), "--yes"]
     jumps = ["--jumps", "2", "--commands", "1.5,0", "--commands", "2.25,0", "--processes", "2"]
     commands = {
         "sweep": ["sweep", name, *joints, *short],

@@ -1,11 +1,7 @@
 """`python -m benchmarks sensor-faults`: from a fault to damping on the wire.
 
-The processes of `pronk deploy` move a virtual robot over LCM and DDS in real time: the Mini Cheetah
-walks; the Go2, for which no policy was trained, squats, sways and pitches on its feet
-(`write_swaying`). A fault of `SENSOR_FAULTS` or `PROCESSES` begins; the time to the first command
-that damps is on the virtual robot's own clock. Then the fault ends, is reset, and the robot stands
-up again. A run that ends for want of processor time (`BUSY`) is repeated. `--docs` writes the table
-of faults in docs.
+`tests.deploy_strikes` moves a virtual robot over LCM and DDS in real time and strikes it with
+faults. `--docs` writes the table of faults in docs.
 
 With `--minutes` the robot walks without a fault instead: what damps it, the memory and the handles
 of each process, and the lateness of the servo. Its link may then also be `sim`.
@@ -16,18 +12,11 @@ from __future__ import annotations
 import json
 import math
 import os
-import signal
-import socket
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from contextlib import suppress
 from functools import partial
-from multiprocessing import active_children, get_context
-from multiprocessing.connection import Connection
+from multiprocessing import active_children
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -35,262 +24,46 @@ import tyro
 
 from benchmarks.runner import Progress, Row, finish, rows_in, rows_of
 from pronk.cli import console
-from pronk.cli.simulate import _PRIORITY, _SERVERS
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
-from pronk.deploy.bench.server import RobotServer
-from pronk.deploy.links.address import Address
-from pronk.deploy.links.realtime import Wanted, enter
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.plan import Link, RunPlan
-from pronk.deploy.runtime.poses import RunTiming
-from pronk.deploy.runtime.records import Event
 from pronk.deploy.runtime.run import Deployment
-from pronk.deploy.runtime.teleop import OperatorCommand
 from pronk.errors import HardwareError
-from pronk.jump.virtual.robot import VirtualRobot, hold_of
-from pronk.jump.virtual.sim_params import load_sim_params
-from pronk.policy.script import STILL, Velocity
-from pronk.processes import die_with_parent
-from pronk.robots import load_robot
-from tests.linear_policy import stiff_go2, write_swaying
+from pronk.policy.script import Velocity
+from pronk.tables import Column, Table
+from tests.deploy_strikes import (
+    PROCESSES,
+    TIMING,
+    TRIES,
+    WALKING_ROBOT,
+    begin_to_walk,
+    drive_until,
+    measure,
+    served,
+)
 
-ROBOT = "mini_cheetah"
-PROCESSES = {
-    "policy-stopped": ("policy", signal.SIGSTOP),
-    "policy-killed": ("policy", signal.SIGKILL),
-    "servo-stopped": ("servo", signal.SIGSTOP),
-    "servo-killed": ("servo", signal.SIGKILL),
-}
-"""Process of a `Deployment`, and what it gets."""
 FAULTS = (*SENSOR_FAULTS, *PROCESSES)
-BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK", "STANDBY")
-"""Reasons of a computer that is too busy."""
-FOUND_S = 3.0
-"""For which a fault is waited for [s]."""
-REFUSED = "refused"
-"""Reason of a robot that the pre-flight refuses: nothing is sent to it."""
+"""Faults that are measured."""
 BAR_S = 0.1
-"""From a fault to damping [s]."""
-WALK = (0.6, 0.0, 0.0)
-"""Forward, left [m/s], yaw rate [rad/s]."""
-SWAY_HZ = (1.5, 1.1, 1.9)
-"""Of the three commands of a robot that sways."""
-SWAY = 0.5
-"""Their amplitude: joints move by 0.2 to 0.7 rad, the trunk tilts by up to 0.2."""
-WALK_S = 1.0
-"""Before a fault begins [s]."""
-TRIES = 4
-"""For each run."""
-TIMING = RunTiming(damp_s=0.3, fold_s=0.5, check_s=0.0, rise_s=0.8)
-RISE_S = TIMING.fold_s + TIMING.rise_s + 0.2
-"""In which the robot stands up [s]."""
+"""Time from a fault to damping that a fault should not exceed [s]."""
 
 
-def _serve(name: str, link: str, options: dict[str, int], end: Connection) -> None:
-    """Body of the robot's process; receives faults, and sends the time to damping."""
-    die_with_parent()
-    # A robot does not depend on how busy this computer is.
-    enter(Wanted(priority=_PRIORITY, lock=False))
-    robot = load_robot(name)
-    machine = VirtualRobot(robot, load_sim_params(None, robot), base="ground", capture_rate_hz=None)
-    machine.connect()
-    server = RobotServer(
-        machine, resolve_name(_SERVERS[link])(robot, mode="", **options), hold=hold_of(robot)
-    )
-    end.send(None)
-
-    def stop() -> bool:
-        if end.poll():
-            word = end.recv()
-            if word == "stop":
-                return True
-            if word == "damped":
-                end.send(server.damped_s)
-            else:
-                server.spoil(word)
-        return False
-
-    server.run(stop)
-
-
-@contextmanager
-def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]:
-    """A virtual robot on the ground in a process of its own: its address, and its other end.
-
-    Of the link `sim`, whose robot is in the servo's process, the address alone.
-    """
-    if link == "sim":
-        yield Address.parse("sim://ground"), None
-        return
-    if link == "lcm":
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("", 0))
-            options = {"port": int(probe.getsockname()[1])}
-    else:
-        options = {"domain": 100 + os.getpid() % 50}
-    context = get_context("spawn")
-    end, other = context.Pipe()
-    process = context.Process(
-        target=_serve, args=(robot, link, options, other), name="virtual robot", daemon=True
-    )
-    process.start()
-    other.close()
-    try:
-        end.recv()
-        yield Address(kind=link, options=options), end
-    finally:
-        process.kill()
-        process.join()
-
-
-def _until(
-    deployment: Deployment,
-    seconds: float,
-    modes: tuple[Mode, ...],
-    request: OperatorRequest = OperatorRequest.NONE,
-    command: Callable[[float], Velocity] = lambda t: STILL,
-) -> bool:
-    """Hold the dead-man button until one of some modes comes; whether it came."""
-    until = time.monotonic() + seconds
-    while (now := time.monotonic()) < until:
-        deployment.write(OperatorCommand(dead_man=True, request=request, command=command(now)))
-        request = OperatorRequest.NONE
-        if deployment.mode in modes:
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def _sway(t: float) -> Velocity:
-    x, y, z = (SWAY * math.sin(2.0 * math.pi * hz * t) for hz in SWAY_HZ)
-    return x, y, z
-
-
-def _motion(deployment: Deployment) -> Callable[[float], Velocity]:
-    """Commands of a robot at a time [s]."""
-    return (lambda t: WALK) if deployment.plan.link.robot == ROBOT else _sway
-
-
-def _walk(deployment: Deployment) -> bool:
-    """From wherever it is to walking; whether it walks."""
-    if deployment.mode is Mode.FAULT:
-        _until(deployment, 1.1, ())
-        _until(deployment, 5.0, (Mode.DAMP,), OperatorRequest.RESET)
-    for mode, request in (
-        (Mode.STAND, OperatorRequest.STAND),
-        (Mode.POLICY, OperatorRequest.WALK),
-    ):
-        if not _until(deployment, 5.0, (mode, Mode.FAULT), request):
-            return False
-        if mode is Mode.STAND:
-            _until(deployment, RISE_S, (Mode.FAULT,))
-    _until(deployment, WALK_S, (Mode.FAULT, Mode.ENDED), command=_motion(deployment))
-    return deployment.mode is Mode.POLICY
-
-
-def strike(plan: RunPlan, robot: Connection, faults: list[str]) -> list[tuple[str, float, str]]:
-    """Name, time to damping on the robot's clock [s] and reason of faults, one after the other.
-
-    A fault that is not found within `FOUND_S` has the time NaN. Of swapped legs the time is that
-    from the request to stand. Ends early where the robot does not walk, the computer is too busy, a
-    process is gone, or the pre-flight refuses the robot (`REFUSED`).
-    """
-    rows: list[tuple[str, float, str]] = []
-    if faults[0] in SWAPPED:
-        plan = replace(plan, timing=replace(TIMING, check_s=RunTiming().check_s))
-    with Deployment(plan) as deployment:
-        for fault in faults:
-            events = list[Event]()
-            if fault in SWAPPED and rows:
-                break  # it needs a robot that has not stood up
-            if fault in SWAPPED:
-                robot.send(fault)
-                begun, request = time.monotonic(), OperatorRequest.STAND
-                while (passed := time.monotonic() - begun) < 5.0:
-                    over = _until(deployment, 0.02, (Mode.FAULT, Mode.ENDED), request)
-                    request = OperatorRequest.NONE
-                    events += deployment.events_seen()
-                    if any(each.kind == "refused" for each in events):
-                        rows.append((fault, passed, REFUSED))
-                        return rows
-                    if over:
-                        break
-            elif not _walk(deployment):
-                break
-            else:
-                deployment.events_seen()
-                robot.send(fault if fault in SENSOR_FAULTS else "")
-            struck = None
-            if fault in PROCESSES:
-                name, number = PROCESSES[fault]
-                struck = getattr(deployment, name).pid
-                os.kill(struck, number)
-            damped: float | None = None
-            due = time.monotonic() + (0.0 if fault in SWAPPED else FOUND_S)
-            while damped is None:
-                _until(deployment, 0.1, (), command=_motion(deployment))
-                robot.send("damped")
-                damped = robot.recv()
-                if time.monotonic() >= due:
-                    break
-            _until(deployment, 0.1, ())
-            if struck is not None and fault == "policy-stopped":
-                os.kill(struck, signal.SIGCONT)
-            robot.send(None)
-            events += deployment.events_seen()
-            reasons = [each.reason for each in events if each.kind == "fault"]
-            if fault.startswith("servo") and deployment.shared.standby.written:
-                reasons = ["STANDBY"]
-            if damped is None or not reasons:
-                rows.append((fault, math.nan, "not found"))
-                break
-            if reasons[0] in BUSY and not fault.startswith(("policy", "servo")):
-                break
-            rows.append((fault, passed if fault in SWAPPED else damped, reasons[0]))
-            if fault in SWAPPED or (struck is not None and fault != "policy-stopped"):
-                break
-    return rows
-
-
-def measure(
-    robot: str,
-    policy: Path,
-    link: str,
-    faults: tuple[str, ...],
-    run: int,
-    **more: Any,
+def rows_of_faults(
+    robot: str, policy: Path, link: str, faults: tuple[str, ...], run: int, real_time: bool
 ) -> list[Row]:
-    """Time to damping [s] and reason of each fault over a link, once; `more` is of the `Plan`.
-
-    A fault that could not begin in `TRIES` deployments, because the robot did not walk or the
-    computer was too busy, has the reason `not measured`.
-    """
-    left, rows, failed = list(faults), list[Row](), 0
-    while left:
-        found: list[tuple[str, float, str]] = []
-        # A robot of its own each time: one that has fallen may not stand up again.
-        with tempfile.TemporaryDirectory() as folder, suppress(HardwareError), ExitStack() as stack:
-            known, network = robot, policy
-            if robot != ROBOT:
-                known = str(stiff_go2(Path(folder) / robot))
-                network = write_swaying(Path(folder) / "policy.onnx", load_robot(known))
-            address, end = stack.enter_context(served(known, link))
-            assert end is not None
-            plan = RunPlan(
-                link=Link(robot=known, address=address),
-                policy=network,
-                timing=TIMING,
-                ignore_latency=True,
-                **more,
-            )
-            found = strike(plan, end, left)
-        failed = 0 if found else failed + 1
-        if failed == TRIES:
-            found = [(left[0], math.nan, "not measured")]
-        for fault, seconds, reason in found:
-            left.remove(fault)
-            common = {"robot": robot, "link": link, "fault": fault, "run": run}
-            rows.append({**common, "time_s": seconds, "reason": reason})
+    """Measure each fault once; return a row for each."""
+    rows = []
+    for result in measure(robot, policy, link, faults, real_time=real_time):
+        rows.append(
+            {
+                "robot": robot,
+                "link": link,
+                "fault": result.fault,
+                "run": run,
+                "time_s": result.time_s,
+                "reason": result.reason,
+            }
+        )
     return rows
 
 
@@ -311,30 +84,28 @@ def endure(
     has fallen is replaced. `out` is written as the rows come.
     """
     rng = np.random.default_rng([29, seed])
-    walked, faults, rows = 0.0, list[tuple[float, str, str]](), list[dict[str, Any]]()
-    runs = list[dict[str, Any]]()
-    while walked < 60.0 * minutes and len(runs) < TRIES + len(faults):
-        with served(ROBOT, link) as (address, _):
+    seconds = 60.0 * minutes
+    walked = 0.0
+    faults: list[tuple[float, str, str]] = []
+    rows: list[dict[str, Any]] = []
+    runs: list[dict[str, Any]] = []
+    while walked < seconds and len(runs) < TRIES + len(faults):
+        with served(WALKING_ROBOT, link) as (address, _):
             plan = RunPlan(
-                link=Link(robot=ROBOT, address=address),
+                link=Link(robot=WALKING_ROBOT, address=address),
                 policy=policy,
                 timing=TIMING,
                 ignore_latency=True,
             )
             with suppress(HardwareError), Deployment(plan) as deployment:
-                while walked < 60.0 * minutes and _walk(deployment):
-                    begun, due = time.monotonic(), 0.0
-                    while deployment.mode is Mode.POLICY and walked < 60.0 * minutes:
-                        x, y, z = (rng.uniform(-1.0, 1.0, 3) * ROAM).tolist()
-                        now: Velocity = (x, y, z)
-                        _until(
-                            deployment,
-                            2.0,
-                            (Mode.FAULT, Mode.ENDED),
-                            command=lambda t, now=now: now,  # type: ignore[misc]
-                        )
-                        passed = time.monotonic() - begun
-                        walked, begun = walked + passed, begun + passed
+                while walked < seconds and begin_to_walk(deployment):
+                    begun = time.monotonic()
+                    due = 0.0
+                    while deployment.mode is Mode.POLICY and walked < seconds:
+                        _roam(deployment, rng)
+                        now = time.monotonic()
+                        walked += now - begun
+                        begun = now
                         for event in deployment.events_seen():
                             if event.kind == "fault":
                                 faults.append((walked, event.reason, event.text))
@@ -342,71 +113,130 @@ def endure(
                             due = begun + _ROW_S
                             rows.append({"walked_s": walked, "processes": _processes()})
                         if out is not None and rows:
-                            kept = {"link": link, "faults": faults, "rows": rows, "runs": runs}
-                            out.write_text(json.dumps(kept | {"walked_s": walked}))
-                        progress(link, walked / (60.0 * minutes))
+                            figures = {
+                                "link": link,
+                                "faults": faults,
+                                "rows": rows,
+                                "runs": runs,
+                                "walked_s": walked,
+                            }
+                            out.write_text(json.dumps(figures))
+                        progress(link, walked / seconds)
             runs.append(deployment.summary.figures())
     return {"link": link, "walked_s": walked, "faults": faults, "rows": rows, "runs": runs}
 
 
+def _roam(deployment: Deployment, rng: np.random.Generator) -> None:
+    """Walk for two seconds under one random command."""
+    forward, sideways, yaw_rate = (rng.uniform(-1.0, 1.0, 3) * ROAM).tolist()
+    velocity: Velocity = (forward, sideways, yaw_rate)
+
+    def command(t: float) -> Velocity:
+        return velocity
+
+    drive_until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=command)
+
+
 def _processes() -> dict[str, tuple[float, int]]:
     """Memory [MB] and open handles of each process of a run, and of this one."""
-    found = {}
-    known = {"operator": os.getpid(), **{each.name: each.pid for each in active_children()}}
-    for name, pid in known.items():
+    pids = {"operator": os.getpid()}
+    for process in active_children():
+        if process.pid is not None:
+            pids[process.name] = process.pid
+    sizes = {}
+    for name, pid in pids.items():
         with suppress(OSError):
             pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
             handles = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
-            found[name] = (pages * os.sysconf("SC_PAGE_SIZE") / 1e6, handles)
-    return found
+            sizes[name] = (pages * os.sysconf("SC_PAGE_SIZE") / 1e6, handles)
+    return sizes
 
 
 def _endured(walks: list[dict[str, Any]]) -> console.Outcome:
     """Print what a walk without faults took and met."""
-    cells = []
+    tables = []
     for walk in walks:
+        falls = 0
         for seconds, reason, text in walk["faults"]:
             console.say(f"{walk['link']}, {seconds:.0f} s, {reason}: {text}")
-        falls = sum(reason in _FALLS for _, reason, _ in walk["faults"])
-        late = [run["servo"]["lateness"] for run in walk["runs"] if run["servo"]]
-        common = f"{walk['walked_s'] / 60.0:.1f}", str(len(walk["faults"]) - falls), str(falls)
-        times = [f"{max(each[key] for each in late):.2f}" for key in ("p50_ms", "p99_ms", "max_ms")]
-        cells.append((walk["link"], *common, *times, "", ""))
+            if reason in _FALLS:
+                falls += 1
+        lateness = [run["servo"]["lateness"] for run in walk["runs"] if run["servo"]]
+        median_ms = max(figures["p50_ms"] for figures in lateness)
+        late_ms = max(figures["p99_ms"] for figures in lateness)
+        largest_ms = max(figures["max_ms"] for figures in lateness)
+        rows = []
         for name in walk["rows"][-1]["processes"]:
-            kept = [row["processes"][name] for row in walk["rows"] if name in row["processes"]]
-            (first, opened), (last, open_) = kept[min(2, len(kept) - 1)], kept[-1]
-            sizes = f"{first:.1f} to {last:.1f}", f"{opened} to {open_}"
-            cells.append((f"  {name}", *[""] * 6, *sizes))
-    columns = ["link", "minutes", "false alarms", "falls", "late: median [ms]", "99 %", "largest"]
-    columns += ["memory from the second minute on [MB]", "handles"]
-    return finish({"walks": walks}, console.table("Walking without a fault", columns, cells))
+            sizes = [row["processes"][name] for row in walk["rows"] if name in row["processes"]]
+            memory_before, handles_before = sizes[min(2, len(sizes) - 1)]
+            memory_after, handles_after = sizes[-1]
+            rows.append((name, memory_before, memory_after, handles_before, handles_after))
+        table = Table(
+            title=f"{walk['walked_s'] / 60.0:.1f} minutes over {walk['link']} without a fault",
+            columns=(
+                Column(heading="process"),
+                Column(heading="memory, second minute", unit="MB", digits=1),
+                Column(heading="memory, end", unit="MB", digits=1),
+                Column(heading="handles, second minute"),
+                Column(heading="handles, end"),
+            ),
+            rows=tuple(rows),
+            notes=(
+                f"{len(walk['faults']) - falls} false alarms, {falls} falls.",
+                f"Servo late by {median_ms:.2f} ms (median), {late_ms:.2f} ms (99 %), "
+                f"{largest_ms:.2f} ms at most.",
+            ),
+        )
+        tables.append(table)
+    return finish({"walks": walks}, *tables)
 
 
-def page(rows: list[Row], command: str) -> str:
+def _cell(times_ms: list[float], count: int) -> str:
+    """Times to damping of the runs of one fault, and how many of `count` were not found."""
+    if not count:
+        return "not measured"
+    words = []
+    if times_ms:
+        words.append(f"{np.median(times_ms):.0f} ({max(times_ms):.0f})")
+    if len(times_ms) < count:
+        words.append(f"{count - len(times_ms)} of {count} not found")
+    words.append(f"n = {count}")
+    return ", ".join(words)
+
+
+def faults_page(rows: list[Row], command: str) -> str:
     """The page of the table of faults in docs."""
     groups = sorted({(row["robot"], row["link"]) for row in rows}, reverse=True)
-    head = ["fault", *(f"{robot}, {link}" for robot, link in groups), "reasons"]
-    table, missed = [head, ["---"] * len(head)], []
+    headings = [f"{robot}, {link}" for robot, link in groups]
+    table = [["fault", *headings, "reasons"], ["---"] * (len(headings) + 2)]
+    missed = []
     for fault in FAULTS:
-        cells, reasons = [], set[str]()
+        cells = []
+        reasons: set[str] = set()
         for robot, link in groups:
-            mine = [r for r in rows if (r["robot"], r["link"], r["fault"]) == (robot, link, fault)]
-            done = [row for row in mine if row["reason"] != "not measured"]
-            times = [1e3 * row["time_s"] for row in done if not math.isnan(row["time_s"])]
-            reasons |= {row["reason"] for row in done if not math.isnan(row["time_s"])}
-            lost = len(done) - len(times)
-            cell = f"{np.median(times):.0f} ({max(times):.0f})" if times else ""
-            cell += f", {lost} of {len(done)} not found" if lost else ""
-            cell += f", n = {len(done)}" if done else "not measured"
-            cells.append(cell.removeprefix(", "))
-            late = sum(each > 1e3 * BAR_S for each in times) if fault not in SWAPPED else 0
-            if lost or late or not done:
-                where = f"`{fault}` ({robot}, {link})"
-                missed.append(f"{where}: {late} of {len(done)} later, {lost} not found")
-        table.append([f"`{fault}`", *cells, ", ".join(f"`{each}`" for each in sorted(reasons))])
+            measured = []
+            for row in rows:
+                same = (row["robot"], row["link"], row["fault"]) == (robot, link, fault)
+                if same and row["reason"] != "not measured":
+                    measured.append(row)
+            timed = [row for row in measured if not math.isnan(row["time_s"])]
+            reasons |= {row["reason"] for row in timed}
+            times_ms = [1e3 * row["time_s"] for row in timed]
+            cells.append(_cell(times_ms, len(measured)))
+            lost = len(measured) - len(timed)
+            late = 0
+            if fault not in SWAPPED:
+                late = len([time_ms for time_ms in times_ms if time_ms > 1e3 * BAR_S])
+            if lost or late or not measured:
+                missed.append(
+                    f"`{fault}` ({robot}, {link}): {late} of {len(measured)} later, {lost} not "
+                    "found"
+                )
+        reason_words = ", ".join(f"`{reason}`" for reason in sorted(reasons))
+        table.append([f"`{fault}`", *cells, reason_words])
     lines = "\n".join("| " + " | ".join(row) + " |" for row in table)
     bar = f"{1e3 * BAR_S:.0f} ms"
-    failures = "".join(f"- {each}\n" for each in missed) or f"All within {bar}.\n"
+    failures = "".join(f"- {line}\n" for line in missed) or f"All within {bar}.\n"
     return f"""# Faults and damping
 
 Written by `{command}`; do not edit.
@@ -465,21 +295,35 @@ def sensor_faults(
             walks = [endure(policy, link, minutes, seed, report, out) for link in links.split(",")]
         return _endured(walks)
     rows = rows_in(out)
-    known = {(row["robot"], row["link"], row["run"], row["fault"]) for row in rows}
+    done = {(row["robot"], row["link"], row["run"], row["fault"]) for row in rows}
     work = []
+    count = len(rows)
     for run in range(runs):
         for robot in robots.split(","):
             for link in links.split(","):
-                left = tuple(f for f in FAULTS if (robot, link, run, f) not in known)
-                part = partial(measure, robot, policy, link, left, run, real_time=jobs == 1)
-                work += [part] if left else []
-    whole = len(rows) + sum(len(part.args[3]) for part in work)
+                waiting = []
+                for fault in FAULTS:
+                    if (robot, link, run, fault) not in done:
+                        waiting.append(fault)
+                if waiting:
+                    count += len(waiting)
+                    work.append(
+                        partial(
+                            rows_of_faults,
+                            robot,
+                            policy,
+                            link,
+                            tuple(waiting),
+                            run,
+                            real_time=jobs == 1,
+                        )
+                    )
     with console.progress() as report:
         for row in rows_of(work, jobs, out):
             rows.append(row)
-            report("faults", len(rows) / whole)
+            report("faults", len(rows) / count)
     command = f"python -m benchmarks sensor-faults POLICY --runs {runs} --docs {docs}"
-    text = page(rows, command)
+    text = faults_page(rows, command)
     if docs is not None:
         docs.write_text(text, encoding="utf-8")
     console.say(text)

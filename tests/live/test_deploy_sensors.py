@@ -18,15 +18,15 @@ pytest.importorskip("lcm")
 pytest.importorskip("cyclonedds")
 pytest.importorskip("onnx")
 
-from benchmarks.sensor_faults import FAULTS, PROCESSES, REFUSED, measure
 from deploy_runs import PATIENT
-from pronk.deploy.bench.faults import SWAPPED
+from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
+from tests.deploy_strikes import PROCESSES, REFUSED, measure
 
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 IMU = ("imu", "attitude", "gyro", "accelerometer")
 SERVO = ("servo-stopped", "servo-killed")
 """`test_deploy_rival.py` has those of the Mini Cheetah: by the other link here."""
-OTHERS = tuple(fault for fault in FAULTS if fault not in SERVO)
+OTHERS = (*SENSOR_FAULTS, "policy-stopped", "policy-killed")
 LONGEST_S = {"encoder-zero": 2.0, **dict.fromkeys(SWAPPED, 6.0), **dict.fromkeys(PROCESSES, 2.5)}
 """Of a joint that hardly moves, of a robot that stands up, and of `patient` processes; 0.5 s else.
 Several times what an idle computer takes, so that a busy one passes."""
@@ -46,11 +46,10 @@ def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> Non
     # Shorter than a walking robot takes to fall while it holds its last action.
     patient = {"ages": replace(PATIENT, hold_s=1.0), "action_valid_s": 0.3}
     patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
-    rows = measure(robot, POLICY, link, faults, 0, **patient)
-    assert {row["fault"] for row in rows} == set(faults)
-    for row in rows:
-        fault = row["fault"]
-        reason = row["reason"]
+    strikes = measure(robot, POLICY, link, faults, **patient)
+    assert {strike.fault for strike in strikes} == set(faults)
+    for strike in strikes:
+        fault = strike.fault
         if fault in PROCESSES:
             expected = {"STANDBY" if fault.startswith("servo") else "EXPIRED"}
         elif fault in SWAPPED:
@@ -62,5 +61,5 @@ def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> Non
         else:
             of_trunk = fault.split("-")[0] in IMU
             expected = {"REPEATED", "ATTITUDE"} if of_trunk else {"ENCODER"}
-        assert reason in expected, row
-        assert row["time_s"] <= LONGEST_S.get(fault, 0.5), row
+        assert strike.reason in expected, strike
+        assert strike.time_s <= LONGEST_S.get(fault, 0.5), strike
