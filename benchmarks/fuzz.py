@@ -121,7 +121,8 @@ def _write(folder: Path) -> None:
     cases.write_match(folder / "page", result, prediction=True)
     cases.write_trial(folder / "page" / "trial", ("matched",), cases.CASES[:1])
     shutil.copytree(folder / "tree" / "trial" / "videos", folder / "page" / "trial" / "videos")
-    response_file.save(folder / "tree" / "a.response.npz", cases.joint_fit("knee").responses)
+    responses = cases.joint_fit("knee").responses
+    response_file.save_responses(folder / "tree" / "a.response.npz", responses)
     log = logs.example(600, ("FR_hip_pitch", "FR_knee"))
     for name in ("npz", "csv", "mcap"):
         getattr(logs, f"write_{name}")(folder / f"a.{name}", log)
@@ -230,7 +231,7 @@ def _kinds() -> dict[str, _Kind]:
         "gains": _Kind(("tree/gains.yaml",), gains),
         "match": _Kind(("tree/match.npz",), match, True),
         "prediction": _Kind(("page/fresh.prediction.npz",), load_prediction, True),
-        "response": _Kind(("tree/a.response.npz",), response_file.load, True),
+        "response": _Kind(("tree/a.response.npz",), response_file.load_responses, True),
         "capture": _Kind(("capture.npz",), capture.load_capture, True),
         "trial": trial(results.JUMPS),
         "walk": trial(WALK),

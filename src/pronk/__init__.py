@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pronk.identify.match.export.targets import export
     from pronk.identify.match.match import match
     from pronk.identify.match.predict import predict
-    from pronk.identify.response.estimate import estimate as response
+    from pronk.identify.response.estimate import estimate_response as response
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
 
@@ -48,7 +48,7 @@ _HOMES = {
     "predict": ("pronk.identify.match.predict", "predict"),
     "read_log": ("pronk.identify.logs.readers", "read_log"),
     "read_logs": ("pronk.identify.logs.readers", "read_logs"),
-    "response": ("pronk.identify.response.estimate", "estimate"),
+    "response": ("pronk.identify.response.estimate", "estimate_response"),
 }
 """Module and name of each public function and class."""
 

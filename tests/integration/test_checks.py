@@ -13,7 +13,7 @@ from pronk.deploy.bench.virtual_sweep import sweep_virtual
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.readers import read_logs
 from pronk.identify.match.checks import check_recordings, check_response, slow_response
-from pronk.identify.response.estimate import estimate
+from pronk.identify.response.estimate import estimate_response
 from pronk.robots import load_robot
 from virtual_robot import ROBOT, SIM_PARAMS
 
@@ -85,7 +85,7 @@ def test_the_slow_response_of_a_joint_is_near_one(case: Case) -> None:
 def test_a_misfit_is_named_where_it_is(
     case: Case, low_hz: float, high_hz: float, cause: str
 ) -> None:
-    measured = estimate(case.log, JOINT)[0]
+    measured = estimate_response(case.log, JOINT)[0]
     used = measured.band(*ROBOT.joint(JOINT).band_hz)
     assert check_response(measured, measured.response, used, 1.0) == ()
     hz = measured.frequency_hz

@@ -14,7 +14,7 @@ from command_line import accepted, refused
 from pronk.errors import PronkError
 from pronk.identify.match.gains import FittedValue, load_gains, save_gains
 from pronk.identify.match.translate import stated_gains, translate
-from pronk.identify.response.estimate import estimate
+from pronk.identify.response.estimate import estimate_response
 from pronk.identify.simulators.profiles import profile
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -86,7 +86,7 @@ def test_the_simulated_joints_respond_alike() -> None:
         known = profile(target).robot(robot)
         how = {"length_s": 12.0, "frictionloss": friction}
         log = chirp_log(known, "FR_knee", (kp, kd), (0.2, 0.1), **how)
-        found = [one.gain[one.band(*hz)] for one in estimate(log, "FR_knee")]
+        found = [one.gain[one.band(*hz)] for one in estimate_response(log, "FR_knee")]
         return 20.0 * np.log10(np.concatenate(found))
 
     own = robot.joint("FR_knee").drive.frictionloss

@@ -14,7 +14,7 @@ from pronk.identify.logs.readers import read_log
 from pronk.identify.match.measured import measured_joints
 from pronk.identify.match.replay import JointReplay
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.response.estimate import estimate
+from pronk.identify.response.estimate import estimate_response
 from pronk.identify.simulators.chain import moves_together
 from pronk.identify.simulators.command_trace import command_trace
 from pronk.identify.simulators.load import joint_rigs
@@ -63,10 +63,10 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
     with joint_rigs("mujoco", ROBOT) as rigs:
         replay = JointReplay(rigs, log.excitations("FR_knee"))
     assert [recording.command for recording in replay.recordings] == [0, 0, 0, 1]
-    loud, quiet = estimate(log, "FR_knee")
+    loud, quiet = estimate_response(log, "FR_knee")
     assert (len(loud.repeats), len(quiet.repeats)) == (3, 1)
     # The same as of the first chirp alone, which a file of its own would hold.
-    alone = estimate(log_of(knee[0]), "FR_knee")[0]
+    alone = estimate_response(log_of(knee[0]), "FR_knee")[0]
     for found in (loud, quiet):
         np.testing.assert_allclose(found.response, alone.response, atol=0.02)
     assert len(measured_joints([log], "FR_knee", ROBOT, MatchSettings())) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +15,15 @@ from scipy.signal import lfilter
 from pronk.errors import ArtefactError, LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
-from pronk.identify.response import (
+from pronk.identify.response.estimate import estimate_response, operators
+from pronk.identify.response.grid import Grid, grid_over, held_mean
+from pronk.identify.response.h1 import H1Operator, SegmentLayout, segment_layout, sum_spectra
+from pronk.identify.response.response import (
     Estimator,
     FrequencyResponse,
-    H1Operator,
-    estimate,
-    load,
-    operators,
-    save,
+    load_responses,
+    save_responses,
 )
-from pronk.identify.response.grid import Grid, grid_over, held_mean
-from pronk.identify.response.h1 import Layout, layout, sum_spectra
 from synthetic_joint import (
     AMPLITUDE,
     HIP,
@@ -98,7 +97,7 @@ KINDS: dict[str, tuple[Any, float, float, int]] = {
 @pytest.mark.parametrize("name", JOINTS)
 def test_the_analytic_response_is_found(name: str, kind: str, rate: float) -> None:
     make, gain_limit, phase_limit, expected = KINDS[kind]
-    (response,) = estimate(make(linear_joint(**JOINTS[name]), rate), "knee")
+    (response,) = estimate_response(make(linear_joint(**JOINTS[name]), rate), "knee")
     gain, phase, bins = errors(response, JOINTS[name])
     assert (gain < gain_limit, phase < phase_limit, bins) == (True, True, expected)
     # One for each excitation; for each block of periods where there are fewer than three.
@@ -108,12 +107,12 @@ def test_the_analytic_response_is_found(name: str, kind: str, rate: float) -> No
 @pytest.mark.parametrize("jitter", [0.05, 0.9])
 def test_measured_timestamps_are_used(jitter: float) -> None:
     log = chirps(rate=500.0, jitter=jitter)
-    gain, phase, bins = errors(estimate(log, "knee")[0], KNEE)
+    gain, phase, bins = errors(estimate_response(log, "knee")[0], KNEE)
     assert (gain < 0.01, phase < 0.5, bins) == (True, True, 191)
     # The same rows with invented, even timestamps are off by more than that.
     time = np.arange(len(log.time)) / 500.0 * (1.0 + 0.02 * jitter)
     even = replace(log, time=time, segments=(), frequency=None)
-    assert errors(estimate(even, "knee")[0], KNEE)[0] > gain
+    assert errors(estimate_response(even, "knee")[0], KNEE)[0] > gain
 
 
 def test_held_mean_is_the_zero_order_hold_on_the_grid_and_moves_no_step_off_it() -> None:
@@ -131,7 +130,7 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
     signals = [(time, size * command, hz) for size in (0.5, 0.5, 1.0, 1.0, 1.0)]
     log = make_log(signals, KNEE_JOINT, kind="chirp")
     segments = tuple(replace(s, amplitude=float("nan")) for s in log.segments)
-    found = estimate(replace(log, segments=segments), "knee")
+    found = estimate_response(replace(log, segments=segments), "knee")
     assert [r.amplitude for r in found] == pytest.approx([0.25, 0.125], rel=0.01)
     assert [len(r.repeats) for r in found] == [3, 2]
     assert np.array_equal(found[0].omega, found[1].omega)
@@ -172,7 +171,7 @@ def test_logs_without_a_response_are_refused() -> None:
         ),
     ):
         with pytest.raises(LogError, match=words):
-            estimate(log, joint)
+            estimate_response(log, joint)
 
 
 @pytest.mark.skipif(not SO101.exists(), reason="the SO-101 recordings are not here")
@@ -180,7 +179,7 @@ def test_recorded_chirp_is_coherent_where_the_servo_follows() -> None:
     """At 2.8 Hz all servos reach their speed limit at once and the response breaks off."""
     log = read_log(SO101 / "chirp_sweep")
     for joint in log.joints[:5]:
-        (response,) = estimate(log, joint)
+        (response,) = estimate_response(log, joint)
         assert response.repeats.shape[0] == 1
         assert response.coherence[response.band(0.25, 2.6)].min() > 0.95
         assert response.coherence[response.band(2.75, 3.1)].min() < 0.93
@@ -198,7 +197,7 @@ def test_lines_of_a_linear_joint_are_exact_without_noise(ramp_s: float) -> None:
     time, command = multisine_command(500.0)
     ramp = np.clip(time / ramp_s, 0.0, 1.0) if ramp_s else 1.0
     log = make_log([(time, command * ramp, None)], KNEE_JOINT, kind="multisine", period=4.0)
-    (response,) = estimate(log, "knee")
+    (response,) = estimate_response(log, "knee")
     assert np.abs(response.response / second_order(response.omega, **KNEE) - 1.0).max() < 2e-4
     assert response.repeats.shape == (3 if ramp_s else 4, 36)
     assert np.all(response.averages == len(response.repeats))
@@ -214,7 +213,7 @@ def test_delay_is_recovered(delay: float, noise: float) -> None:
         moved = simulate_second_order(command, rate, **KNEE)
         return np.r_[np.zeros(round(delay * rate)), moved][: len(moved)]
 
-    (response,) = estimate(chirps(4, late, rate=500.0, noise=noise), "knee")
+    (response,) = estimate_response(chirps(4, late, rate=500.0, noise=noise), "knee")
     assert response.delay_s == pytest.approx(delay, abs=3e-4 if noise else 5e-5)
     gain, phase, _ = errors(response, KNEE, delay=delay)
     assert noise or (gain < 0.005, phase < 0.5) == (True, True)
@@ -230,7 +229,7 @@ def test_friction_shows_in_the_third_harmonic() -> None:
         (steps_command(500.0, (1.0, 2.0, 3.0)), 0.2, "sine_steps"),
     )
     logs = [make_log([one], friction_joint(dry), kind=k, noise=2e-5) for one, dry, k in signals]
-    none, whole, half, stepped = (estimate(log, "knee")[0].third_harmonic for log in logs)
+    none, whole, half, stepped = (estimate_response(log, "knee")[0].third_harmonic for log in logs)
     assert none < 0.001
     assert 0.008 < whole < 0.02
     assert half == pytest.approx(2.0 * whole, rel=0.15)
@@ -284,10 +283,10 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     assert np.mean(np.abs(hits[:, 0].mean(axis=0) - 0.945) <= 0.045) > 0.97
 
 
-def laid_out() -> tuple[Layout, np.ndarray]:
+def laid_out() -> tuple[SegmentLayout, np.ndarray]:
     """Segments over one chirp at 200 Hz, and its spectra."""
     time, command, _ = chirp_command("chirp", 200.0)
-    where = layout(grid_over(time), SETTINGS, padded=True)
+    where = segment_layout(grid_over(time), SETTINGS, padded=True)
     return where, where.spectra(held_mean(time, command, where.grid.edges))
 
 
@@ -314,7 +313,7 @@ def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
     raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in each], axis=0)
     assert float((raw * each[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
     # Nor is a single noisy repeat coherent by construction.
-    assert float(np.median(estimate(chirps(noise=0.5), "knee")[0].coherence)) < 0.7
+    assert float(np.median(estimate_response(chirps(noise=0.5), "knee")[0].coherence)) < 0.7
 
 
 # --- the estimate as a matrix -------------------------------------------------------------------
@@ -334,7 +333,7 @@ IN_MOTION = [tuple(part[:3500] for part in chirp_command("chirp", 200.0))]
     ids=["chirp", "jitter", "unknown", "in motion", "multisine"],
 )
 def test_operator_is_the_estimate(log: JointLog, settings: Estimator) -> None:
-    (response,) = estimate(log, "knee", settings)
+    (response,) = estimate_response(log, "knee", settings)
     (row,) = operators(log, "knee", settings)
     positions = [log.cut(segment).position[:, 0] for segment in log.segments]
     pairs = list(zip(row, positions, strict=True))
@@ -372,25 +371,39 @@ def test_matrix_takes_positions_at_physics_steps() -> None:
 # --- files --------------------------------------------------------------------------------------
 
 
+def test_a_response_tells_itself_in_one_line_and_can_be_drawn() -> None:
+    (response,) = estimate_response(chirps(2, noise=1e-4), "knee")
+    assert re.fullmatch(r"FrequencyResponse\(knee, .* rad, .* repeats\)", repr(response))
+    numbers = response.to_dict()
+    assert numbers["gain"] == response.gain.tolist()
+    assert numbers["joint"] == "knee"
+    json.dumps(numbers)
+    figure = response.plot()
+    assert [axes.get_ylabel() for axes in figure.axes] == ["gain [dB]", "phase [deg]", "coherence"]
+
+
 def test_responses_survive_a_file_and_damage_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "knee.response.npz"
-    written = [*estimate(chirps(2, noise=1e-4), "knee"), *estimate(multisines(), "knee")]
-    save(path, written)
-    for a, b in zip(written, load(path), strict=True):
+    written = [
+        *estimate_response(chirps(2, noise=1e-4), "knee"),
+        *estimate_response(multisines(), "knee"),
+    ]
+    save_responses(path, written)
+    for a, b in zip(written, load_responses(path), strict=True):
         for name in vars(a):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        save(path, [FrequencyResponse(**{**vars(written[0]), "source": object()})])
+        save_responses(path, [FrequencyResponse(**{**vars(written[0]), "source": object()})])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
     np.savez(path, header=json.dumps({"schema": "pronk/response/0"}))
     with pytest.raises(ArtefactError, match="this pronk reads"):
-        load(path)
+        load_responses(path)
     np.savez(path, header=np.array([{"schema": "pronk/response/1"}], dtype=object))
     for data in (path.read_bytes(), b"not a zip", before[:-200]):
         path.write_bytes(data)
         with pytest.raises(ArtefactError, match="not a response file"):
-            load(path)
+            load_responses(path)
     with pytest.raises(ArtefactError, match="no such file"):
-        load(tmp_path / "missing.response.npz")
+        load_responses(tmp_path / "missing.response.npz")

@@ -155,7 +155,7 @@ def sweep_and_match(
     from pronk.identify.match import result as result_file
     from pronk.identify.match.match import match
     from pronk.identify.match.predict import Prediction, predict, save_prediction
-    from pronk.identify.response import save as save_responses
+    from pronk.identify.response.response import save_responses
     from pronk.jump.virtual.sim_params import load_sim_params
 
     params, cpus = load_sim_params(), os.cpu_count() or 1

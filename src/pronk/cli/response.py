@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +13,16 @@ from pronk.cli import console
 from pronk.cli.options import Reading
 from pronk.errors import LogError
 from pronk.names import file_name
+from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
+    from pronk.identify.logs.joint_log import JointLog
     from pronk.identify.response.response import FrequencyResponse
 
 COHERENT = 0.95
 """Least coherence of a frequency that counts as measured."""
+_LOUD = 0.5
+"""Least coherence of a frequency that counts for the bandwidth."""
 
 
 def response(
@@ -36,91 +41,138 @@ def response(
         plots: Draw Bode plots.
         reading: How logs are read.
     """
-    from pronk.identify.response import Estimator, estimate, save
-    from pronk.report import figures, style
+    from pronk.identify.response.response import save_responses
     from pronk.robots import load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)
     rows: list[dict[str, Any]] = []
     written: list[Path] = []
     with console.progress() as report:
-        done = report.bar("estimate")
-        for i, log in enumerate(logs):
+        progress = report.bar("estimate")
+        for count, log in enumerate(logs, start=1):
             source = Path(log.source or "log")
-            folder, stem = out or source.parent, source.stem
-            found: list[FrequencyResponse] = []
-            if not (joints := log.excited_joints):
-                raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
-            for joint in joints:
-                mine = estimate(log, joint, Estimator())
-                found += mine
-                if plots:
-                    own = file_name(joint)
-                    name = stem if len(joints) == 1 and own == stem else f"{stem}.{own}"
-                    path = folder / f"{name}.response.svg"
-                    written.append(style.save(figures.responses(mine), path))
-            save(folder / f"{stem}.response.npz", found)
-            written.append(folder / f"{stem}.response.npz")
-            rows += [summary(one) | {"log": log.source} for one in found]
-            done((i + 1) / len(logs))
-    virtual = any(row["virtual"] for row in rows)
-    title = "Responses of the virtual robot" if virtual else "Responses"
-    console.show_rows(title, COLUMNS, rows)
+            folder = source.parent if out is None else out
+            by_joint = _responses_by_joint(log)
+            if plots:
+                written += _write_plots(by_joint, folder, source.stem)
+            responses = []
+            for joint_responses in by_joint.values():
+                responses += joint_responses
+            path = folder / f"{source.stem}.response.npz"
+            save_responses(path, responses)
+            written.append(path)
+            for joint_response in responses:
+                rows.append(response_figures(joint_response) | {"log": log.source})
+            progress(count / len(logs))
+    console.show(response_table(rows))
     for log in logs:
         for note in log.notes:
             console.say(f"note: {Path(log.source).name}: {note}")
-    name, where = robot or logs[0].robot or "ROBOT", " ".join(map(str, paths))
+    robot_name = robot or logs[0].robot or "ROBOT"
+    logs_stated = " ".join(str(path) for path in paths)
     return console.Outcome(
         figures={"responses": rows, "written": written},
         wrote=written,
-        following=[f"pronk match {where} --robot {name} --out gains.yaml"],
+        following=[f"pronk match {logs_stated} --robot {robot_name} --out gains.yaml"],
     )
 
 
-def summary(found: FrequencyResponse) -> dict[str, Any]:
-    """Figures of one response, for the table and for JSON.
+def _responses_by_joint(log: JointLog) -> dict[str, list[FrequencyResponse]]:
+    """Responses of every excited joint; a LogError if none was excited."""
+    from pronk.identify.response.estimate import estimate_response
 
-    The bandwidth is where the gain falls 3 dB below that at the lowest frequency [Hz]: after the
-    last coherent frequency above that level, so that a noisy dip is not taken for it.
+    if not log.excited_joints:
+        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
+    return {joint: estimate_response(log, joint) for joint in log.excited_joints}
+
+
+def _write_plots(
+    by_joint: Mapping[str, Sequence[FrequencyResponse]], folder: Path, stem: str
+) -> list[Path]:
+    """Draw one plot a joint, named by the log and, where that does not name it, the joint."""
+    from pronk.report import figures, style
+
+    written = []
+    for joint, responses in by_joint.items():
+        name = f"{stem}.{file_name(joint)}"
+        if len(by_joint) == 1 and stem == file_name(joint):
+            name = stem
+        written.append(style.save(figures.responses(responses), folder / f"{name}.response.svg"))
+    return written
+
+
+def response_figures(response: FrequencyResponse) -> dict[str, Any]:
+    """Return the figures of one response, for the table and for JSON.
+
+    The bandwidth is the frequency at which the gain falls 3 dB below its value at the lowest
+    frequency [Hz]: after the last coherent frequency above that level, so that a noisy dip is not
+    taken for it.
     """
     import numpy as np
 
-    hz, level = found.frequency_hz, found.gain[0] / np.sqrt(2.0)
-    coherent = hz[found.coherence >= COHERENT]
-    band = (float(coherent.min()), float(coherent.max())) if len(coherent) else None
-    inside = found.band(*band) if band else hz > 0.0
-    peak = int(np.argmax(np.where(inside, found.gain, -np.inf)))
-    above = np.flatnonzero((found.gain >= level) & (found.coherence >= 0.5))
+    hz = response.frequency_hz
+    coherent_hz = hz[response.coherence >= COHERENT]
+    if len(coherent_hz):
+        band = (float(coherent_hz.min()), float(coherent_hz.max()))
+        inside = response.band(*band)
+    else:
+        band = None
+        inside = hz > 0.0
+    peak = int(np.argmax(np.where(inside, response.gain, -np.inf)))
+    level = response.gain[0] / np.sqrt(2.0)
+    above = np.flatnonzero((response.gain >= level) & (response.coherence >= _LOUD))
     bandwidth = math.nan
     if len(above) and above[-1] + 1 < len(hz):
         ends = slice(above[-1], above[-1] + 2)
-        bandwidth = float(np.interp(-level, -found.gain[ends], hz[ends]))
+        bandwidth = float(np.interp(-level, -response.gain[ends], hz[ends]))
     return {
-        "joint": found.joint,
-        "virtual": found.virtual,
-        "amplitude_rad": found.amplitude,
-        "repeats": len(found.repeats),
-        "estimator": found.estimator,
+        "joint": response.joint,
+        "virtual": response.virtual,
+        "amplitude_rad": response.amplitude,
+        "repeats": len(response.repeats),
+        "estimator": response.estimator,
         "coherent_hz": band,
-        "coherence_min": float(found.coherence[inside].min()),
-        "peak_db": float(20.0 * np.log10(found.gain[peak])),
+        "coherence_min": float(response.coherence[inside].min()),
+        "peak_db": float(20.0 * np.log10(response.gain[peak])),
         "peak_hz": float(hz[peak]),
         "bandwidth_hz": bandwidth,
-        "delay_s": found.delay_s,
-        "third_harmonic": found.third_harmonic,
+        "delay_s": response.delay_s,
+        "third_harmonic": response.third_harmonic,
     }
 
 
-COLUMNS = {
-    "joint": "joint",
-    "amplitude [rad]": "amplitude_rad",
-    "repeats": "repeats",
-    f"coherence >= {COHERENT} [Hz];1": "coherent_hz",
-    "least there": "coherence_min",
-    "peak [dB];2": "peak_db",
-    "at [Hz];2": "peak_hz",
-    "-3 dB at [Hz];2": "bandwidth_hz",
-    "command delay [s];4": "delay_s",
-    "third harmonic": "third_harmonic",
-}
-"""Heading to field of a summary."""
+def response_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of `response_figures`, one row a response."""
+    cells = []
+    for row in rows:
+        cells.append(
+            (
+                row["joint"],
+                row["amplitude_rad"],
+                row["repeats"],
+                row["coherent_hz"],
+                row["coherence_min"],
+                row["peak_db"],
+                row["peak_hz"],
+                row["bandwidth_hz"],
+                row["delay_s"],
+                row["third_harmonic"],
+            )
+        )
+    virtual = any(row["virtual"] for row in rows)
+    return Table(
+        title="Responses of the virtual robot" if virtual else "Responses",
+        columns=(
+            Column(heading="joint"),
+            Column(heading="amplitude", unit="rad"),
+            Column(heading="repeats"),
+            Column(heading=f"coherence >= {COHERENT}", unit="Hz", digits=1),
+            Column(heading="lowest coherence"),
+            Column(heading="peak", unit="dB", digits=2),
+            Column(heading="at", unit="Hz", digits=2),
+            Column(heading="-3 dB at", unit="Hz", digits=2),
+            Column(heading="command delay", unit="s", digits=4),
+            Column(heading="third harmonic", digits=4),
+        ),
+        rows=tuple(cells),
+    )

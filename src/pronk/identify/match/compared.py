@@ -11,7 +11,7 @@ from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.measured import DB, MeasuredJoint, rms
-from pronk.identify.response.estimate import estimate
+from pronk.identify.response.estimate import estimate_response
 from pronk.identify.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 
@@ -109,7 +109,7 @@ def compare_recordings(
     compared = np.zeros(0, dtype=bool)
     for number, log in enumerate(logs):
         try:
-            measured = estimate(log, joint_name)[0]
+            measured = estimate_response(log, joint_name)[0]
         except LogError:
             continue  # The joint was not excited, or was stuck, in this recording.
         coherent = measured.band(*band_hz, COHERENCE_MIN)
@@ -124,7 +124,7 @@ def compare_recordings(
     for position in (matched[best_number], nominal[best_number]):
         positions = log.position.copy()
         positions[:, log.column(joint_name)] = position
-        simulated.append(estimate(replace(log, position=positions), joint_name)[0])
+        simulated.append(estimate_response(replace(log, position=positions), joint_name)[0])
     return ComparedResponses(
         measured=(best,),
         matched=simulated[0].response,

@@ -18,7 +18,7 @@ from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.response.estimate import estimate, log_rate, operator
+from pronk.identify.response.estimate import estimate_response, log_rate, operator
 from pronk.identify.response.h1 import H1Operator
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
@@ -209,7 +209,7 @@ def _responses_of_log(
     joint = robot.joint(joint_name)
     excitations = log.excitations(joint_name)
     rate_hz = log_rate(excitations)
-    responses = estimate(log, joint_name, settings.estimator)
+    responses = estimate_response(log, joint_name, settings.estimator)
     targets: list[MeasuredJoint] = []
     warnings: list[str] = []
     for repeats, response in zip(group_repeats(excitations), responses, strict=True):

@@ -23,7 +23,7 @@ def log_rate(excitations: Sequence[Excitation]) -> float:
     return analysis_rate([excitation.time for excitation in excitations])
 
 
-def estimate(
+def estimate_response(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[FrequencyResponse]:
     """Estimate the responses of one joint, from its held command to its position.
@@ -93,7 +93,7 @@ def operator(excitation: Excitation, estimator: Estimator, rate_hz: float) -> H1
 def operators(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
-    """Return the `operator` of every repeat, a row for each response of `estimate`."""
+    """Return the `operator` of every repeat, a row for each response of `estimate_response`."""
     settings = Estimator() if estimator is None else estimator
     excitations = log.excitations(joint)
     rate_hz = log_rate(excitations)

@@ -60,7 +60,7 @@ def rests(command: Array, rate_hz: float) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layout:
+class SegmentLayout:
     """Where the segments of one excitation lie on its analysis grid."""
 
     grid: Grid
@@ -95,7 +95,7 @@ class Layout:
         return np.asarray(fft.rfft(parts)[:, self.bins])
 
 
-def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
+def segment_layout(grid: Grid, estimator: Estimator, *, padded: bool) -> SegmentLayout:
     """Lay the segments over a grid.
 
     Args:
@@ -141,7 +141,7 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
             f"no frequency between {estimator.min_hz:g} and {top_hz:g} Hz with segments of "
             f"{estimator.segment_s:g} s at {rate_hz:g} Hz."
         )
-    return Layout(
+    return SegmentLayout(
         grid=grid,
         starts=np.arange(first, stop) * transform.hop - transform.m_num_mid,
         window=window,
@@ -203,11 +203,11 @@ class Sums:
         return np.asarray(self.segments * self.uu / np.maximum(self.spread, _TINY))
 
 
-def sum_spectra(command: ComplexArray, position: ComplexArray, segments: Layout) -> Sums:
+def sum_spectra(command: ComplexArray, position: ComplexArray, segments: SegmentLayout) -> Sums:
     """Sum the spectra of one excitation over its segments.
 
     Args:
-        command: Spectra of the command, by `Layout.spectra`, shape (k, f).
+        command: Spectra of the command, by `SegmentLayout.spectra`, shape (k, f).
         position: Spectra of the position, shape (k, f).
         segments: Where the segments lie.
     """
@@ -254,7 +254,7 @@ def estimate_averaged(
         padded = rests(command, rate_hz)
         if not padded:
             ends = "inside the excitation"
-        segments = layout(grid, estimator, padded=padded)
+        segments = segment_layout(grid, estimator, padded=padded)
         sums_of_repeats.append(
             sum_spectra(segments.spectra(command), segments.spectra(position), segments)
         )
@@ -285,12 +285,12 @@ def estimate_averaged(
 class H1Operator:
     """Linear map from the positions of one excitation to its response.
 
-    On the analysis grid it is the sum over segments of `scale` times `Layout.spectra`.
+    On the analysis grid it is the sum over segments of `scale` times `SegmentLayout.spectra`.
     """
 
     time: Array
     """Measured timestamps of the log it was built for [s], shape (n,)."""
-    layout: Layout
+    layout: SegmentLayout
     """Where the segments lie on the analysis grid."""
     command: ComplexArray
     """Transforms of the command, shape (k, f)."""
@@ -312,7 +312,7 @@ class H1Operator:
         """
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
-        segments = layout(grid, estimator, padded=rests(held, grid.rate_hz))
+        segments = segment_layout(grid, estimator, padded=rests(held, grid.rate_hz))
         return cls(time=time, layout=segments, command=segments.spectra(held))
 
     @property

@@ -23,7 +23,7 @@ from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.response.grid import Grid, grid_over, held_mean, hold, interpolate
-from pronk.identify.response.h1 import H1Operator, Layout
+from pronk.identify.response.h1 import H1Operator, SegmentLayout
 from pronk.identify.response.response import Estimator, FrequencyResponse
 
 _EXCITED = 0.02
@@ -104,7 +104,7 @@ def multisine_operator(
             f"a signal of period {period_s:g} s has no line between {estimator.min_hz:g} and "
             f"{top_hz:g} Hz."
         )
-    segments = Layout(
+    segments = SegmentLayout(
         grid=grid,
         starts=np.arange(0, grid.count, samples),
         window=np.full(samples, 1.0 / samples),

@@ -265,13 +265,13 @@ class _ResponseFile:
     responses: list[FrequencyResponse]
 
 
-def save(path: Path, responses: Sequence[FrequencyResponse]) -> None:
+def save_responses(path: Path, responses: Sequence[FrequencyResponse]) -> None:
     """Write responses to one `*.response.npz` (plain arrays and a JSON header, no pickle)."""
     save_artefact(path, _ResponseFile(list(responses)), SCHEMA)
 
 
-def load(path: Path) -> list[FrequencyResponse]:
-    """Read what `save` wrote; ArtefactError for any other file."""
+def load_responses(path: Path) -> list[FrequencyResponse]:
+    """Read what `save_responses` wrote; ArtefactError for any other file."""
     return load_artefact(
         path, _ResponseFile, SCHEMA, what="a response file", writer="pronk response LOG"
     ).responses
