@@ -77,20 +77,19 @@ class CommandTrace:
             command = np.pad(command, (0, steps - len(command)), mode="edge")
         return np.array(pose), command
 
-    def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
+    def same_as(self, other: CommandTrace, robot: RobotSpec) -> bool:
         """Tell whether both lead to the same simulation of the same original joint.
 
         Args:
             other: Another command, which may rest longer or shorter at its end.
             robot: The robot.
-            sign: 1, or -1 for commands of opposite signs.
         """
         if robot.joint(self.joint).original[0] != robot.joint(other.joint).original[0]:
             return False
         steps = max(len(self.command), len(other.command))
         pose, command = self.excitation(robot, steps)
         other_pose, other_command = other.excitation(robot, steps)
-        if np.abs(command - sign * other_command).max() >= _SAME:
+        if np.abs(command - other_command).max() >= _SAME:
             return False
         return bool(np.allclose(pose, other_pose, atol=1e-3))
 

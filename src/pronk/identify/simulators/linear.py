@@ -6,13 +6,12 @@ position `P_q(z)` and speed `P_v(z)`; explicit PD then gives
 
     H(z) = kp P_q / (1 + kp P_q + kd P_v + c z P_v),    z = exp(j omega timestep)
 
-for a whole grid of gains without simulating anything. Where damping is implicit
-(`pronk.robots.drive_law`) it acts on the speed at the end of the step, `z P_v`.
+for any gains without simulating anything. Gains are translated between drive laws by it. Where
+damping is implicit (`pronk.robots.drive_law`) it acts on the speed at the end of the step, `z P_v`.
 `c = 4 f / (pi |speed|)` is the describing function of the joint's dry friction `f` (Gelb and
 Vander Velde, *Multiple-Input Describing Functions*, 1968, table of appendix B: ideal relay) at
-the amplitude of the response. What it leaves out (coupling through held joints that
-slip, the estimator's leakage, friction near sticking) is a smooth ratio that simulations at the
-optimum correct.
+the amplitude of the response. The closed form does not have the coupling through held joints that
+slip, and friction near sticking.
 """
 
 from __future__ import annotations
@@ -30,8 +29,6 @@ from pronk.robots.drive_law import DriveLaw
 
 _PERTURBATION = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
-_LOG_STEP = 1e-3
-"""Step of `LinearJoint.slope` in the logarithm of a gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,23 +83,6 @@ class LinearJoint:
             speed = (np.sqrt(np.maximum(half**2 - constant, 0.0)) - half) / square
             closed = direct / (open_loop + relay / np.maximum(speed, 1e-9) * next_speed)
         return np.asarray(closed / hold)
-
-    def slope(self, stiffness: float, damping: float, *, amplitude: float) -> Array:
-        """Differentiate the log magnitude by the log of stiffness and of damping.
-
-        Args:
-            stiffness: Stiffness of the drive [N m/rad].
-            damping: Damping of the drive [N m s/rad].
-            amplitude: Amplitude of the command [rad].
-
-        Returns:
-            Derivatives, shape (f, 2).
-        """
-        log_gains = np.log([stiffness, damping]) + _LOG_STEP * np.array([[0, 0], [1, 0], [0, 1]])
-        gains = np.exp(log_gains)
-        responses = self.response(gains[:, 0], gains[:, 1], amplitude=amplitude)
-        log_magnitude = np.log(np.abs(responses))
-        return np.asarray((log_magnitude[1:] - log_magnitude[0]).T / _LOG_STEP)
 
 
 def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
