@@ -190,8 +190,8 @@ def measured_joints(
             measured = target.measured
             key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
             amplitudes.setdefault(key, []).append(target)
-    targets = [merged_repeats(repeats) for repeats in amplitudes.values()]
-    return sorted(targets, key=lambda target: -target.measured.amplitude)
+    merged = map(merged_repeats, amplitudes.values())
+    return sorted(merged, key=lambda target: -target.measured.amplitude)
 
 
 def _responses_of_log(
@@ -246,32 +246,42 @@ def merged_repeats(targets: Sequence[MeasuredJoint]) -> MeasuredJoint:
     first = targets[0]
     if len(targets) == 1:
         return first
-    responses = [target.measured for target in targets]
-    for response in responses:
-        if not np.allclose(response.omega, first.measured.omega):
+    response_sum = np.zeros_like(first.measured.response)
+    coherence_sum = np.zeros_like(first.measured.coherence)
+    averages = np.zeros_like(first.measured.averages)
+    repeats = []
+    # Only frequencies that are coherent in all logs are compared.
+    fit_mask = first.fit_mask
+    sources: list[str] = []
+    warnings: list[str] = []
+    for target in targets:
+        measured = target.measured
+        if not np.allclose(measured.omega, first.measured.omega):
             raise LogError(
-                f"{first.joint} was excited at {first.measured.amplitude:.3g} rad in several logs "
-                "whose responses have different frequencies; match them one at a time."
+                f"{first.joint} was excited at {measured.amplitude:.3g} rad in several logs whose "
+                "responses have different frequencies; match them one at a time."
             )
-    weights = [len(response.repeats) for response in responses]
-    coherence = [response.coherence for response in responses]
-    sources = dict.fromkeys(response.source for response in responses)
-    warnings = [warning for target in targets for warning in target.warnings]
-    measured = replace(
+        weight = len(measured.repeats)
+        response_sum = response_sum + weight * measured.response
+        coherence_sum = coherence_sum + weight * measured.coherence
+        averages = averages + measured.averages
+        repeats.append(measured.repeats)
+        fit_mask = fit_mask & target.fit_mask
+        if measured.source not in sources:
+            sources.append(measured.source)
+        for warning in target.warnings:
+            if warning not in warnings:
+                warnings.append(warning)
+    all_repeats = np.concatenate(repeats)
+    merged = replace(
         first.measured,
-        response=np.average([one.response for one in responses], axis=0, weights=weights),
-        coherence=np.average(coherence, axis=0, weights=weights),
-        averages=np.sum([one.averages for one in responses], axis=0),
-        repeats=np.concatenate([one.repeats for one in responses]),
+        response=response_sum / len(all_repeats),
+        coherence=coherence_sum / len(all_repeats),
+        averages=averages,
+        repeats=all_repeats,
         source=", ".join(sources),
     )
-    return replace(
-        first,
-        measured=measured,
-        # Only frequencies that are coherent in all logs are compared.
-        fit_mask=np.logical_and.reduce([target.fit_mask for target in targets]),
-        warnings=tuple(dict.fromkeys(warnings)),
-    )
+    return replace(first, measured=merged, fit_mask=fit_mask, warnings=tuple(warnings))
 
 
 def _compared_frequencies(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pronk.identify.match.gains import JointGains
+from pronk.identify.match.gains import Interval
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.result import MatchResult
 from pronk.identify.match.torque_fit import UNITS
@@ -14,22 +14,29 @@ from pronk.tables import Cell, Column, Table
 
 
 def gains_table(result: MatchResult) -> Table:
-    """Make the table of the matched gains, one joint a row; columns that are empty are left out."""
-    gains = [joint.gains for joint in result.joints.values()]
-    has_total = any(np.isfinite(one.stiffness.total95).all() for one in gains)
-    has_friction = any(np.isfinite(one.frictionloss.value) for one in gains)
-    has_stribeck = any(one.stribeck.value > 0.0 for one in gains)
-    has_delay = any(one.delay_s.value > 0.0 for one in gains)
-    has_grid = any(joint.grid is not None for joint in result.joints.values())
-    interval = "repeat 95 %" if has_total else "95 %"
-    columns = [Column(heading="joint"), Column(heading="stiffness", unit="N m/rad", digits=2)]
-    columns.append(Column(heading=interval, digits=2))
-    if has_total:
-        columns.append(Column(heading="total 95 %", digits=2))
-    columns.append(Column(heading="damping", unit="N m s/rad"))
-    columns.append(Column(heading=interval))
-    if has_total:
-        columns.append(Column(heading="total 95 %"))
+    """Make the table of the matched gains, one joint a row; columns without a value are left out.
+
+    Intervals by the repeats alone are followed by those with what the model does not explain.
+    """
+    has_total = False
+    has_friction = False
+    has_stribeck = False
+    has_delay = False
+    has_grid = False
+    for joint in result.joints.values():
+        gains = joint.gains
+        has_total = has_total or bool(np.isfinite(gains.stiffness.total95).all())
+        has_friction = has_friction or bool(np.isfinite(gains.frictionloss.value))
+        has_stribeck = has_stribeck or gains.stribeck.value > 0.0
+        has_delay = has_delay or gains.delay_s.value > 0.0
+        has_grid = has_grid or joint.grid is not None
+
+    columns = [Column(heading="joint")]
+    for name, unit, digits in (("stiffness", "N m/rad", 2), ("damping", "N m s/rad", 3)):
+        columns.append(Column(heading=name, unit=unit, digits=digits))
+        columns.append(Column(heading="repeat 95 %" if has_total else "95 %", digits=digits))
+        if has_total:
+            columns.append(Column(heading="total 95 %", digits=digits))
     if has_friction:
         columns.append(Column(heading="friction", unit="N m"))
     if has_stribeck:
@@ -41,27 +48,30 @@ def gains_table(result: MatchResult) -> Table:
     columns.append(Column(heading="nominal error", unit="dB", digits=2))
     columns.append(Column(heading="error", unit="dB", digits=2))
     columns.append(Column(heading="lowest coherence"))
+
     rows = []
     for name, joint in result.joints.items():
-        one = joint.gains
-        row: list[Cell] = [f"{name} (flagged)" if one.flags else name]
-        row.extend([one.stiffness.value, one.stiffness.repeat95])
-        if has_total:
-            row.append(one.stiffness.total95)
-        row.extend([one.damping.value, one.damping.repeat95])
-        if has_total:
-            row.append(one.damping.total95)
+        gains = joint.gains
+        quality = gains.quality
+        row: list[Cell] = [f"{name} (flagged)" if gains.flags else name]
+        for fitted in (gains.stiffness, gains.damping):
+            row.append(fitted.value)
+            row.append(_interval(fitted.repeat95))
+            if has_total:
+                row.append(_interval(fitted.total95))
         if has_friction:
-            row.append(one.frictionloss.value)
+            row.append(gains.frictionloss.value)
         if has_stribeck:
-            row.append(one.frictionloss.value * (1.0 - one.stribeck.value))
+            row.append(gains.frictionloss.value * (1.0 - gains.stribeck.value))
         if has_delay:
-            row.append(1000.0 * one.delay_s.value)
+            row.append(1000.0 * gains.delay_s.value)
         if has_grid:
             row.append(None if joint.grid is None else "{:.2f} / {:.3f}".format(*joint.grid.gains))
-        quality = one.quality
-        row.extend([quality.nominal_error_db, quality.error_db, quality.coherence_min])
+        row.append(quality.nominal_error_db)
+        row.append(quality.error_db)
+        row.append(quality.coherence_min)
         rows.append(tuple(row))
+
     simulator = result.simulator
     notes = [
         f"Equivalent gains of {simulator.engine} at a step of {1000.0 * simulator.timestep_s:g} ms "
@@ -75,6 +85,11 @@ def gains_table(result: MatchResult) -> Table:
     return Table(
         title="Matched gains", columns=tuple(columns), rows=tuple(rows), notes=tuple(notes)
     )
+
+
+def _interval(interval: Interval) -> Cell:
+    """Return the cell of an interval; that of a value that was held says so."""
+    return interval if np.isfinite(interval).all() else "held"
 
 
 def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> Table:
@@ -165,9 +180,21 @@ def simulators_table(
     rows: list[tuple[Cell, ...]] = []
     for simulator, result in results.items():
         for group, names in members.items():
-            gains = [result.joints[name].gains for name in names]
-            flagged = sum(1 for one in gains if one.flags)
-            rows.append((simulator, group, *group_means(gains), flagged))
+            values = []
+            flagged = 0
+            for name in names:
+                gains = result.joints[name].gains
+                values.append(
+                    (
+                        gains.stiffness.value,
+                        gains.damping.value,
+                        gains.frictionloss.value,
+                        gains.delay_s.value,
+                        gains.quality.error_db,
+                    )
+                )
+                flagged += bool(gains.flags)
+            rows.append((simulator, group, *np.mean(values, axis=0).tolist(), flagged))
     columns = (
         Column(heading="framework"),
         Column(heading="group"),
@@ -180,19 +207,3 @@ def simulators_table(
     )
     title = "The same joints in every framework, means of each group"
     return Table(title=title, columns=columns, rows=tuple(rows))
-
-
-def group_means(gains: Sequence[JointGains]) -> tuple[float, float, float, float, float]:
-    """Return the means of stiffness, damping, dry friction, delay and error of some joints."""
-    values = []
-    for one in gains:
-        row = (
-            one.stiffness.value,
-            one.damping.value,
-            one.frictionloss.value,
-            one.delay_s.value,
-            one.quality.error_db,
-        )
-        values.append(row)
-    stiffness, damping, friction, delay, error = np.mean(values, axis=0).tolist()
-    return stiffness, damping, friction, delay, error
