@@ -131,7 +131,7 @@ def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResul
     )
     return JointResult(
         joint=fit.joint,
-        gains=joint_gains(fit, compared, flags),
+        gains=joint_gains(fit, compared),
         fit=fit,
         responses=compared,
         grid=GridSearch(
@@ -167,7 +167,6 @@ def match(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 4) -
         groups=groups,
         logs={f"{name}.mcap": f"{number:064x}" for number, name in enumerate(joints)},
         virtual=virtual,
-        seconds={"estimate": 1.2, "grid": 31.0},
     )
 
 

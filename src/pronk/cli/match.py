@@ -192,7 +192,6 @@ def summary(result: MatchResult) -> dict[str, Any]:
         "flags": result.flags,
         "gains": figures["joints"],
         "groups": figures["groups"],
-        "seconds": figures["seconds"],
     }
 
 

@@ -128,7 +128,6 @@ def part(path: Path, gains: str | None = None) -> Part:
         "excitation": _excitation_table(fits),
         "amplitudes": _amplitude_table(fits),
         "logs": table("log | SHA-256", own.logs.items()),
-        "seconds": result.seconds,
     }
     return Part(
         kind="match",

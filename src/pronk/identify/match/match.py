@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -38,13 +35,10 @@ from pronk.identify.match.result import (
     joint_gains,
 )
 from pronk.identify.match.settings import MatchSettings
+from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
-from pronk.identify.simulators.load import joint_rigs
-from pronk.identify.simulators.mujoco import mujoco_info
-from pronk.identify.simulators.profiles import Profile, load_profiles, profile
 from pronk.identify.simulators.simulator import JointRigs, SimulatorInfo
-from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
 
 Method = Literal["time", "paper"]
@@ -112,120 +106,76 @@ def match(
         >>> result.gains.joints["FR_knee"].stiffness
     """
     settings = settings or MatchSettings()
-    framework = named_profile(simulator)
-    check_choices(method, mode, settings, framework)
-    parameters = fitted_parameters(mode, settings, framework)
-    all_logs = with_drive_gains(logs, robot, drive_gains)
-    excited_logs = [log for log in all_logs if log.excited_joints]
-    torque_fits: dict[str, DriveFit] = {}
-    if mode == "drive":
-        torque_fits = fit_torque_drives(all_logs, robot)
-        if torque_fits and not excited_logs:
-            return match_by_torque(robot, all_logs, torque_fits)
-    sources = logs_by_joint(excited_logs or all_logs, robot)
-    recording_flags: dict[str, tuple[str, ...]] = {}
-    for name, joint_logs in sources.items():
-        recordings = [one for log in joint_logs for one in log.excitations(name)]
-        recording_flags[name] = check_recordings(recordings, robot)
-    seconds: dict[str, float] = {}
-    joints: dict[str, JointResult] = {}
-
+    simulation = find_simulation(simulator, robot)
+    check_choices(method, mode, settings, simulation)
+    parameters = fitted_parameters(mode, settings, simulation)
+    logs = with_drive_gains(logs, robot, drive_gains)
+    torque_fits = fit_torque_drives(logs, robot) if mode == "drive" else {}
+    excited_logs = [log for log in logs if log.excited_joints]
+    if torque_fits and not excited_logs:
+        return match_by_torque(logs, simulation, torque_fits)
     if any(moves_together(log) for log in excited_logs):
-        require_mujoco(simulator, framework)
-        simulated_robot = robot if framework is None else framework.robot(robot)
-        with timed("fit", seconds, progress) as report:
-            chains = fit_chains(excited_logs, simulated_robot, parameters, settings, report)
-        for name, fit in with_torque(chains.fits, torque_fits, robot).items():
-            responses = chains.responses.get(name)
-            flags = (*fit.flags, *recording_flags.get(name, ()))
-            joints[name] = JointResult(
-                joint=name, gains=joint_gains(fit, responses, flags), fit=fit, responses=responses
-            )
-        info = simulator_info(mujoco_info(robot), framework, simulated_robot)
-        result = match_result(
-            robot, info, joints, all_logs, excluded=chains.excluded, seconds=seconds
-        )
-        require_stable_gains(result, framework, simulated_robot)
-        return result
+        return match_chains(logs, simulation, parameters, torque_fits, settings, progress)
 
-    with open_rigs(simulator, robot, framework, settings) as rigs:
-        measured: dict[str, list[MeasuredJoint]] = {}
-        with timed("estimate", seconds, progress) as report:
-            for name, joint_logs in sources.items():
-                measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
-                report(len(measured) / len(sources))
+    with simulation.open_rigs(settings.threads, settings.simulator_python) as rigs:
+        sources = logs_by_joint(excited_logs or logs, robot)
+        recording_flags = {}
+        measured = {}
+        nominal: dict[str, dict[str, float]] = {}
+        for name, joint_logs in sources.items():
+            recording_flags[name] = check_recordings(recordings_of(joint_logs, name), robot)
+            measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
+            nominal |= nominal_drives(joint_logs, [name], rigs.robot)
+            progress("estimate", len(measured) / len(sources))
 
-        searches: dict[str, GridSearch] = {}
+        grids: dict[str, GridSearch] = {}
         if method == "paper":
-            with timed("grid", seconds, progress) as report:
-                stiffness, damping = grid_axes(rigs.robot, settings.grid_points)
-                targets = [amplitudes[0] for amplitudes in measured.values()]
-                grids = search_grid(rigs, targets, stiffness, damping, progress=report)
-                searches = dict(zip(measured, grids, strict=True))
+            grids = search_grids(rigs, measured, settings.grid_points, progress)
 
-        fits = {}
-        with timed("fit", seconds, progress) as report:
-            for name, amplitudes in measured.items():
-                if method == "paper":
-                    fits[name] = fit_magnitude(rigs, amplitudes, searches[name])
-                else:
-                    fits[name] = fit_in_time(rigs, sources[name], name, parameters, mode)
-                report(len(fits) / len(measured))
-        fits = with_torque(fits, torque_fits, robot)
-
-        with timed("responses", seconds, progress) as report:
-            for name, fit in fits.items():
-                if name not in measured:
-                    gains = joint_gains(fit, None, fit.flags)
-                    joints[name] = JointResult(joint=name, gains=gains, fit=fit)
-                    continue
-                target = measured[name][0]
-                responses = compare(
-                    rigs.robot,
-                    measured[name],
-                    matched=simulated_response(rigs, target, compared_values(fit, method)),
-                    nominal=simulated_response(
-                        rigs, target, nominal_drives(sources[name], [name], rigs.robot)[name]
-                    ),
+        fits: dict[str, DriveFit] = {}
+        for name, responses in measured.items():
+            if method == "paper":
+                fits[name] = fit_magnitude(rigs, responses, grids[name])
+            else:
+                fits |= fit_drives(
+                    JointReplay(rigs, recordings_of(sources[name], name)),
+                    parameters=parameters,
+                    nominal={name: nominal[name]},
+                    unidentified="refuse" if mode == "drive" else "flag",
                 )
-                zero_armature = None
-                if method == "paper" and settings.zero_armature and "armature" in rigs.parameters:
-                    zero_armature = search_without_armature(
-                        rigs, target, responses.error_db, no_match_db(target)
-                    )
-                flags = (
-                    *fit.flags,
-                    *check_response(
-                        target.measured, responses.matched, target.fit_mask, no_match_db(target)
-                    ),
-                    *unused_flags(target, robot),
-                    *recording_flags[name],
+            progress("fit", len(fits) / len(measured))
+
+        joints: dict[str, JointResult] = {}
+        for name, fit in with_torque(fits, torque_fits, robot).items():
+            if name not in measured:
+                joints[name] = JointResult(joint=name, gains=joint_gains(fit), fit=fit)
+                continue
+            target = measured[name][0]
+            compared = compare(
+                rigs.robot,
+                measured[name],
+                matched=simulated_response(rigs, target, compared_values(fit, method)),
+                nominal=simulated_response(rigs, target, nominal[name]),
+            )
+            zero_armature = None
+            if method == "paper" and settings.zero_armature and "armature" in rigs.parameters:
+                zero_armature = search_without_armature(
+                    rigs, target, compared.error_db, no_match_db(target)
                 )
-                joints[name] = JointResult(
-                    joint=name,
-                    gains=joint_gains(fit, responses, flags),
-                    fit=fit,
-                    responses=responses,
-                    grid=searches.get(name),
-                    zero_armature=zero_armature,
-                )
-                report(len(joints) / len(fits))
-    info = simulator_info(rigs.info, framework, rigs.robot)
-    result = match_result(robot, info, joints, all_logs, seconds=seconds)
-    require_stable_gains(result, framework, rigs.robot)
-    return result
+            flags = (*response_flags(target, compared, robot), *recording_flags[name])
+            joints[name] = JointResult(
+                joint=name,
+                gains=joint_gains(fit, compared, flags),
+                fit=fit,
+                responses=compared,
+                grid=grids.get(name),
+                zero_armature=zero_armature,
+            )
+            progress("responses", len(joints) / len(fits))
+        return match_result(simulation, simulation.info(rigs), joints, logs)
 
 
-def named_profile(simulator: str) -> Profile | None:
-    """Return the profile that a simulator's name names, or None if it names none."""
-    if simulator.split(",")[0] in load_profiles():
-        return profile(simulator)
-    return None
-
-
-def check_choices(
-    method: str, mode: str, settings: MatchSettings, framework: Profile | None
-) -> None:
+def check_choices(method: str, mode: str, settings: MatchSettings, simulation: Simulation) -> None:
     """Refuse choices that are not known or do not go together.
 
     Raises:
@@ -242,199 +192,125 @@ def check_choices(
         )
     if settings.fitted and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
-    if framework is not None and mode == "drive":
+    if simulation.framework is not None and mode == "drive":
         raise PronkError(
-            f"profile {framework.name} in mode drive; a profile is matched in mode gains."
+            f"profile {simulation.name} in mode drive; a profile is matched in mode gains."
         )
 
 
 def fitted_parameters(
-    mode: Mode, settings: MatchSettings, framework: Profile | None
+    mode: Mode, settings: MatchSettings, simulation: Simulation
 ) -> tuple[str, ...]:
-    """Return the names of the parameters that a fit in time searches."""
+    """Return the names of the parameters that a fit in time searches.
+
+    Raises:
+        PronkError: A parameter that the settings name is not known.
+    """
     if settings.fitted:
         return checked_names(settings.fitted, FREE)
     if mode == "drive":
         return DRIVE_MODE
+    framework = simulation.framework
     if framework is not None and framework.friction != "N m":
         # The framework has no dry friction in newton metres that could be fitted.
         return tuple(name for name in GAINS_MODE if name != "frictionloss")
     return GAINS_MODE
 
 
-def require_mujoco(simulator: str, framework: Profile | None) -> None:
-    """Refuse another simulator than MuJoCo where several joints moved at once.
-
-    Raises:
-        PronkError: The simulator is neither MuJoCo nor a profile, which MuJoCo computes.
-    """
-    if framework is None and simulator != "mujoco":
-        raise PronkError(
-            f"simulator {simulator}: several joints of these logs move at once, which only "
-            "simulator mujoco matches; record one joint at a time."
-        )
+def recordings_of(logs: Sequence[JointLog], joint: str) -> list[Excitation]:
+    """Return every excitation of a joint in some logs."""
+    recordings: list[Excitation] = []
+    for log in logs:
+        recordings.extend(log.excitations(joint))
+    return recordings
 
 
-def open_rigs(
-    simulator: str, robot: RobotSpec, framework: Profile | None, settings: MatchSettings
-) -> JointRigs:
-    """Open the joints of a robot in a simulator, or as a framework simulates them."""
-    if framework is not None:
-        return joint_rigs("mujoco", framework.robot(robot), threads=settings.threads)
-    return joint_rigs(simulator, robot, threads=settings.threads, python=settings.simulator_python)
-
-
-def simulator_info(
-    info: SimulatorInfo, framework: Profile | None, robot: RobotSpec
-) -> SimulatorInfo:
-    """Describe the simulator that the gains hold for: that of the framework, if there is one."""
-    if framework is None:
-        return info
-    return replace(framework.info, decimation=robot.decimation)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MatchedDrive:
-    """Drive of one matched joint, for the stability limit of a framework."""
-
-    joints: tuple[str, ...]
-    """Name of the joint."""
-    stiffness: float
-    """[N m/rad]"""
-    damping: float
-    """[N m s/rad]"""
-    armature: float
-    """Rotor inertia at the joint [kg m^2]."""
-
-
-def require_stable_gains(result: MatchResult, framework: Profile | None, robot: RobotSpec) -> None:
-    """Refuse gains that are not stable at the step of a framework.
-
-    Raises:
-        PronkError: The message names a smaller step.
-    """
-    if framework is None:
-        return
-    drives = []
-    for name, joint in result.joints.items():
-        drives.append(
-            MatchedDrive(
-                joints=(name,),
-                stiffness=joint.gains.stiffness.value,
-                damping=joint.gains.damping.value,
-                armature=joint.gains.armature.value,
-            )
-        )
-    require_stable(framework, robot, drives)
-
-
-@contextmanager
-def timed(
-    stage: str, seconds: dict[str, float], progress: Progress
-) -> Iterator[Callable[[float], None]]:
-    """Time a stage and report its begin and its end; yield what reports the share that is done."""
-
-    def report(share: float) -> None:
-        progress(stage, share)
-
-    report(0.0)
-    begin = time.perf_counter()
-    yield report
-    seconds[stage] = time.perf_counter() - begin
-    report(1.0)
-
-
-def fit_in_time(
+def search_grids(
     rigs: JointRigs,
-    logs: Sequence[JointLog],
-    joint_name: str,
-    parameters: Sequence[str],
-    mode: Mode,
-) -> DriveFit:
-    """Fit the drive of one joint that moved alone.
+    measured: Mapping[str, Sequence[MeasuredJoint]],
+    points: int,
+    progress: Progress,
+) -> dict[str, GridSearch]:
+    """Search the paper's grid for the largest amplitude of every joint (F7).
 
     Args:
         rigs: Joints in the simulator.
-        logs: Logs that excite the joint.
-        joint_name: The joint.
-        parameters: Names of the parameters to fit.
-        mode: In mode `drive` a parameter that is not identified is an error, else it is flagged.
+        measured: Measured responses by joint, the largest amplitude first.
+        points: Points of each axis of the grid.
+        progress: Called with the stage and the share of it that is done.
 
-    Raises:
-        IdentifiabilityError: The logs do not identify a parameter, in mode `drive`.
+    Returns:
+        Error over the grid by joint.
     """
-    excitations: list[Excitation] = []
-    for log in logs:
-        excitations += log.excitations(joint_name)
-    fits = fit_drives(
-        JointReplay(rigs, excitations),
-        parameters=parameters,
-        nominal=nominal_drives(logs, [joint_name], rigs.robot),
-        unidentified="refuse" if mode == "drive" else "flag",
-    )
-    return fits[joint_name]
+
+    def report(share: float) -> None:
+        progress("grid", share)
+
+    stiffness, damping = grid_axes(rigs.robot, points)
+    targets = [amplitudes[0] for amplitudes in measured.values()]
+    searches = search_grid(rigs, targets, stiffness, damping, progress=report)
+    return dict(zip(measured, searches, strict=True))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChainFits:
-    """Drives of legs or arms whose joints moved together."""
-
-    fits: Mapping[str, DriveFit]
-    """Drive of each joint."""
-    responses: Mapping[str, ComparedResponses]
-    """Responses of each joint of which a recording gives one."""
-    excluded: Mapping[str, str]
-    """Reason why a joint that moved was not fitted, by joint."""
-
-
-def fit_chains(
+def match_chains(
     logs: Sequence[JointLog],
-    robot: RobotSpec,
+    simulation: Simulation,
     parameters: Sequence[str],
+    torque_fits: Mapping[str, DriveFit],
     settings: MatchSettings,
-    report: Callable[[float], None],
-) -> ChainFits:
-    """Fit the drives of every chain that moves in some logs, one chain after the other.
+    progress: Progress,
+) -> MatchResult:
+    """Match legs or arms whose joints moved together, one chain after the other.
 
-    With a fixed base chains (legs) do not move each other.
+    With a fixed base chains do not move each other. Parameters of a joint that the logs do not
+    identify are held at their nominal value.
 
     Args:
-        logs: Logs in which several joints move at once.
-        robot: The robot as it is simulated.
-        parameters: Names of the parameters to fit; those of a joint that the logs do not identify
-            are held at the nominal value.
+        logs: Logs of one robot, in some of which several joints move at once.
+        simulation: The robot in its simulator.
+        parameters: Names of the parameters to fit.
+        torque_fits: Drives by a torque channel.
         settings: Threads of the simulator.
-        report: Called with the share that is done.
+        progress: Called with the stage and the share of it that is done.
 
     Raises:
+        PronkError: The simulator moves one joint at a time only.
         IdentifiabilityError: The logs identify too few parameters of a joint.
     """
+    simulation.require_mujoco()
+    robot = simulation.robot
+    logs_in_motion = [log for log in logs if log.excited_joints]
+    recording_flags = {}
+    for name, joint_logs in logs_by_joint(logs_in_motion, robot).items():
+        recording_flags[name] = check_recordings(recordings_of(joint_logs, name), robot)
     fits: dict[str, DriveFit] = {}
     responses: dict[str, ComparedResponses] = {}
     excluded: dict[str, str] = {}
-    chains = branches(logs, robot)
-    for number, joints in enumerate(chains):
+    chains = branches(logs_in_motion, robot)
+    for number, joint_names in enumerate(chains):
 
-        def report_chain(share: float, number: int = number) -> None:
-            report((number + share) / len(chains))
+        def report(share: float, number: int = number) -> None:
+            progress("fit", (number + share) / len(chains))
 
-        with ChainSimulation(robot, logs, joints=joints, threads=settings.threads) as simulation:
-            replay = ChainReplay(simulation)
-            nominal = nominal_drives(simulation.logs, simulation.joints, robot)
+        with ChainSimulation(
+            robot, logs_in_motion, joints=joint_names, threads=settings.threads
+        ) as chain:
+            replay = ChainReplay(chain)
+            nominal = nominal_drives(chain.logs, chain.joints, robot)
             chain_fits = fit_drives(
                 replay,
                 parameters=parameters,
                 nominal=nominal,
                 unidentified="hold",
-                progress=report_chain,
+                progress=report,
             )
             matched = {name: fit.values for name, fit in chain_fits.items()}
-            matched_positions, nominal_positions = simulation.run([matched, nominal])
-            for column, name in enumerate(simulation.joints):
+            matched_positions, nominal_positions = chain.run([matched, nominal])
+            for column, name in enumerate(chain.joints):
                 compared = compare_recordings(
                     robot,
                     name,
-                    simulation.logs,
+                    chain.logs,
                     matched=[positions[:, column] for positions in matched_positions],
                     nominal=[positions[:, column] for positions in nominal_positions],
                     highest_hz=replay.trusted_hz[name],
@@ -442,8 +318,12 @@ def fit_chains(
                 if compared is not None:
                     responses[name] = compared
             fits.update(chain_fits)
-            excluded.update(simulation.excluded)
-    return ChainFits(fits=fits, responses=responses, excluded=excluded)
+            excluded.update(chain.excluded)
+    joints = {}
+    for name, fit in with_torque(fits, torque_fits, robot).items():
+        gains = joint_gains(fit, responses.get(name), recording_flags.get(name, ()))
+        joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
+    return match_result(simulation, simulation.info(), joints, logs, excluded)
 
 
 def compared_values(fit: DriveFit, method: Method) -> Mapping[str, float]:
@@ -461,9 +341,13 @@ def no_match_db(target: MeasuredJoint) -> float:
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * target.measurement_error_db())
 
 
-def unused_flags(target: MeasuredJoint, robot: RobotSpec) -> list[str]:
-    """Say which frequencies and amplitudes of a measured response were left out."""
-    flags = []
+def response_flags(
+    target: MeasuredJoint, compared: ComparedResponses, robot: RobotSpec
+) -> list[str]:
+    """Warn of a simulated response that is not the measured one, and of what was left out."""
+    flags = list(
+        check_response(target.measured, compared.matched, target.fit_mask, no_match_db(target))
+    )
     band_count = int(target.measured.band(*robot.joint(target.joint).band_hz).sum())
     incoherent_count = band_count - int(target.fit_mask.sum())
     if incoherent_count > 0:
@@ -473,7 +357,7 @@ def unused_flags(target: MeasuredJoint, robot: RobotSpec) -> list[str]:
 
 
 def match_by_torque(
-    robot: RobotSpec, logs: Sequence[JointLog], torque_fits: Mapping[str, DriveFit]
+    logs: Sequence[JointLog], simulation: Simulation, torque_fits: Mapping[str, DriveFit]
 ) -> MatchResult:
     """Return the result of logs that excite no joint by a commanded position.
 
@@ -481,9 +365,8 @@ def match_by_torque(
         IdentifiabilityError: The torques identify no drive.
     """
     joints = {}
-    for name, fit in with_torque({}, torque_fits, robot).items():
-        gains = joint_gains(fit, None, fit.flags)
-        joints[name] = JointResult(joint=name, gains=gains, fit=fit)
+    for name, fit in with_torque({}, torque_fits, simulation.robot).items():
+        joints[name] = JointResult(joint=name, gains=joint_gains(fit), fit=fit)
     if not joints:
         reasons: dict[str, None] = {}
         for fit in torque_fits.values():
@@ -492,27 +375,39 @@ def match_by_torque(
             f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
             f"by torque: {'; '.join(reasons) or 'record larger or faster motions'}."
         )
-    return match_result(robot, mujoco_info(robot), joints, logs)
+    return match_result(simulation, simulation.info(), joints, logs)
 
 
 def match_result(
-    robot: RobotSpec,
+    simulation: Simulation,
     simulator: SimulatorInfo,
     joints: Mapping[str, JointResult],
     logs: Sequence[JointLog],
-    *,
     excluded: Mapping[str, str] | None = None,
-    seconds: Mapping[str, float] | None = None,
 ) -> MatchResult:
-    """Put the results of all joints together, with the training ranges of their groups."""
+    """Put the results of all joints together, with the training ranges of their groups.
+
+    Args:
+        simulation: The robot in its simulator.
+        simulator: Description of the simulator that the gains hold for.
+        joints: Results by joint.
+        logs: Every log that went in.
+        excluded: Reasons by joint for joints that moved and were not matched.
+
+    Raises:
+        PronkError: The gains are not stable at the step of a framework.
+    """
     gains = {name: joint.gains for name, joint in joints.items()}
+    simulation.require_stable(gains)
+    hashes = {}
+    for log in logs:
+        hashes[Path(log.source or "log").name] = log.origin.sha256
     return MatchResult(
-        robot=robot.name,
+        robot=simulation.robot.name,
         simulator=simulator,
         joints=joints,
-        groups=group_gains(robot, gains),
-        logs={Path(log.source or "log").name: log.origin.sha256 for log in logs},
+        groups=group_gains(simulation.robot, gains),
+        logs=hashes,
         virtual=any(log.virtual for log in logs),
         excluded=excluded or {},
-        seconds=seconds or {},
     )

@@ -204,8 +204,6 @@ class MatchResult:
     """True if a log came from pronk's virtual robot."""
     excluded: Mapping[str, str] = field(default_factory=dict)
     """Reasons by joint for joints that moved and were not matched."""
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    """Wall time by stage [s]."""
 
     @property
     def gains(self) -> MatchedGains:
@@ -262,7 +260,7 @@ class MatchResult:
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the match as a dictionary of numbers, text and dictionaries.
 
-        The keys are `robot`, `virtual`, `simulator`, `joints`, `groups`, `excluded` and `seconds`;
+        The keys are `robot`, `virtual`, `simulator`, `joints`, `groups` and `excluded`;
         a joint has the fields of `JointGains`, its `held_out` errors and its `grid` optimum.
         """
         joints = {}
@@ -281,7 +279,6 @@ class MatchResult:
             "joints": joints,
             "groups": {name: asdict(group) for name, group in self.groups.items()},
             "excluded": dict(self.excluded),
-            "seconds": dict(self.seconds),
         }
 
     def plot(self, joint: str | None = None) -> Figure:
@@ -339,14 +336,14 @@ def load(path: Path) -> MatchResult:
 
 
 def joint_gains(
-    fit: DriveFit, responses: ComparedResponses | None, flags: tuple[str, ...]
+    fit: DriveFit, responses: ComparedResponses | None = None, flags: Sequence[str] = ()
 ) -> JointGains:
     """Return the part of a joint's result that training needs.
 
     Args:
         fit: The fit of the drive.
         responses: Compared responses, if there are any.
-        flags: Every sentence that warns of this joint, those of the fit among them.
+        flags: Sentences that warn of this joint beside those of the fit.
     """
     spread = amplitude_spread(fit.amplitude_gains)
     quality = MatchQuality(amplitude_spread=spread)
@@ -369,7 +366,7 @@ def joint_gains(
         covariance=(tuple(stiffness_row), tuple(damping_row)),
         quality=quality,
         torque=fit.torque,
-        flags=flags,
+        flags=(*fit.flags, *flags),
     )
 
 
