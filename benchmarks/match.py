@@ -228,7 +228,7 @@ def read_recordings(folder: Path, names: Sequence[str], robot: RobotSpec) -> lis
     return [read_log(folder / name, robot=robot) for name in names]
 
 
-def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> list[Row]:
+def on_recordings(folder: Path, report: Progress, chosen_methods: Collection[str]) -> list[Row]:
     """Rows of the SO-101: `FITTED` give the drives, `RECORDED` judge them.
 
     Raises:
@@ -244,7 +244,7 @@ def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> li
     ):
         nominal = {name: start_values(robot, name) for name in arm.joints}
         dry_start: DriveValues = {}
-        chosen = [name for name in ON_ARM if name == PRONK or name in wanted]
+        chosen = [name for name in ON_ARM if name == PRONK or name in chosen_methods]
         for number, method in enumerate(chosen, 1):
             begin = time.perf_counter()
             drives: DriveValues
@@ -362,15 +362,15 @@ def gain_bias(rows: Sequence[Mapping[str, Any]]) -> Array:
     return bias
 
 
-def coverage(rows: Sequence[Mapping[str, Any]], kind: str) -> dict[str, Any]:
+def coverage(rows: Sequence[Mapping[str, Any]], figure: str) -> dict[str, Any]:
     """How many intervals of one kind hold the gains without noise, and how wide they are."""
     covered = 0
     half_widths = []
     for row in rows:
         for gain in GAINS:
-            if gain not in row[kind]:
+            if gain not in row[figure]:
                 continue
-            low, high = row[kind][gain]
+            low, high = row[figure][gain]
             covered += low <= row["exact"][gain] <= high
             half_widths.append(50.0 * (high - low) / row["values"][gain])
     return {
@@ -380,16 +380,18 @@ def coverage(rows: Sequence[Mapping[str, Any]], kind: str) -> dict[str, Any]:
     }
 
 
-def error_ratios(rows: Rows, others: Rows, signals: Sequence[str], kind: str = "rmse") -> Array:
+def error_ratios(
+    rows: Rows, other_rows: Rows, signals: Sequence[str], figure: str = "rmse"
+) -> Array:
     """Errors over those of another method, shape (joints that both have, signals).
 
     NaN where a signal does not excite a joint.
     """
     ratios = []
     for key, row in rows.items():
-        other = others.get(key, {})
-        if kind in other:
-            ratios.append([row[kind].get(s, NAN) / other[kind].get(s, NAN) for s in signals])
+        other = other_rows.get(key, {})
+        if figure in other:
+            ratios.append([row[figure].get(s, NAN) / other[figure].get(s, NAN) for s in signals])
     return np.array(ratios).reshape(-1, len(signals))
 
 
@@ -479,14 +481,14 @@ def match(
     unknown = set(method) - set(names)
     if unknown:
         raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(names)}.")
-    wanted = {NOMINAL, PLAIN, *(method or names)}
+    chosen_methods = {NOMINAL, PLAIN, *(method or names)}
     rows: list[Row] = []
     with console.progress() as report:
         try:
             if arm:
-                rows = on_recordings(arm, report, wanted)
+                rows = on_recordings(arm, report, chosen_methods)
             else:
-                chosen = [name for name in names if name in wanted]
+                chosen = [name for name in names if name in chosen_methods]
                 for robot_rows in run(
                     robots, seed, report, joints=joints, names=chosen, folder=cache, jobs=jobs
                 ):

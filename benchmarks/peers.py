@@ -177,13 +177,18 @@ def fit_sysid(
     signal = f"{joint}_qpos"
     mapping = {signal: (sysid.SignalType.MjStateQPos, np.arange(1))}
     count = len(replay.position)
+    names = []
+    measurements = []
+    for repeat, position in enumerate(replay.position):
+        names.append(f"repeat {repeat}")
+        measurements.append(sysid.TimeSeries(replay.time, position[:, None], mapping))
     sequences = sysid.ModelSequences(
         joint,
         replay.spec,
-        [f"repeat {k}" for k in range(count)],
+        names,
         list(replay.initial),
         [sysid.TimeSeries(replay.time, replay.control)] * count,
-        [sysid.TimeSeries(replay.time, one[:, None], mapping) for one in replay.position],
+        measurements,
     )
     parameters = sysid.ParameterDict()
     parameters.add(sysid.Parameter("stiffness", start[0], *bounds[0]))

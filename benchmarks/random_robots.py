@@ -167,7 +167,7 @@ class Plans:
 def plans(leg: str, kinds: tuple[str, ...]) -> Plans:
     """Plan the motions of some joints of a leg."""
     robot = load_robot(ROBOT)
-    joints = [f"{leg}_{kind}" for kind in kinds]
+    joints = [f"{leg}_{joint_kind}" for joint_kind in kinds]
     sweep = make_plan(robot, joints, amplitudes=AMPLITUDES, repeats=REPEATS)
     held_out = []
     for name in joints:

@@ -92,14 +92,14 @@ def fit(
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
     log = recorded_with_known_drives(commands(65.0, 0.15, 8.0, 0.35))
     fits = fit(log, DRIVE_MODE)
-    for joint, known in KNOWN.items():
+    for joint, true_values in KNOWN.items():
         values = fits[joint].values
-        assert values["stiffness"] == known["stiffness"]
-        assert values["damping"] == pytest.approx(known["damping"], rel=0.03)
-        assert values["armature"] == pytest.approx(known["armature"], rel=0.08)
-        assert values["frictionloss"] == pytest.approx(known["frictionloss"], rel=0.05)
-        assert values["stribeck"] == pytest.approx(known["stribeck"], abs=0.08)
-        assert values["delay"] == pytest.approx(known["delay"], abs=1e-3)
+        assert values["stiffness"] == true_values["stiffness"]
+        assert values["damping"] == pytest.approx(true_values["damping"], rel=0.03)
+        assert values["armature"] == pytest.approx(true_values["armature"], rel=0.08)
+        assert values["frictionloss"] == pytest.approx(true_values["frictionloss"], rel=0.05)
+        assert values["stribeck"] == pytest.approx(true_values["stribeck"], abs=0.08)
+        assert values["delay"] == pytest.approx(true_values["delay"], abs=1e-3)
         assert fits[joint].rmse < 1e-3 < fits[joint].nominal_rmse
 
 

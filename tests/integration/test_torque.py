@@ -57,16 +57,16 @@ def simulated(seed: int) -> JointLog:
         torque[k] = drive
         data.qfrc_applied[:] = drive - np.array(DRY) * np.tanh(data.qvel / 0.05)
         mujoco.mj_step(model, data)
-    every = slice(0, None, 4)
+    stride = slice(0, None, 4)
     noise = NOISE_NM * random.standard_normal((steps // 4, 2))
     return JointLog(
         robot="ak80_double_pendulum",
         joints=JOINTS,
         time=np.linspace(0.0, 10.0, steps // 4, endpoint=False),
-        command=position[every],
-        position=position[every],
-        velocity=velocity[every],
-        torque=SCALE * torque[every] + noise,
+        command=position[stride],
+        position=position[stride],
+        velocity=velocity[stride],
+        torque=SCALE * torque[stride] + noise,
     )
 
 
@@ -215,7 +215,7 @@ def test_recordings_of_torque_are_fitted_from_the_command_line(tmp_path: Path) -
     words = ["match", *logs, "--robot", robot, "--unit", "rad", *column_options(), "--out", out]
     assert "--mode drive" in refused(*words)
     assert not out.exists()
-    shown = accepted(*words, "--mode", "drive")
+    printed = accepted(*words, "--mode", "drive")
     expected = compare()[0].joints
     gains = load_gains(out).joints
     armature = gains["elbow"].armature.value
@@ -227,7 +227,7 @@ def test_recordings_of_torque_are_fitted_from_the_command_line(tmp_path: Path) -
         low, high = gains[joint].torque["dry"].ci95
         assert low < friction < high
         assert "the robot's file" in " ".join(gains[joint].flags)
-    assert "armature" in shown
+    assert "armature" in printed
     assert (out.parent / "match.html").is_file()
     # One drive for both actuators, as their builder may state.
     robot.write_text(robot.read_text().replace("drive: elbow", "drive: shoulder"))
@@ -243,5 +243,5 @@ def test_fit_of_three_recordings_holds_on_the_others() -> None:
     assert armature.identified
     assert 0.0 < armature.ci95[0] < armature.ci95[1]
     for comparison in comparisons:
-        others = [name for name in comparison.errors if name != "fit"]
-        assert comparison.lower_than == others, comparison
+        published = [name for name in comparison.errors if name != "fit"]
+        assert comparison.lower_than == published, comparison

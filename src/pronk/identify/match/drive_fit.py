@@ -50,7 +50,7 @@ from pronk.identify.match.result import HELD_OUT, DriveFit, amplitude_flags, hel
 from pronk.identify.match.uncertainty import (
     Estimate,
     block_moves,
-    estimate,
+    estimate_parameters,
     jackknife,
     repeat_moves,
     total_intervals,
@@ -193,8 +193,8 @@ def _fit_from_nominal(
     delay = _restricted(fitted, ["delay"])
     vector = DriveVector(delay, _raised(nominal, delay))
     delayed = minimize_residuals(Residuals(replay, samples, vector))
-    others = _restricted(fitted, [name for name in PARAMETERS if name != "delay"])
-    start = _raised(delayed.drives(), others)
+    undelayed = _restricted(fitted, [name for name in PARAMETERS if name != "delay"])
+    start = _raised(delayed.drives(), undelayed)
     best = minimize_residuals(Residuals(replay, samples, DriveVector(fitted, start)))
     at_bound = any(best.at_bound(joint) for joint in fitted)
     if best.settled and not at_bound and best.cost < SETTLED_WELL**2 * delayed.cost:
@@ -254,7 +254,7 @@ def _estimates(optimum: Optimum) -> dict[str, Estimate]:
     estimates = {}
     for joint, values in optimum.drives().items():
         columns = optimum.vector.columns[joint]
-        estimates[joint] = estimate(
+        estimates[joint] = estimate_parameters(
             optimum.vector.fitted[joint],
             optimum.x[columns],
             covariance[np.ix_(columns, columns)],

@@ -93,9 +93,9 @@ def joint_recordings(
     recordings = []
     for excitation, trace, command in zip(excitations, traces, commands, strict=True):
         time = excitation.time
-        every = max(1, int(excitation.rate_hz * trace.timestep / SAMPLES_PER_STEP + 1e-6))
+        stride = max(1, int(excitation.rate_hz * trace.timestep / SAMPLES_PER_STEP + 1e-6))
         during = (time >= trace.time[0]) & (time <= trace.time[-1])
-        samples = np.flatnonzero(during)[::every]
+        samples = np.flatnonzero(during)[::stride]
         weight = np.full(len(samples), 1.0 / trace.amplitude)
         if excitation.frequency is not None:
             # Between excitations the joint is at rest, which holds nothing of its dynamics.

@@ -146,12 +146,12 @@ def motion(log: JointLog, joints: Sequence[str]) -> Motion:
     Raises:
         LogError: The log has no torque, or too few samples a second.
     """
-    where = log.source or "log"
+    source = log.source or "log"
     if log.torque is None:
-        raise LogError(f"{where}: no torque channel; the torque fit needs one.")
+        raise LogError(f"{source}: no torque channel; the torque fit needs one.")
     if log.rate_hz < 4.0 * MOTION_HZ:
         raise LogError(
-            f"{where}: {log.rate_hz:.0f} Hz; accelerations need {4.0 * MOTION_HZ:.0f} Hz or more."
+            f"{source}: {log.rate_hz:.0f} Hz; accelerations need {4.0 * MOTION_HZ:.0f} Hz or more."
         )
     time = np.arange(log.time[0], log.time[-1], 1.0 / log.rate_hz)
     position = np.empty((len(time), len(joints)))
@@ -325,9 +325,9 @@ def fit_torque(
     kept_rows = []
     for log in logs:
         moved = motion(log, model.joints)
-        every = max(1, round(log.rate_hz / RATE_HZ))
-        rate_hz = log.rate_hz / every
-        used = slice(0, int(min(most_s, 1e6) * log.rate_hz), every)
+        stride = max(1, round(log.rate_hz / RATE_HZ))
+        rate_hz = log.rate_hz / stride
+        used = slice(0, int(min(most_s, 1e6) * log.rate_hz), stride)
         columns = model.regressor(
             moved.position[used], moved.velocity[used], moved.acceleration[used]
         )
@@ -375,19 +375,19 @@ def _solve(
         target = np.concatenate([(torque * weight).ravel(), np.zeros(len(prior))])
         size = np.linalg.norm(rows, axis=0)
         size[size == 0.0] = 1.0
-        left, singular, right = np.linalg.svd(rows / size, full_matrices=False)
+        left_vectors, singular, right = np.linalg.svd(rows / size, full_matrices=False)
         rank = int((singular > RANK_RATIO * singular[0]).sum())
-        left = left[:, :rank]
+        left_vectors = left_vectors[:, :rank]
         singular = singular[:rank]
         right = right[:rank]
-        seen = (left.T @ target) / singular
+        seen = (left_vectors.T @ target) / singular
         x = right.T @ seen / size
         squares = np.sum((design @ x - torque) ** 2, axis=0)
         rms = np.sqrt(squares / np.maximum(counts, 1))
         weight = 1.0 / np.maximum(rms, 1e-9)
         next_prior = _prior(model, design, x)
     # Combinations that the recordings show, and what each row says of them.
-    reduced = left * singular
+    reduced = left_vectors * singular
     prior_count = len(prior)
     all_blocks = np.append(blocks, np.full(prior_count, -1))
     moves = block_moves(reduced, reduced @ seen - target, all_blocks)
@@ -407,8 +407,8 @@ def _solve(
             continue
         # Torque of the links that no other term has; known ones fill one column, the first ones.
         links = design[:, index, index]
-        others = np.delete(design[:, index], index, axis=1)
-        links = links - others @ np.linalg.lstsq(others, links, rcond=None)[0]
+        other_terms = np.delete(design[:, index], index, axis=1)
+        links = links - other_terms @ np.linalg.lstsq(other_terms, links, rcond=None)[0]
         links_torque = float(np.sqrt(np.sum(links**2) / counts[index]))
         joints[joint] = {}
         for term in ("scale", *DRIVE_TERMS):

@@ -138,7 +138,7 @@ class Estimate:
         return tuple(name for name, sd in self.sd.items() if not sd <= PARAMETERS[name].sd_max)
 
 
-def estimate(
+def estimate_parameters(
     fitted: Sequence[str],
     x: Array,
     covariance: Array,
