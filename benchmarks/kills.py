@@ -46,8 +46,12 @@ PROGRAMS: tuple[Program, ...] = ("sweep", "sweep-lcm", "match", "trial", "deploy
 ACTIONS = ("KILL", "TERM", "STOP CONT", "STOP KILL")
 MOVING = ("operator", "servo", "policy", "root")
 """Processes without which the joints must be damped."""
-STOPPED_S, ENDS_S, DAMPED_S = 0.5, 10.0, 0.5
-"""How long a process is stopped; longest until the others have ended, and until damping [s]."""
+STOPPED_S = 0.5
+"""Time for which a process is stopped [s]."""
+ENDS_S = 10.0
+"""Longest time until the other processes have ended [s]."""
+DAMPED_S = 0.5
+"""Longest time until damping [s]."""
 _JOINTS = ("FR_hip_pitch", "FR_knee", "FL_hip_pitch", "FL_knee")
 _EMPTY = 2**16
 """A log of at most so many bytes may hold no sample yet."""
@@ -129,16 +133,16 @@ def _stat(pid: int) -> tuple[int, str, str]:
     return 0, "", ""
 
 
-def _below(root: int, known: dict[int, _Process]) -> None:
-    """Add a process and all below it to `known`."""
+def _below(root: int, processes: dict[int, _Process]) -> None:
+    """Add a process and all below it to `processes`."""
     parents = {int(p.name): _stat(int(p.name)) for p in Path("/proc").iterdir() if p.name.isdigit()}
     for pid, (parent, _, born) in sorted(parents.items()):
-        if born and pid not in known and (pid == root or parent in known):
+        if born and pid not in processes and (pid == root or parent in processes):
             words = Path(f"/proc/{pid}/cmdline")
             with suppress(OSError):
                 tracker = "resource_tracker" in words.read_text()
                 kind = "root" if pid == root else "tracker" if tracker else "child"
-                known[pid] = _Process(pid, born, kind)
+                processes[pid] = _Process(pid, born, kind)
 
 
 @contextmanager
@@ -146,14 +150,17 @@ def _heard(port: int) -> Iterator[list[tuple[float, bool]]]:
     """Commands on the wire: when they came [s], and whether they damp."""
     import lcm
 
-    found: list[tuple[float, bool]] = []
-    going, wire = [True], lcm.LCM(url_of(port=port))
+    commands: list[tuple[float, bool]] = []
+    going = threading.Event()
+    going.set()
+    wire = lcm.LCM(url_of(port=port))
 
     def hear(_: str, data: bytes) -> None:
-        found.append((time.monotonic(), not decode_command(CHEETAH, data).stiffness.any()))
+        damps = not decode_command(CHEETAH, data).stiffness.any()
+        commands.append((time.monotonic(), damps))
 
     def listen() -> None:
-        while going:
+        while going.is_set():
             wire.handle_timeout(50)
 
     subscription = wire.subscribe(CHEETAH.command.channel, hear)
@@ -161,7 +168,7 @@ def _heard(port: int) -> Iterator[list[tuple[float, bool]]]:
     thread = threading.Thread(target=listen)
     thread.start()
     try:
-        yield found
+        yield commands
     finally:
         going.clear()
         thread.join()
@@ -169,7 +176,7 @@ def _heard(port: int) -> Iterator[list[tuple[float, bool]]]:
 
 def _torn(folder: Path) -> list[str]:
     """Files that cannot be read; a log of no sample yet may be short."""
-    found = []
+    errors = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name[0] != "."):
         try:
             if path.suffix == ".mcap":
@@ -188,15 +195,15 @@ def _torn(folder: Path) -> list[str]:
                 if end != f"/{path.suffix[1:]}>":
                     raise PronkError(f"{path} is cut")
         except PronkError as error:
-            found.append(str(error)[:300])
-    return found
+            errors.append(str(error)[:300])
+    return errors
 
 
-def _wait(process: subprocess.Popen[str], known: dict[int, _Process], seconds: float) -> bool:
+def _wait(process: subprocess.Popen[str], processes: dict[int, _Process], seconds: float) -> bool:
     """Wait until a process has ended, and note what it starts; whether it has."""
     until = time.monotonic() + seconds
     while process.poll() is None and time.monotonic() < until:
-        _below(process.pid, known)
+        _below(process.pid, processes)
         time.sleep(0.02)
     return process.poll() is not None
 
@@ -212,7 +219,8 @@ def _act(process: _Process, action: str) -> None:
 
 def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> dict[str, Any]:
     """One run; a row of figures and faults. A `length_s` of zero: nothing is killed."""
-    rng, faults = np.random.default_rng([seed, i]), list[str]()
+    rng = np.random.default_rng([seed, i])
+    faults: list[str] = []
     row: dict[str, Any] = {"program": program, "seed": seed, "i": i}
     row["action"] = ACTIONS[i // 5 % 4]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -226,11 +234,12 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
     elif not any(line.startswith("ready") for line in robot.stdout or ()):
         raise PronkError("the virtual robot did not start.")
     folder.mkdir()
-    known: dict[int, _Process] = {}
+    processes: dict[int, _Process] = {}
     with _heard(port) if wired else tempfile.TemporaryFile() as heard:
         process = _start(_words(program, folder, port))
         lines: list[str] = []
-        ready, text = threading.Event(), process.stdout
+        ready = threading.Event()
+        text = process.stdout
         assert text is not None
 
         def read() -> None:
@@ -244,41 +253,44 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
         begun = time.monotonic()
         if program == "deploy":
             ready.wait(120.0)
-            _below(process.pid, known)
+            _below(process.pid, processes)
             if not ready.is_set():
                 process.terminate()
         if length_s == 0.0:
-            _wait(process, known, 600.0)
+            _wait(process, processes, 600.0)
         else:
-            _wait(process, known, float(rng.uniform(0.05, 1.0)) * length_s)
-            _below(process.pid, known)
-            there = [one for one in known.values() if one.alive]
+            _wait(process, processes, float(rng.uniform(0.05, 1.0)) * length_s)
+            _below(process.pid, processes)
+            alive = [child for child in processes.values() if child.alive]
             if program == "deploy" and ready.is_set():
                 names = json.loads(next(line for line in lines if line.startswith("{")))
                 name = list(names)[i % 5]
                 target = _Process(names[name], _stat(names[name])[2], name)
-            elif there and program != "deploy":
-                target = there[int(rng.integers(len(there)))]
+            elif alive and program != "deploy":
+                target = alive[int(rng.integers(len(alive)))]
             else:
                 target = _Process(process.pid, "", "none: not walking, or ended before")
             at = time.monotonic()
             row |= {"target": target.kind, "at_s": at - begun}
             _act(target, row["action"])
             acted = time.monotonic()
-            if not _wait(process, known, 4.0 if wired else 30.0 + 4.0 * length_s):
+            if not _wait(process, processes, 4.0 if wired else 30.0 + 4.0 * length_s):
                 if wired:
                     process.terminate()
-                if not _wait(process, known, ENDS_S):
+                if not _wait(process, processes, ENDS_S):
                     faults.append("does not end")
         ended = time.monotonic()
-        while (left := [one for one in known.values() if one.alive]) and process.poll() is not None:
+        while process.poll() is not None:
+            orphans = [orphan.kind for orphan in processes.values() if orphan.alive]
+            if not orphans:
+                break
             if time.monotonic() - ended > ENDS_S:
-                faults.append(f"left: {', '.join(one.kind for one in left)}")
+                faults.append(f"left: {', '.join(orphans)}")
                 break
             time.sleep(0.05)
         row["ends_s"] = time.monotonic() - ended
-        for one in known.values():
-            _act(one, "KILL")
+        for orphan in processes.values():
+            _act(orphan, "KILL")
         process.wait()
         reader.join()
         time.sleep(0.2 if wired else 0.0)
@@ -353,15 +365,20 @@ def kills(
     by = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
     for row in rows:
         by[row["program"], row["target"]].append(row)
-    table = [
-        {"program": program, "process": target, "n": len(each)}
-        | {"faults": sum(bool(row["faults"]) for row in each)}
-        | {"damped_s": max((row.get("damped_s") or 0.0 for row in each), default=0.0)}
-        | {"ends_s": max(row["ends_s"] for row in each)}
-        | {"aside": sum(row["aside"] for row in each)}
-        | {"traceback": sum("printed" in row for row in each)}
-        for (program, target), each in sorted(by.items())
-    ]
+    table = []
+    for (program_name, target), of_target in sorted(by.items()):
+        table.append(
+            {
+                "program": program_name,
+                "process": target,
+                "n": len(of_target),
+                "faults": len([row for row in of_target if row["faults"]]),
+                "damped_s": max(row.get("damped_s") or 0.0 for row in of_target),
+                "ends_s": max(row["ends_s"] for row in of_target),
+                "aside": sum(row["aside"] for row in of_target),
+                "traceback": len([row for row in of_target if "printed" in row]),
+            }
+        )
     columns = {name: name for name in ("program", "process", "n", "faults", "aside", "traceback")}
     columns |= {"damped after at most [s];3": "damped_s", "all ended after at most [s];2": "ends_s"}
     console.show_rows(f"{len(rows)} kills, seed {seed}", columns, table)

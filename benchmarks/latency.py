@@ -36,6 +36,7 @@ from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
 from pronk.policy.script import STILL
 from pronk.robots.machine import State
+from pronk.tables import Cell, Column, Table
 
 RATE_HZ = 50.0
 PRIORITY = 50
@@ -45,9 +46,8 @@ LIMITS_MS = {"lateness": 1.0, "network": 0.2}
 WAYS = ("back to back", "at the tick", "after warm-up")
 START_S = 60.0
 """Longest time that a process may take to start."""
-QUANTILES = {"lateness": ("p50", "p99", "p99_9", "max"), "network": ("p50", "p99")}
-QUANTILES["decision"] = QUANTILES["network"]
-"""Columns of the table; `network` is ONNX Runtime alone, `decision` is observation, network and
+QUANTITIES = ("lateness", "network", "decision")
+"""What is measured; `network` is ONNX Runtime alone, `decision` is observation, network and
 targets."""
 
 Row = dict[str, Any]
@@ -66,10 +66,11 @@ class Case:
     real_time: bool
 
 
-CASES = tuple(
-    Case(name=f"{'two CPU hogs' if hogs else 'idle'}, {how}", hogs=hogs, real_time=real_time)
-    for hogs in (0, 2)
-    for real_time, how in ((False, "ordinary"), (True, "real time"))
+CASES = (
+    Case(name="idle, ordinary", hogs=0, real_time=False),
+    Case(name="idle, real time", hogs=0, real_time=True),
+    Case(name="two CPU hogs, ordinary", hogs=2, real_time=False),
+    Case(name="two CPU hogs, real time", hogs=2, real_time=True),
 )
 
 
@@ -92,14 +93,15 @@ def _measure(case: Case, policy: Path, seconds: float, progress: Progress) -> Ro
         hog.start()
     pool = ProcessPoolExecutor(1, mp_context=context)
     try:
-        found, begun = pool.submit(_loop, case, policy, seconds), time.monotonic()
-        while not wait([found], timeout=0.2).done:
+        begun = time.monotonic()
+        loop = pool.submit(_loop, case, policy, seconds)
+        while not wait([loop], timeout=0.2).done:
             passed = time.monotonic() - begun
             progress(case.name, passed / (seconds + 3.0))
             if passed > seconds + START_S:
                 raise TimeoutError
         progress(case.name, 1.0)
-        return found.result()
+        return loop.result()
     except (BrokenProcessPool, TimeoutError):
         raise PronkError(f"the loop of {case.name!r} did not finish; try again.") from None
     finally:
@@ -118,7 +120,9 @@ def _loop(case: Case, path: Path, seconds: float) -> Row:
     policy = load_policy(path)
     stand_in = policy.sibling()
     states = _states(standing(policy.contract))
-    counts = {way: {name: Histogram() for name in QUANTILES} for way in WAYS}
+    histograms: dict[str, dict[str, Histogram]] = {}
+    for way in WAYS:
+        histograms[way] = {name: Histogram() for name in QUANTITIES}
 
     def warm_up() -> None:
         stand_in.reset()
@@ -128,8 +132,8 @@ def _loop(case: Case, path: Path, seconds: float) -> Row:
         state = states[number % len(states)]
         begun = time.monotonic()
         policy.step(measurement(state), STILL)
-        counts[way]["decision"].add(time.monotonic() - begun)
-        counts[way]["network"].add(policy.network_s)
+        histograms[way]["decision"].add(time.monotonic() - begun)
+        histograms[way]["network"].add(policy.network_s)
 
     real_time = Wanted(priority=PRIORITY, core=0, lock=True)
     granted = enter(real_time if case.real_time else Wanted(lock=False))
@@ -145,13 +149,12 @@ def _loop(case: Case, path: Path, seconds: float) -> Row:
             warm_up_until(pace.deadline, warm_up)
         else:
             sleep_until(pace.deadline)
-        counts[way]["lateness"].add(time.monotonic() - pace.deadline)
+        histograms[way]["lateness"].add(time.monotonic() - pace.deadline)
         decide(pace.tick, way)
         pace.advance(time.monotonic())
-    ways = {
-        way: {name: histogram.figures() for name, histogram in counted.items()}
-        for way, counted in counts.items()
-    }
+    ways: dict[str, dict[str, Any]] = {}
+    for way, of_way in histograms.items():
+        ways[way] = {name: histogram.figures() for name, histogram in of_way.items()}
     return {"case": case.name, "granted": granted, "ways": ways, "missed": pace.missed}
 
 
@@ -159,31 +162,35 @@ def _states(still: State) -> list[State]:
     """States of a standing robot that moves a little."""
     rng = np.random.default_rng(0)
     size = len(still.position)
-    return [
-        replace(
+    states = []
+    for _ in range(16):
+        state = replace(
             still,
             position=still.position + 0.05 * rng.standard_normal(size),
             velocity=rng.standard_normal(size),
             gyro=0.1 * rng.standard_normal(3),
         )
-        for _ in range(16)
-    ]
+        states.append(state)
+    return states
 
 
 def checks(rows: dict[str, Row]) -> list[Check]:
-    """The limits for the loop as `pronk deploy` runs it, on an idle computer."""
-    return [
-        Check(
-            name=f"{case.name}: {name}, 99 %",
-            value=rows[case.name]["ways"][WAYS[-1]][name]["p99_ms"],
-            sense="<=",
-            limit=limit,
-            unit="ms",
-        )
-        for case in CASES
-        if not case.hogs
-        for name, limit in LIMITS_MS.items()
-    ]
+    """Return the limits for the loop as `pronk deploy` runs it, on an idle computer."""
+    limit_checks = []
+    for case in CASES:
+        if case.hogs:
+            continue
+        figures = rows[case.name]["ways"][WAYS[-1]]
+        for name, limit in LIMITS_MS.items():
+            check = Check(
+                name=f"{case.name}: {name}, 99 %",
+                value=figures[name]["p99_ms"],
+                sense="<=",
+                limit=limit,
+                unit="ms",
+            )
+            limit_checks.append(check)
+    return limit_checks
 
 
 def latency(
@@ -198,26 +205,57 @@ def latency(
     """
     with console.progress() as report:
         rows = run(policy, seconds, report)
-    cells = []
+    limit_checks = checks(rows)
+    figures = {"cases": rows, "limits": [check.row() for check in limit_checks]}
+    return finish(figures, _measured_table(rows), _limit_table(limit_checks))
+
+
+def _measured_table(rows: dict[str, Row]) -> Table:
+    """Return the quantiles of every case and way."""
+    table_rows: list[tuple[Cell, ...]] = []
     for name, row in rows.items():
-        cells.append((name, *[""] * 9, str(row["missed"])))
         for way, figures in row["ways"].items():
-            numbers = [
-                f"{figures[what][f'{key}_ms']:.3f}" if figures[what]["n"] else ""
-                for what, keys in QUANTILES.items()
-                for key in keys
-            ]
-            cells.append((f"  {way}", str(figures["network"]["n"]), *numbers, ""))
-    columns = ["case", "n", "late: median", "99 %", "99.9 %", "largest", "network: median", "99 %"]
-    columns += ["decision: median", "99 %", "missed"]
-    measured = console.table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells)
-    found = checks(rows)
-    limits = [
-        (c.name, f"{c.value:.3f}", f"{c.sense} {c.limit:g}", "yes" if c.passed else "NO")
-        for c in found
-    ]
-    columns = ["what", "measured [ms]", "limit [ms]", "passed"]
-    figures = {"cases": rows, "limits": [check.row() for check in found]}
-    return finish(figures, measured, console.table("Limits, after warm-up", columns, limits))
-    for line in dict.fromkeys(line for row in rows.values() for line in row["granted"]):
-        console.say(line)
+            late = figures["lateness"]
+            network = figures["network"]
+            decision = figures["decision"]
+            cells: list[Cell] = [f"{name}: {way}", network["n"]]
+            for key in ("p50_ms", "p99_ms", "p99_9_ms", "max_ms"):
+                cells.append(late[key] if late["n"] else None)
+            cells += [network["p50_ms"], network["p99_ms"]]
+            cells += [decision["p50_ms"], decision["p99_ms"], row["missed"]]
+            table_rows.append(tuple(cells))
+    return Table(
+        title=f"A {RATE_HZ:g} Hz loop on this computer [ms]",
+        columns=(
+            Column(heading="case"),
+            Column(heading="n"),
+            Column(heading="late: median"),
+            Column(heading="99 %"),
+            Column(heading="99.9 %"),
+            Column(heading="largest"),
+            Column(heading="network: median"),
+            Column(heading="99 %"),
+            Column(heading="decision: median"),
+            Column(heading="99 %"),
+            Column(heading="missed"),
+        ),
+        rows=tuple(table_rows),
+    )
+
+
+def _limit_table(limit_checks: list[Check]) -> Table:
+    """Return the figures with a limit."""
+    rows = []
+    for check in limit_checks:
+        passed = "yes" if check.passed else "NO"
+        rows.append((check.name, check.value, f"{check.sense} {check.limit:g}", passed))
+    return Table(
+        title="Limits, after warm-up",
+        columns=(
+            Column(heading="figure"),
+            Column(heading="measured", unit="ms"),
+            Column(heading="limit", unit="ms"),
+            Column(heading="passed"),
+        ),
+        rows=tuple(rows),
+    )

@@ -120,16 +120,17 @@ QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
 
 def draw_params(number: int) -> SimParams:
     """Draw a parameter set; number 0 is the shipped one."""
-    base, rng = load_sim_params(), np.random.default_rng([29, number])
+    base = load_sim_params()
+    rng = np.random.default_rng([29, number])
     if number == 0:
         return base
     shipped = base.machine
 
-    def times(value: float, least: float, most: float) -> float:
-        return value * float(rng.uniform(least, most))
+    def times(value: float, lowest: float, highest: float) -> float:
+        return value * float(rng.uniform(lowest, highest))
 
-    def vector(most: float) -> tuple[float, float, float]:
-        x, y, z = rng.uniform(-most, most, 3).tolist()
+    def vector(largest: float) -> tuple[float, float, float]:
+        x, y, z = rng.uniform(-largest, largest, 3).tolist()
         return x, y, z
 
     machine = replace(
@@ -163,7 +164,8 @@ def draw_params(number: int) -> SimParams:
 
 def in_steps(state: State) -> State:
     """A state as the Mini Cheetah's drives send it: 16 bits of 25 rad, 12 of 130 rad/s."""
-    position, velocity = 25.0 / 65535.0, 130.0 / 4095.0
+    position = 25.0 / 65535.0
+    velocity = 130.0 / 4095.0
     return replace(
         state,
         position=position * np.rint(state.position / position),
@@ -208,22 +210,29 @@ class Flight:
             robot, self.params, seed=self.seed, base="ground", capture_rate_hz=None, start=start
         )
         machine.connect()
-        safety, modes = SafetyFilter(limits=Limits.of(robot)), StateMachine(robot, RunTiming())
+        safety = SafetyFilter(limits=Limits.of(robot))
+        modes = StateMachine(robot, RunTiming())
         modes.enter(Mode.DAMP, 0.0)
         modes.request(OperatorRequest.STAND)
-        command, jump, change = STILL, False, math.inf
-        jump_at, entry = math.inf, -1
+        command = STILL
+        jump = False
+        change = math.inf
+        jump_at = math.inf
+        entry = -1
         under_way: list[tuple[int, Any]] = []
         waiting: list[State] = []
-        action, newest, sound = None, machine.latest(), machine.latest()
+        action = None
+        newest = machine.latest()
+        sound = machine.latest()
         for tick in range(1, round(seconds * SERVO_HZ) + 1):
             t = tick / SERVO_HZ
-            measured = [each for each in machine.wait(t) if rng.random() >= self.loss]
-            measured = [in_steps(each) for each in measured] if self.coarse else measured
+            measured = [state for state in machine.wait(t) if rng.random() >= self.loss]
+            if self.coarse:
+                measured = [in_steps(state) for state in measured]
             if t < self.fault_at:
                 sound = measured[-1] if measured else sound
             elif self.fault:
-                measured = [spoiled(self.fault, sound, each) for each in measured]
+                measured = [spoiled(self.fault, sound, state) for state in measured]
             waiting += measured
             keep = self.delay_ticks if t >= self.fault_at else 0
             states = waiting[: max(0, len(waiting) - keep)]
@@ -240,13 +249,15 @@ class Flight:
                 decision = safety.damped()
                 machine.damp()
                 if safety.faulted:
-                    self.damped, self.damped_at = decision, t
+                    self.damped = decision
+                    self.damped_at = t
                     return
             else:
                 sent, decision = safety.judge(states or [newest], desired.command, t)
                 self.seconds += 1.0 / SERVO_HZ
                 if sent is None:
-                    self.damped, self.damped_at = decision, t
+                    self.damped = decision
+                    self.damped_at = t
                     return
                 machine.send(sent)
                 for name, (_, quantity) in QUANTITIES.items():
@@ -254,11 +265,13 @@ class Flight:
                     value = quantity(safety)
                     self.largest[name] = more(self.largest.get(name, value), value)
             if t >= change and self.steady is not None:
-                command, change = self.steady, math.inf
+                command = self.steady
+                change = math.inf
             elif t >= change:
                 share = rng.uniform(-1.0, 1.0, 3) * (rng.random(3) < (0.9, 0.3, 0.3))
                 x, y, z = (share * FASTEST).tolist()
-                command, change = (x, y, z), t + float(rng.uniform(1.0, 3.0))
+                command = (x, y, z)
+                change = t + float(rng.uniform(1.0, 3.0))
                 jump_at = t + 0.5 if rng.random() < 0.5 else math.inf
                 self.jumps += jump_at < math.inf
             jump = jump_at <= t < jump_at + 0.5
@@ -267,8 +280,8 @@ class Flight:
                     policy.reset()
                     entry = modes.entry
                 live = modes.mode is Mode.POLICY
-                given = (command, jump) if live else (STILL, False)
-                target = policy.step(measurement(newest), *given)
+                velocity = command if live else STILL
+                target = policy.step(measurement(newest), velocity, live and jump)
                 record = np.zeros((), ACTIONS)
                 record["sequence"] = tick
                 record["state_sequence"] = newest.sequence
@@ -312,7 +325,8 @@ def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
 def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
     """Time from a fault to damping [s] and the reason; NaN where it is not found in 4 s."""
     fault, k = job
-    begins, number = (0.0 if fault in SWAPPED else 7.0 + 0.137 * k), k
+    begins = 0.0 if fault in SWAPPED else 7.0 + 0.137 * k
+    number = k
     while True:
         number += 1
         flight = Flight(
@@ -346,8 +360,8 @@ def fly(
         flown += row["seconds"]
         if flown >= 3600.0 * hours:
             break
-    known = {(row["fault"], row["run"]) for row in rows if "fault" in row}
-    faults = ((name, k) for k in range(runs) for name in FAULTS if (name, k) not in known)
+    done = {(row["fault"], row["run"]) for row in rows if "fault" in row}
+    faults = ((name, k) for k in range(runs) for name in FAULTS if (name, k) not in done)
     yield from rows_of((partial(struck, policy, seed, job) for job in faults), jobs, out)
 
 
@@ -376,9 +390,11 @@ def supervision(
     with console.progress() as report:
         for row in fly(policy, hours, sets, runs, seed, jobs, out):
             rows.append(row)
-            done = len(rows) if "run" in row else sum(r.get("seconds", 0.0) for r in rows) / 3600.0
-            whole = len(FAULTS) * runs if "run" in row else hours
-            report("faults" if "run" in row else "walking and jumping", min(done / whole, 1.0))
+            if "run" in row:
+                report("faults", min(len(rows) / (len(FAULTS) * runs), 1.0))
+            else:
+                flown_s = sum(flight.get("seconds", 0.0) for flight in rows)
+                report("walking and jumping", min(flown_s / (3600.0 * hours), 1.0))
     flights = [row for row in rows if "flight" in row]
     largest = []
     for name, (limit, _) in QUANTITIES.items():
@@ -397,16 +413,18 @@ def supervision(
     caption = ", ".join(f"{name} {number}" for name, number in ends.items())
     cells = []
     for name in FAULTS:
-        mine = [row for row in rows if row.get("fault") == name]
-        times = 1e3 * np.array([row["time_s"] for row in mine])
+        of_fault = [row for row in rows if row.get("fault") == name]
+        times = 1e3 * np.array([row["time_s"] for row in of_fault])
         missed = int(np.isnan(times).sum())
-        if missed == len(mine):
-            median, worst = "", "not found"
+        if missed == len(of_fault):
+            median = ""
+            worst = "not found"
         else:
-            median, worst = f"{np.nanmedian(times):.0f}", f"{np.nanmax(times):.0f}"
-        reasons = Counter(row["reason"] for row in mine)
+            median = f"{np.nanmedian(times):.0f}"
+            worst = f"{np.nanmax(times):.0f}"
+        reasons = Counter(row["reason"] for row in of_fault)
         texts = ", ".join(f"{reason} {number}" for reason, number in reasons.items())
-        cells.append((name, median, worst, f"{len(mine) - missed}/{len(mine)}", texts))
+        cells.append((name, median, worst, f"{len(of_fault) - missed}/{len(of_fault)}", texts))
     return finish(
         {"rows": rows},
         console.table(title, ["quantity", "largest", "limit"], largest, caption),

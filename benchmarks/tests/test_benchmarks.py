@@ -73,7 +73,7 @@ def test_the_page_of_faults_names_what_is_late_or_not_found() -> None:
     common = {"robot": "go2", "link": "dds", "run": 0, "reason": "ENCODER"}
     times = {"gyro-zero": (0.04, 0.05), "encoder-zero": (0.04, 0.3), "encoder-jumps": (math.nan,)}
     rows = [{**common, "fault": k, "time_s": t} for k, each in times.items() for t in each]
-    text = sensor_faults.page(rows, "command")
+    text = sensor_faults.faults_page(rows, "command")
     assert "`gyro-zero` | 45 (50), n = 2 |" in text
     late = text.split("## Longer")[1]
     assert "`encoder-zero` (go2, dds): 1 of 2 later, 0 not found" in late
