@@ -191,8 +191,8 @@ def wrong_inputs(
     """
     begin = time.perf_counter()
     with console.progress() as report:
-        found = run(cases, seed, cache, report, jobs=jobs)
+        judged = run(cases, seed, cache, report, jobs=jobs)
     columns = ("corruption", "log", *OUTCOMES, "wrong number, silent")
     caption = f"{cases} cases a row, seed {seed}; {time.perf_counter() - begin:.0f} s"
-    figures = {"schema": "pronk/bench-wrong-inputs/2", "cases": found}
-    return finish(figures, console.table("Wrong inputs", columns, table_rows(found), caption))
+    figures = {"schema": "pronk/bench-wrong-inputs/2", "cases": judged}
+    return finish(figures, console.table("Wrong inputs", columns, table_rows(judged), caption))

@@ -53,14 +53,17 @@ def model_of(kind: str, folder: Path) -> Path:
     ("kind", "joint"), [("pendulum", "swing"), ("arm", "elbow"), ("cheetah", "FR_knee")]
 )
 def test_sweep_match_predict_export(kind: str, joint: str, tmp_path: Path) -> None:
-    robot, gains, logs = tmp_path / "robot.yaml", tmp_path / "gains.yaml", tmp_path / "logs"
-    once, of = ("--amplitude", "0.15", "--repeats", "1", "--joints", joint), ("--robot", robot)
+    robot = tmp_path / "robot.yaml"
+    gains = tmp_path / "gains.yaml"
+    logs = tmp_path / "logs"
+    matched = tmp_path / "matched.xml"
+    sweep = ("--amplitude", "0.15", "--repeats", "1", "--joints", joint)
     accepted("robot", "new", model_of(kind, tmp_path))
     accepted("robot", "check", robot)
-    accepted("sweep", robot, "--out", logs, *once)
-    accepted("match", logs, *of, "--out", gains, "--method", "paper")
-    accepted("predict", logs, *of, "--gains", gains)
-    accepted("export", gains, *of, "--to", "mjcf", "--out", tmp_path / "matched.xml")
+    accepted("sweep", robot, "--out", logs, *sweep)
+    accepted("match", logs, "--robot", robot, "--out", gains, "--method", "paper")
+    accepted("predict", logs, "--robot", robot, "--gains", gains)
+    accepted("export", gains, "--robot", robot, "--to", "mjcf", "--out", matched)
     # The virtual robot gives a tenth more torque than its drive computes.
     stiffness = load_gains(gains).joints[joint].stiffness.value
     share = stiffness / load_robot(robot).joint(joint).stiffness
@@ -70,7 +73,9 @@ def test_sweep_match_predict_export(kind: str, joint: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("kind", ["pendulum", "arm", "cheetah"])
 def test_bare_model_is_a_robot(kind: str, tmp_path: Path) -> None:
     bare = load_robot(model_of(kind, tmp_path))
-    assert all(one.name in one.chain and one.stiffness > 0.0 for one in bare.joints)
+    for joint in bare.joints:
+        assert joint.name in joint.chain
+        assert joint.stiffness > 0.0
     if kind == "cheetah":
         assert bare.joint_names == load_robot("mini_cheetah").joint_names
 

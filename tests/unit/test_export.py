@@ -99,8 +99,11 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
     text = export(gains, target)
     assert {*driven_joints(entity_model(ROBOT, text))} == {*ROBOT.joint_names}
     space = evaluated(text)
-    rows = zip(space["ACTUATORS"], space["EVENTS"].values(), gains.groups.items(), strict=True)
-    for i, (cfg, event, (name, group)) in enumerate(rows):
+    assert list(space["EVENTS"]) == [f"{name}_gains" for name in gains.groups]
+    assert len(space["ACTUATORS"]) == len(gains.groups)
+    for index, (name, group) in enumerate(gains.groups.items()):
+        cfg = space["ACTUATORS"][index]
+        event = space["EVENTS"][f"{name}_gains"]
         drive = ROBOT.group(name)[0].drive
         assert type(cfg).__name__ == TARGETS[target].config_class
         assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
@@ -112,7 +115,7 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
             assert cfg.saturation_effort == pytest.approx(drive.stall_torque)
             assert cfg.velocity_limit == pytest.approx(drive.no_load_speed)
         assert (cfg.delay_min_lag, cfg.delay_max_lag) == (2, 2)
-        assert event.params["asset_cfg"].actuator_ids == [i]
+        assert event.params["asset_cfg"].actuator_ids == [index]
         assert event.params["operation"] == "abs"
         ends = group.stiffness - group.stiffness_range, group.stiffness + group.stiffness_range
         assert event.params["kp_range"] == pytest.approx(ends)
@@ -122,8 +125,10 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
 def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
     gains = for_target(target, frictionloss=0.15, delay_s=0.011)
     text = export(gains, target)
-    nodes = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
-    calls = [node for node in nodes if isinstance(node.func, ast.Name)]
+    calls = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            calls.append(node)
     assert len(calls) == len(gains.groups)
     for call, group in zip(calls, gains.groups.values(), strict=True):
         values = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
@@ -133,8 +138,10 @@ def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
         assert values["friction"] == 0.15
         assert values.get("dynamic_friction", 0.15) == 0.15
         assert values.get("max_delay", 2) == 2
-        newton = target == "isaaclab-newton"  # without viscous friction of its own
-        assert values["damping"] == pytest.approx(group.damping + 0.01 * newton)
+        damping = group.damping
+        if target == "isaaclab-newton":  # without viscous friction of its own
+            damping += 0.01
+        assert values["damping"] == pytest.approx(damping)
     assert ("2.2 steps" in text.replace("\n# ", " ")) == (not target.startswith("isaaclab-delayed"))
 
 
@@ -174,14 +181,17 @@ def test_playground_text_gives_a_model_the_explicit_law() -> None:
     space = evaluated(export(gains, "playground", per="joint"))
     space["JOINTS"] = {"FR_knee": space["JOINTS"]["FR_knee"] | {"frictionloss": 0.0}}
     space["apply"](model)
-    own, drive = gains.joints["FR_knee"], ROBOT.joint("FR_knee").drive
-    data, speed, angle = mujoco.MjData(model), 0.0, 0.0
+    knee = gains.joints["FR_knee"]
+    drive = ROBOT.joint("FR_knee").drive
+    data = mujoco.MjData(model)
+    speed = 0.0
+    angle = 0.0
     inertia = 1e-3 + 0.2 * 0.1**2 + drive.armature
     data.ctrl[:] = 0.3
     for _ in range(100):
         torque = (
-            np.clip(own.stiffness.value * (0.3 - angle), -26.435, 26.435)
-            - (own.damping.value + drive.viscous_damping) * speed
+            np.clip(knee.stiffness.value * (0.3 - angle), -26.435, 26.435)
+            - (knee.damping.value + drive.viscous_damping) * speed
         )
         speed += 0.004 * (torque - 0.2 * 9.81 * 0.1 * np.sin(angle)) / inertia
         angle += 0.004 * speed
@@ -208,9 +218,10 @@ def test_newton_text_is_a_usd_layer_in_radians_and_degrees(tmp_path: Any) -> Non
 def smooth_arm() -> RobotSpec:
     """The SO-101 with dry friction that does not fall with speed."""
     arm = load_robot("so101")
-    drives = [replace(joint.drive, stribeck_speed=0.0) for joint in arm.joints]
-    joints = tuple(replace(a, drive=b) for a, b in zip(arm.joints, drives, strict=True))
-    return replace(arm, joints=joints)
+    joints = []
+    for joint in arm.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, stribeck_speed=0.0)))
+    return replace(arm, joints=tuple(joints))
 
 
 def motion(
@@ -256,36 +267,42 @@ def assert_moves(
 
 @pytest.mark.parametrize("name", list(load_profiles()))
 def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
-    holds, arm = profile(name), smooth_arm()
+    framework = profile(name)
+    arm = smooth_arm()
     # A history of parts of a step is interpolated between the parts.
-    delay = 2.0 * holds.timestep_s if holds.iterations > 1 else 0.0123
+    delay = 2.0 * framework.timestep_s if framework.iterations > 1 else 0.0123
     gains = matched("so101", name, delay_s=delay)
     model = mujoco.MjModel.from_xml_string(export(gains, "mjcf", arm, per="joint"))
     snippet = export(gains, "mjcf-snippet", arm, per="joint")
     assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
-    known = holds.robot(arm)
-    assert_moves(model, *motion(known, drives_of(known, gains)), steps=holds.iterations)
+    simulated_arm = framework.robot(arm)
+    command, expected = motion(simulated_arm, drives_of(simulated_arm, gains))
+    assert_moves(model, command, expected, steps=framework.iterations)
 
 
 @pytest.mark.train
 def test_joints_of_mjlab_move_as_its_profile_does() -> None:
-    arm, name = smooth_arm(), "mjlab-builtin"
-    gains, known = matched("so101", name), profile(name).robot(arm)
-    model = entity_model(arm, export(gains, name, arm, per="joint"))
+    arm = smooth_arm()
+    gains = matched("so101", "mjlab-builtin")
+    simulated_arm = profile("mjlab-builtin").robot(arm)
+    model = entity_model(arm, export(gains, "mjlab-builtin", arm, per="joint"))
     # As mjlab's SimulationCfg sets them.
-    model.opt.timestep = known.timestep_s
+    model.opt.timestep = simulated_arm.timestep_s
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     columns = [arm.joint_names.index(joint) for joint in driven_joints(model)]
-    assert_moves(model, *motion(known, drives_of(known, gains)), columns=columns)
+    command, expected = motion(simulated_arm, drives_of(simulated_arm, gains))
+    assert_moves(model, command, expected, columns=columns)
 
 
 def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
-    arm, gains = load_robot("so101"), matched("so101", frictionloss=0.2, stribeck=0.6)
+    arm = load_robot("so101")
+    gains = matched("so101", frictionloss=0.2, stribeck=0.6)
     model = mujoco.MjModel.from_xml_string(export(gains, "mjcf"))
     drives = drives_of(arm, gains)
     for name, group in gains.groups.items():
         drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
-    assert_moves(model, *motion(arm, drives, 400), within=1e-5)
+    command, expected = motion(arm, drives, 400)
+    assert_moves(model, command, expected, within=1e-5)
     assert "elbow_flex 0.6" in export(gains, "mjlab").replace("\n# ", " ")
     assert "elbow_flex" not in export(matched("so101"), "mjlab").partition("import")[0]
     static = export(gains, "isaaclab-dcmotor")
@@ -296,24 +313,24 @@ def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> 
 def test_every_export_says_what_it_holds_for(target: str) -> None:
     text = export(for_target(target, only="_knee"), target)
     text = text.replace("\n# ", " ").replace("\n", " ")
-    holds = profile(TARGETS[target].profile or "isaaclab-implicit")
-    law = f"drive law {holds.drive_law.label}, timestep {holds.timestep_s:g}"
-    for words in (holds.name, law, "virtual", "ab" * 32, "NOT MATCHED"):
+    framework = profile(TARGETS[target].profile or "isaaclab-implicit")
+    law = f"drive law {framework.drive_law.label}, timestep {framework.timestep_s:g}"
+    for words in (framework.name, law, "virtual", "ab" * 32, "NOT MATCHED"):
         assert words in text
-    assert ("stability limit" in text) == (holds.law != "implicit")
+    assert ("stability limit" in text) == (framework.law != "implicit")
 
 
 def test_unmatched_joints_have_the_gains_of_their_group() -> None:
     gains = matched(only="FR_knee")
     (knee,) = exported_actuators(gains, ROBOT)
     assert knee.unmatched == ("FL_knee", "HR_knee", "HL_knee")
-    for one in exported_actuators(gains, ROBOT, "joint"):
-        group = gains.groups["knee"]
+    group = gains.groups["knee"]
+    for actuator in exported_actuators(gains, ROBOT, "joint"):
         expected = (group.stiffness, group.damping)
-        if one.name == "FR_knee":
-            knee = gains.joints["FR_knee"]
-            expected = (knee.stiffness.value, knee.damping.value)
-        assert (one.stiffness, one.damping) == expected
+        if actuator.name == "FR_knee":
+            joint = gains.joints["FR_knee"]
+            expected = (joint.stiffness.value, joint.damping.value)
+        assert (actuator.stiffness, actuator.damping) == expected
 
 
 def test_gains_of_another_drive_law_are_refused() -> None:
@@ -326,21 +343,38 @@ def test_gains_of_another_drive_law_are_refused() -> None:
 @pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin", "newton-featherstone"])
 def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
     arm = load_robot("so101")
-    loss = {"frictionloss": 0.0, "stribeck_speed": 0.0, "effort_limit": 1e6, "stall_torque": 1e6}
-    free = [replace(joint.drive, **loss, no_load_speed=1e6) for joint in arm.joints]
-    joints = [replace(a, drive=b) for a, b in zip(arm.joints, free, strict=True)]
+    joints = []
+    for joint in arm.joints:
+        unlimited = replace(
+            joint.drive,
+            frictionloss=0.0,
+            stribeck_speed=0.0,
+            effort_limit=1e6,
+            stall_torque=1e6,
+            no_load_speed=1e6,
+        )
+        joints.append(replace(joint, drive=unlimited))
     robot = replace(profile(name).robot(arm), joints=tuple(joints))
     drives = exported_actuators(matched("so101", name), robot, "joint")
-    # Only a large stiffness makes the law with implicit damping diverge.
-    field = "stiffness" if name == "mjlab-builtin" else "damping"
 
     def scaled(scale: float) -> list[Actuator]:
-        return [replace(one, **{field: scale * getattr(one, field)}) for one in drives]
+        actuators = []
+        for drive in drives:
+            # Only a large stiffness makes the law with implicit damping diverge.
+            if name == "mjlab-builtin":
+                actuators.append(replace(drive, stiffness=scale * drive.stiffness))
+            else:
+                actuators.append(replace(drive, damping=scale * drive.damping))
+        return actuators
 
-    low, high = 0.1, 1e3
+    low = 0.1
+    high = 1e3
     while high / low > 1.001:
         scale = np.sqrt(low * high)
-        low, high = (low, scale) if stability_share(robot, scaled(scale)) > 1 else (scale, high)
+        if stability_share(robot, scaled(scale)) > 1:
+            high = scale
+        else:
+            low = scale
     rest = {joint.name: joint.default_position for joint in joints}
     with Chain(robot, "gripper", threads=1) as chain:
         pose = np.array([rest[joint] for joint in chain.joints])

@@ -1,4 +1,4 @@
-"""Replays: the gains that made a log replay it exactly; naive gains do not."""
+"""Predictions: the gains that made a log replay it exactly; the nominal gains do not."""
 
 from __future__ import annotations
 
@@ -34,37 +34,40 @@ def gains(*names: str, **extra: float) -> MatchedGains:
 
 def two_joints(delay_s: float = 0.0) -> JointLog:
     """Two joints, one after the other, recorded in the training simulator."""
-    one, two = (
-        chirp_log(ROBOT, name, pair, (0.2,), length_s=4.0, delay_s=delay_s)
-        for name, pair in MADE_WITH.items()
-    )
-    later = one.time[-1] + 0.002
-    still = [np.full_like(log.position, log.pose) for log in (one, two)]
-    (segment,) = two.segments
-    segment = replace(segment, start=segment.start + later, stop=segment.stop + later)
+    logs = []
+    for name, pair in MADE_WITH.items():
+        logs.append(chirp_log(ROBOT, name, pair, (0.2,), length_s=4.0, delay_s=delay_s))
+    first, second = logs
+    assert first.pose is not None
+    assert second.pose is not None
+    offset_s = first.time[-1] + 0.002
+    first_still = np.full_like(first.position, first.pose)
+    second_still = np.full_like(second.position, second.pose)
+    (segment,) = second.segments
+    segment = replace(segment, start=segment.start + offset_s, stop=segment.stop + offset_s)
     return replace(
-        one,
+        first,
         joints=tuple(MADE_WITH),
-        time=np.concatenate([one.time, later + two.time]),
-        command=np.block([[one.command, still[1]], [still[0], two.command]]),
-        position=np.block([[one.position, still[1]], [still[0], two.position]]),
-        segments=(*one.segments, segment),
+        time=np.concatenate([first.time, offset_s + second.time]),
+        command=np.block([[first.command, second_still], [first_still, second.command]]),
+        position=np.block([[first.position, second_still], [first_still, second.position]]),
+        segments=(*first.segments, segment),
         stiffness=np.full(2, 17.0),
         damping=np.full(2, 0.4),
-        pose=np.concatenate([one.pose, two.pose]),
+        pose=np.concatenate([first.pose, second.pose]),
     )
 
 
-def test_gains_that_made_the_log_replay_it_and_naive_ones_do_not() -> None:
-    found = predict(two_joints(), ROBOT, gains())
-    assert found.virtual
-    assert [one.joint for one in found.joints] == list(MADE_WITH)
-    for one in found.joints:
-        assert one.signal == "chirp"
-        assert one.rmse_matched < 1e-5
-        assert one.rmse_nominal > 20 * one.rmse_matched
-        assert one.r2_matched > 0.9999 > one.r2_nominal
-        assert len(one.time) == len(one.command) == len(one.measured) == len(one.nominal)
+def test_gains_that_made_the_log_replay_it_and_nominal_gains_do_not() -> None:
+    prediction = predict(two_joints(), ROBOT, gains())
+    assert prediction.virtual
+    assert [joint.joint for joint in prediction.joints] == list(MADE_WITH)
+    for joint in prediction.joints:
+        assert joint.signal == "chirp"
+        assert joint.rmse_matched < 1e-5
+        assert joint.rmse_nominal > 20 * joint.rmse_matched
+        assert joint.r2_matched > 0.9999 > joint.r2_nominal
+        assert len(joint.time) == len(joint.command) == len(joint.measured) == len(joint.nominal)
 
 
 def test_matched_delay_is_applied_to_the_command() -> None:
@@ -73,7 +76,7 @@ def test_matched_delay_is_applied_to_the_command() -> None:
     without = predict(log, ROBOT, gains())
     for delayed, prompt in zip(late.joints, without.joints, strict=True):
         assert delayed.rmse_matched < 1e-5 < 0.05 * prompt.rmse_matched
-        # The delay alone helps the naive gains too, and the table says by how much.
+        # The delay alone helps the nominal gains too, and the table says by how much.
         assert delayed.rmse_matched < delayed.rmse_nominal_delayed < delayed.rmse_nominal
         assert prompt.rmse_nominal_delayed == prompt.rmse_nominal
 
@@ -86,9 +89,9 @@ def test_friction_of_the_gains_is_used() -> None:
 
 
 def test_joint_without_gains_is_left_out_with_a_reason() -> None:
-    found = predict(two_joints(), ROBOT, gains("HR_knee"))
-    assert [one.joint for one in found.joints] == ["HR_knee"]
-    assert "FL_hip_roll" in found.excluded["FL_hip_roll"]
+    prediction = predict(two_joints(), ROBOT, gains("HR_knee"))
+    assert [joint.joint for joint in prediction.joints] == ["HR_knee"]
+    assert "FL_hip_roll" in prediction.excluded["FL_hip_roll"]
     with pytest.raises(LogError, match="nothing to replay"):
         predict(two_joints(), ROBOT, replace(gains(), joints={}))
     with pytest.raises(LogError, match=r"mini_cheetah.*so101"):
@@ -96,7 +99,8 @@ def test_joint_without_gains_is_left_out_with_a_reason() -> None:
 
 
 def test_rmse_and_r2_by_hand() -> None:
-    measured, simulated = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 5.0])
+    measured = np.array([1.0, 2.0, 3.0])
+    simulated = np.array([1.0, 2.0, 5.0])
     assert rmse(simulated, measured) == pytest.approx(np.sqrt(4.0 / 3.0))
     assert r2(simulated, measured) == pytest.approx(1.0 - 4.0 / 2.0)
     assert np.isnan(r2(simulated, np.ones(3)))

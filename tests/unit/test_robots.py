@@ -45,9 +45,11 @@ def test_dimensions_of_legs_come_from_the_model() -> None:
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
-    robot, model = load_robot(name), MODELS[name]
+    robot = load_robot(name)
+    model = MODELS[name]
     for joint in robot.joints:
-        hinge, drive = model.joint(joint.name), joint.drive
+        hinge = model.joint(joint.name)
+        drive = joint.drive
         np.testing.assert_allclose(hinge.range, joint.range)
         assert model.jnt_limited[hinge.id]
         passive = (drive.armature, drive.frictionloss, drive.viscous_damping)
@@ -70,8 +72,8 @@ def test_drives_have_the_published_figures(
 ) -> None:
     drive = load_robot(name).joint(joint).drive
     assert drive.armature == pytest.approx(figures[0], abs=5e-5)
-    others = (drive.effort_limit, drive.stall_torque, drive.no_load_speed)
-    assert others == pytest.approx(figures[1:], abs=0.05)
+    limits = (drive.effort_limit, drive.stall_torque, drive.no_load_speed)
+    assert limits == pytest.approx(figures[1:], abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -86,8 +88,10 @@ def test_drives_have_the_published_figures(
 def test_mass_and_order_of_legs(name: str, total: float, legs: tuple[str, ...]) -> None:
     assert MODELS[name].body_mass.sum() == pytest.approx(total, abs=1e-6)
     if legs:
-        joints = ("hip_roll", "hip_pitch", "knee")
-        assert load_robot(name).joint_names == tuple(f"{leg}_{j}" for leg in legs for j in joints)
+        names: list[str] = []
+        for leg in legs:
+            names += [f"{leg}_hip_roll", f"{leg}_hip_pitch", f"{leg}_knee"]
+        assert load_robot(name).joint_names == tuple(names)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +101,8 @@ def test_mass_and_order_of_legs(name: str, total: float, legs: tuple[str, ...]) 
 def test_feet_are_under_the_hips_and_on_the_floor(
     name: str, hip: str, ahead: float, side: float
 ) -> None:
-    data, body = posed(MODELS[name]), legged(name)
+    data = posed(MODELS[name])
+    body = legged(name)
     for leg in body.legs:
         x = data.body(f"{leg}_{hip}").xpos[0]
         outwards = side if leg.endswith("L") else -side
@@ -117,8 +122,10 @@ def test_the_whole_robot_is_symmetric_about_its_middle_plane() -> None:
     full = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
     # Mirroring maps R to L joints, flips y, roll and yaw of the trunk and every hip_roll.
-    order = [model.joint(n).dofadr[0] for n in load_robot("mini_cheetah").joint_names]
-    swap = [0, 1, 2, 3, 4, 5, *(order[i] for i in (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8))]
+    names = load_robot("mini_cheetah").joint_names
+    swap = [0, 1, 2, 3, 4, 5]
+    for index in (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8):
+        swap.append(model.joint(names[index]).dofadr[0])
     sign = np.array([1, -1, 1, -1, 1, -1, *([-1, 1, 1] * 4)])
     mirrored = (sign[:, None] * full * sign)[np.ix_(swap, swap)]
     np.testing.assert_allclose(mirrored, full, atol=1e-15)
@@ -130,19 +137,26 @@ def test_only_feet_legs_and_trunk_touch_a_floor_and_never_each_other() -> None:
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1), pos=(0, 0, 0.5)
     )
     model = spec.compile()
-    pairs = [({model.geom(g).name for g in c.geom}, c.dim) for c in posed(model).contact]
-    parts = [f"{leg}_{part}" for leg in CHEETAH.legs for part in ("thigh", "shank", "foot")]
-    expected = {"floor", *(f"{part}_collision" for part in ("trunk", *parts))}
-    assert set().union(*(pair for pair, _ in pairs)) == expected
-    assert all("floor" in pair for pair, _ in pairs)
-    assert {dim for pair, dim in pairs if "FR_foot_collision" in pair} == {3}
+    touching = set()
+    for contact in posed(model).contact:
+        names = {model.geom(index).name for index in contact.geom}
+        assert "floor" in names
+        touching |= names
+        if "FR_foot_collision" in names:
+            assert contact.dim == 3
+    expected = {"floor", "trunk_collision"}
+    for leg in CHEETAH.legs:
+        expected |= {f"{leg}_thigh_collision", f"{leg}_shank_collision", f"{leg}_foot_collision"}
+    assert touching == expected
 
 
 def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
     """The evidence for the signs of SAGE recordings: sag over gravity torque is one stiffness."""
     model = MODELS["so101"]
     bias = posed(model).qfrc_bias
-    gravity = {n: -bias[model.joint(n).dofadr[0]] for n in load_robot("so101").joint_names}
+    gravity = {}
+    for joint in load_robot("so101").joint_names:
+        gravity[joint] = -bias[model.joint(joint).dofadr[0]]
     sag = {"Pitch": 0.038, "Elbow": 0.037, "Wrist_Pitch": 0.010}  # means of the four recordings
     for name, offset in sag.items():
         assert 9.0 < gravity[SAGE_JOINTS[name]] / offset < 14.0
@@ -171,3 +185,9 @@ def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_p
     (tmp_path / "robot.yaml").write_text(re.sub(old, new, (folder / "robot.yaml").read_text()))
     with pytest.raises(RobotError, match=named):
         load_robot(tmp_path)
+
+
+def test_a_robot_is_shown_in_one_line() -> None:
+    shown = repr(load_robot("so101"))
+    assert "so101" in shown
+    assert len(shown) < 100
