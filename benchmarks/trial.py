@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -34,11 +35,23 @@ from pronk.jump.trial.trial import (
 )
 from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
+from pronk.tables import Column, Table
 
 LIMIT = 0.6
-"""Least speed over that of the bare loop."""
+"""Least speed over that of the bare loop [1]."""
 ROBOT = "mini_cheetah"
 CASE = PAPER_COMMANDS[1]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Physics steps between which nothing was set."""
+
+    steps: int
+    targets: Array
+    """Targets of the drives."""
+    motors: Array
+    """Parameters of the motors."""
 
 
 class Recording:
@@ -46,42 +59,48 @@ class Recording:
 
     def __init__(self, job: TrialJob) -> None:
         """Run one job and record it."""
-        self.blocks: list[tuple[int, Array, Array]] = []
-        """Steps, targets of the drives, parameters of the motors."""
+        self.blocks: list[Block] = []
         self._step = mujoco.mj_step
         self._data: Any = None
         with patch.object(mujoco, "mj_step", self._record):
             run_job(job)
-        self.steps = sum(steps for steps, _, _ in self.blocks)
+        self.steps = sum(block.steps for block in self.blocks)
         self.timestep_s = float(self._model.opt.timestep)
 
     def _record(self, model: Any, data: Any, nstep: int = 1) -> None:
+        """Record some steps, and do them."""
         if self._data is None:
-            self._model, self._begin = copy.deepcopy(model), copy.deepcopy(data)
+            self._model = copy.deepcopy(model)
+            self._begin = copy.deepcopy(data)
+            self._data = data
         elif data is not self._data:
             raise PronkError("the trial stepped two simulations; the benchmark records one.")
-        self._data = data
-        control, motors = data.ctrl.copy(), model.actuator_gainprm.copy()
-        last = self.blocks[-1] if self.blocks else None
-        if last and np.array_equal(last[1], control) and np.array_equal(last[2], motors):
-            self.blocks[-1] = (last[0] + nstep, control, motors)
-        else:
-            self.blocks.append((nstep, control, motors))
+        targets = data.ctrl.copy()
+        motors = model.actuator_gainprm.copy()
+        steps = nstep
+        if self.blocks:
+            block = self.blocks[-1]
+            is_same = np.array_equal(block.targets, targets)
+            if is_same and np.array_equal(block.motors, motors):
+                self.blocks.pop()
+                steps += block.steps
+        self.blocks.append(Block(steps, targets, motors))
         self._step(model, data, nstep)
 
     def replay(self) -> float:
-        """Repeat the run with `mujoco.mj_step` alone; returns the processor time [s].
+        """Repeat the run with `mujoco.mj_step` alone; return the processor time [s].
 
         Raises:
             PronkError: It ended in another state than the recorded run.
         """
-        model, data, step = self._model, copy.deepcopy(self._begin), self._step
-        control, motors = data.ctrl, model.actuator_gainprm
+        model = self._model
+        data = copy.deepcopy(self._begin)
+        step = self._step
         begun = time.process_time()
-        for steps, targets, parameters in self.blocks:
-            control[:] = targets
-            motors[:] = parameters
-            step(model, data, steps)
+        for block in self.blocks:
+            data.ctrl[:] = block.targets
+            model.actuator_gainprm[:] = block.motors
+            step(model, data, block.steps)
         seconds = time.process_time() - begun
         if not np.array_equal(data.qpos, self._data.qpos):
             raise PronkError("the bare loop ended in another state than the recorded trial.")
@@ -98,6 +117,13 @@ def run(
 ) -> dict[str, Any]:
     """Time the trial loop of one jump beside the bare loop.
 
+    Args:
+        policy: File of the policy.
+        progress: Called with a stage and the share of it that is done.
+        sim_params: Parameters of the virtual robot; those that ship with pronk if None.
+        repeats: Number of runs of each loop.
+        seed: Seed of the jump's start and noise.
+
     Returns:
         Processor times of both loops [s], simulated seconds per second (medians), and the paired
         ratio with its range.
@@ -111,17 +137,18 @@ def run(
     (subject,) = load_subjects([policy], robot)
     plan = TrialPlan(cases=(CASE,), jumps=1, seed=seed)
     params = sim_params or load_sim_params()
-    [job] = plan_jobs([subject], plan, TrialSetup(robot=robot, sim_params=params, out=Path()))
+    setup = TrialSetup(robot=robot, sim_params=params, out=Path())
+    (job,) = plan_jobs([subject], plan, setup)
     recording = Recording(job)  # the warm-up as well
 
-    def trial_block() -> float:
+    def run_trial_loop() -> float:
         begun = time.process_time()
         run_job(job)
         return time.process_time() - begun
 
     progress("trial", 0.0)
-    trial_s, bare_s = in_turn([trial_block, recording.replay], repeats)
-    middle, *extremes = paired_ratio(bare_s, trial_s)
+    trial_s, bare_s = in_turn([run_trial_loop, recording.replay], repeats)
+    ratio, lowest, highest = paired_ratio(bare_s, trial_s)
     simulated_s = recording.steps * recording.timestep_s
     return {
         "policy": subject.name,
@@ -134,10 +161,10 @@ def run(
         "simulated_s": simulated_s,
         "speed": simulated_s / float(np.median(trial_s)),
         "bare_speed": simulated_s / float(np.median(bare_s)),
-        "ratio": middle,
-        "ratio_range": extremes,
+        "ratio": ratio,
+        "ratio_range": [lowest, highest],
         "limit": LIMIT,
-        "passed": middle >= LIMIT,
+        "passed": ratio >= LIMIT,
     }
 
 
@@ -153,25 +180,36 @@ def trial(
         policy: policy.onnx.
         repeats: Runs of each loop, taken in turn.
         sim_params: Parameters of the virtual robot; those that ship with pronk if left out.
-        seed: Of the jump's start and noise.
+        seed: Seed of the jump's start and noise.
     """
     with console.progress() as report:
-        chosen = load_sim_params(sim_params)
-        found = run(policy, report, sim_params=chosen, repeats=repeats, seed=seed)
-    caption = (
-        f"One jump with the command {CASE.name}: {found['simulated_s']:.1f} s in "
-        f"{found['steps']:,} physics steps of {1e3 * found['timestep_s']:g} ms, the same in both "
-        f"loops; medians of {repeats} runs of each, taken in turn, processor time of one thread. "
-        f"Policy {found['policy']} ({found['sha256'][:12]}), MuJoCo {found['machine']['mujoco']}, "
-        f"ONNX Runtime {found['machine']['onnxruntime']}."
+        params = load_sim_params(sim_params)
+        figures = run(policy, report, sim_params=params, repeats=repeats, seed=seed)
+    lowest, highest = figures["ratio_range"]
+    limit = f"{LIMIT:.2f} {'reached' if figures['passed'] else 'MISSED'}"
+    table = Table(
+        title="Simulated seconds per second and core, virtual robot",
+        columns=(
+            Column(heading="loop"),
+            Column(heading="simulated s per s", digits=2),
+            Column(heading="ratio"),
+            Column(heading="least ratio"),
+        ),
+        rows=(
+            (
+                "trial: build, settle, policy, sensors, capture, measure",
+                figures["speed"],
+                spread((figures["ratio"], lowest, highest)),
+                limit,
+            ),
+            ("bare mujoco.mj_step", figures["bare_speed"], "1", ""),
+        ),
+        notes=(
+            f"One jump with the command {CASE.name}: {figures['simulated_s']:.1f} s in "
+            f"{figures['steps']:,} physics steps of {1e3 * figures['timestep_s']:g} ms, the same "
+            f"in both loops; medians of {repeats} runs of each, taken in turn, processor time of "
+            f"one thread. Policy {figures['policy']} ({figures['sha256'][:12]}), MuJoCo "
+            f"{figures['machine']['mujoco']}, ONNX Runtime {figures['machine']['onnxruntime']}.",
+        ),
     )
-    ratio = spread((found["ratio"], *found["ratio_range"]))
-    limit = f"{LIMIT:.2f} {'reached' if found['passed'] else 'MISSED'}"
-    whole = "trial: build, settle, policy, sensors, capture, measure"
-    rows = [
-        (whole, f"{found['speed']:.2f}", ratio, limit),
-        ("bare mujoco.mj_step", f"{found['bare_speed']:.2f}", "1", ""),
-    ]
-    columns = ("loop", "simulated s per s", "ratio", "least ratio")
-    title = "Simulated seconds per second and core, virtual robot"
-    return finish(found, console.table(title, columns, rows, caption))
+    return finish(figures, table)

@@ -55,8 +55,10 @@ ROBOT = load_robot("mini_cheetah")
 CASES = (PAPER_COMMANDS[0], PAPER_COMMANDS[1], RATES)
 FLIGHTS = {"matched": (400, 410, 420), "naive": (380, 400, 420)}
 """Time in the air of each policy's jumps [ms]: the naive ones differ twice as much."""
-RATE, OMEGA = 3.0, 25.0
-"""Amplitude [rad/s] and omega [rad/s] of the roll rate of the matched policy."""
+RATE = 3.0
+"""Amplitude of the roll rate of the matched policy [rad/s]."""
+OMEGA = 25.0
+"""Angular frequency of that roll rate [rad/s]."""
 
 
 def second_order(omega, stiffness, damping, inertia, viscous=0.01):
@@ -78,17 +80,29 @@ def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResul
     stiffness *= 1.0 + 0.02 * (leg - 1.5)
     omega = 2.0 * np.pi * np.arange(0.25, 22.6, 0.25)
     matched = second_order(omega, stiffness, damping, inertia)
-    naive = second_order(omega, *NOMINAL_GAINS, inertia)
-    known: dict[str, Any] = {"joint": f"{LEGS[leg]}_{name}", "omega": omega, "virtual": virtual}
-    known |= {"estimator": "H1", "window": "hann 4 s, 75 % overlap", "segment_s": 4.0}
-    known |= {"coherence": 1.0 - 0.3 * (omega / omega[-1]) ** 3, "delay_s": 0.002}
-    known |= {"averages": np.full(omega.size, 12.0), "third_harmonic": 0.02}
+    nominal = second_order(omega, *NOMINAL_GAINS, inertia)
+    joint = f"{LEGS[leg]}_{name}"
     responses = []
     for amplitude in (0.25, 0.125):
         noise = 0.01 * (rng.normal(size=(3, omega.size)) + 1j * rng.normal(size=(3, omega.size)))
         repeats = matched * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
-        found = {"amplitude": amplitude, "response": repeats.mean(axis=0), "repeats": repeats}
-        responses.append(FrequencyResponse(**found, **known))
+        responses.append(
+            FrequencyResponse(
+                joint=joint,
+                amplitude=amplitude,
+                omega=omega,
+                response=repeats.mean(axis=0),
+                repeats=repeats,
+                coherence=1.0 - 0.3 * (omega / omega[-1]) ** 3,
+                averages=np.full(omega.size, 12.0),
+                third_harmonic=0.02,
+                delay_s=0.002,
+                estimator="H1",
+                window="hann 4 s, 75 % overlap",
+                segment_s=4.0,
+                virtual=virtual,
+            )
+        )
     first = responses[0].response
     band = responses[0].band(*band_hz)
     stiffness_axis = np.linspace(13, 27, 21)
@@ -101,7 +115,7 @@ def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResul
         response = second_order(omega, 27.0, 0.62, 0.0012)
         zero_armature = ZeroArmature(error_db=2.9, response=response, ruled_out=True)
     fit = DriveFit(
-        joint=known["joint"],
+        joint=joint,
         values={
             "stiffness": stiffness,
             "damping": damping,
@@ -123,10 +137,10 @@ def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResul
     compared = ComparedResponses(
         measured=tuple(responses),
         matched=matched,
-        nominal=naive,
+        nominal=nominal,
         band_hz=band_hz,
         error_db=float(error_db(first, matched, band)),
-        nominal_error_db=float(error_db(first, naive, band)),
+        nominal_error_db=float(error_db(first, nominal, band)),
         coherence_min=0.91,
     )
     return JointResult(
@@ -190,9 +204,10 @@ def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) 
     gains_file.save_gains(folder / "gains.yaml", result.gains)
     match_file.save(folder / "match.npz", result)
     if prediction:
-        joints, virtual = (joint_prediction(),), result.gains.virtual
-        one = Prediction(joints=joints, virtual=virtual, source="fresh.mcap")
-        save_prediction(folder / "fresh.prediction.npz", one)
+        fresh = Prediction(
+            joints=(joint_prediction(),), virtual=result.gains.virtual, source="fresh.mcap"
+        )
+        save_prediction(folder / "fresh.prediction.npz", fresh)
     return folder
 
 

@@ -241,8 +241,8 @@ def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: TrialJob) -> None:
     recording = trial.Recording(job)
     assert repr(run_job(job)) == before
     assert recording.replay() > 0.0
-    steps, control, motors = recording.blocks[-1]
-    recording.blocks[-1] = (steps - 1, control, motors)
+    block = recording.blocks[-1]
+    recording.blocks[-1] = replace(block, steps=block.steps - 1)
     with pytest.raises(PronkError, match="another state"):
         recording.replay()
 
