@@ -102,12 +102,29 @@ def count(path: Path) -> Count:
     total = Count()
     for file in python_files(path):
         text = file.read_text(encoding="utf-8")
-        for line in text.splitlines():
+        tree = ast.parse(text)
+        docstrings = _docstring_lines(tree)
+        for number, line in enumerate(text.splitlines(), start=1):
             stripped = line.strip()
-            total.code_lines += bool(stripped) and not stripped.startswith("#")
-        for node in ast.walk(ast.parse(text)):
+            is_code = bool(stripped) and not stripped.startswith("#")
+            total.code_lines += is_code and number not in docstrings
+        for node in ast.walk(tree):
             _count_node(node, total)
     return total
+
+
+def _docstring_lines(tree: ast.AST) -> set[int]:
+    """Return the numbers of the lines that texts by themselves take."""
+    lines: set[int] = set()
+    for node in ast.walk(tree):
+        is_text = (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, str)
+        )
+        if is_text:
+            lines.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return lines
 
 
 def _count_node(node: ast.AST, total: Count) -> None:
@@ -122,9 +139,6 @@ def _count_node(node: ast.AST, total: Count) -> None:
         total.packed_assignments += isinstance(node.targets[0], ast.Tuple) and isinstance(
             node.value, ast.Tuple
         )
-    elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-        if isinstance(node.value.value, str):
-            total.code_lines -= (node.end_lineno or node.lineno) - node.lineno + 1
     elif isinstance(node, ast.arg):
         _count_name(node.arg, total)
     elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
