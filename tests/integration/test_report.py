@@ -55,7 +55,7 @@ def report(folder: Path) -> Checker:
 
 
 def match_report(folder: Path) -> Checker:
-    return Checker(match_page.write_page(folder)[0].read_text(encoding="utf-8"))
+    return Checker(build.write_artefact_page(folder / "match.npz").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -119,10 +119,9 @@ def test_the_page_of_a_match(tmp_path: Path) -> None:
     page = match_report(write_match(tmp_path, result, prediction=True))
     optional = {"match-without-rotor-inertia", "match-prediction-of-fresh-logs"}
     assert {"match-bode-plots", "match-error-maps", *optional} < set(page.ids)
-    found = match_page.verdict(result)
-    assert (found["matched"], found["joints"]) == (12, 12)
+    assert len(result.matched_joints) == len(result.joints) == 12
     expected = np.sqrt(np.mean([j.gains.quality.error_db**2 for j in result.joints.values()]))
-    assert found["error_db"] == pytest.approx(expected)
+    assert result.error_db == pytest.approx(expected)
     numbers = ("12 of 12 joints matched", f"{expected:.2f} dB", "3.11.0", "dc_motor_pd", "0.516")
     for words in (*numbers, *result.gains.logs.values(), *result.joints):
         assert words.replace("_", " ") in page.text.replace("_", " ")
@@ -133,14 +132,16 @@ def test_the_page_of_a_match(tmp_path: Path) -> None:
     assert not optional & set(ids)
 
 
-def test_a_joint_without_a_match_is_a_warning() -> None:
+def test_a_joint_without_a_match_is_a_warning(tmp_path: Path) -> None:
     result = match(legs=1)
     warning = "no match: the best gains miss the measured response by 2 dB RMS"
     knee = result.joints["FR_knee"]
     bad = replace(knee, gains=replace(knee.gains, flags=(warning,)))
-    found = match_page.verdict(replace(result, joints={**result.joints, "FR_knee": bad}))
-    assert found["matched"] == 2
-    assert warning in found["flags"]["FR_knee"]
+    write_match(tmp_path, replace(result, joints={**result.joints, "FR_knee": bad}))
+    part = match_page.match_part(tmp_path / "match.npz")
+    assert part.warning
+    assert part.figures["matched"] == 2
+    assert warning in part.figures["flags"]["FR_knee"]
 
 
 def test_text_of_files_is_escaped(tmp_path: Path) -> None:
@@ -185,25 +186,25 @@ def test_missing_captures_are_counted(tmp_path: Path) -> None:
 def test_damage_is_one_sentence_and_no_page(
     tree: Path, tmp_path: Path, name: str, bytes_kept: int
 ) -> None:
-    ignore = shutil.ignore_patterns(build.NAME)
+    ignore = shutil.ignore_patterns(build.PAGE_NAME)
     shutil.copytree(tree, tmp_path, ignore=ignore, dirs_exist_ok=True)
     damaged = tmp_path / name
     damaged.write_bytes(damaged.read_bytes()[:bytes_kept])
     with pytest.raises(ArtefactError, match=damaged.stem) as refusal:
         build.write_report(tmp_path)
     assert "\n" not in str(refusal.value)
-    assert not (tmp_path / build.NAME).exists()
+    assert not (tmp_path / build.PAGE_NAME).exists()
 
 
 def test_missing_artefacts_are_named(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="no such folder"):
-        match_page.write_page(tmp_path / "nowhere")
+        build.write_artefact_page(tmp_path / "nowhere" / "match.npz")
     with pytest.raises(ArtefactError, match=r"gains\.yaml"):
-        match_page.write_page(tmp_path)
+        build.write_artefact_page(tmp_path / "match.npz")
     gains_file.save_gains(tmp_path / "gains.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match=r"match\.npz"):
-        match_page.write_page(tmp_path)
-    assert not (tmp_path / match_page.PAGE_NAME).exists()
+        build.write_artefact_page(tmp_path / "match.npz")
+    assert not (tmp_path / "match.html").exists()
 
 
 def test_gains_under_another_name_are_found(tmp_path: Path) -> None:

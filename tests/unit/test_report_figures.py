@@ -44,8 +44,8 @@ def test_axes_have_units_and_legends_fit(result) -> None:
         figures.error_maps(result, dict.fromkeys(result.joints, NOMINAL_GAINS)),
         figures.ranges(result.gains, groups),
         figures.zero_armature(knee),
-        figures.prediction(joint_prediction(), virtual=True),
-        figures.responses(knee.responses.measured),
+        figures.prediction_figure(joint_prediction(), virtual=True),
+        figures.measured_responses(knee.responses.measured),
     ):
         labels = [text for a in figure.axes for text in (a.get_xlabel(), a.get_ylabel())]
         named = [label for label in labels if label and label != "coherence"]
@@ -86,7 +86,7 @@ def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> N
 
 def test_ellipse_passes_through_the_points_of_its_equation() -> None:
     covariance = np.array([[0.09, 0.0015], [0.0015, 1e-4]])
-    drawn = figures.ellipse((20.0, 0.5), covariance, squared=5.99)
+    drawn = figures.ellipse((20.0, 0.5), covariance, squared_radius=5.99, edgecolor="black")
     points = drawn.get_patch_transform().transform(drawn.get_path().vertices)[::3]
     away = points - (20.0, 0.5)
     assert np.allclose(np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away), 5.99)

@@ -149,6 +149,6 @@ def _save_figures(prediction: Prediction, log: JointLog, folder: Path) -> list[P
     for joint in prediction.joints:
         joint_name = file_name(joint.joint)
         name = stem if stem == joint_name else f"{stem}.{joint_name}"
-        figure = figures.prediction(joint, virtual=log.virtual)
+        figure = figures.prediction_figure(joint, virtual=log.virtual)
         wrote.append(style.save(figure, folder / f"{name}.prediction.svg"))
     return wrote

@@ -97,7 +97,9 @@ def _write_plots(
         name = f"{stem}.{file_name(joint)}"
         if len(by_joint) == 1 and stem == file_name(joint):
             name = stem
-        written.append(style.save(figures.responses(responses), folder / f"{name}.response.svg"))
+        written.append(
+            style.save(figures.measured_responses(responses), folder / f"{name}.response.svg")
+        )
     return written
 
 

@@ -16,71 +16,97 @@ from pronk.jump.trial.results import SUMMARY
 from pronk.report import deploy_page, match_page, trial_page
 from pronk.report.page import Part, page
 
-NAME = "report.html"
+PAGE_NAME = "report.html"
 LOGS = "*.mcap"
-KINDS: dict[str, Callable[[Path], Part]] = {
+PART_MAKERS: dict[str, Callable[[Path], Part]] = {
     SUMMARY: trial_page.part,
     LOGS: deploy_page.deploy_part,
-    "match.npz": match_page.part,
+    "match.npz": match_page.match_part,
 }
 """How the part of each file is made, in the order of the page."""
 
 
+def no_progress(stage: str, share: float) -> None:
+    """Ignore the share of a stage that is done."""
+
+
 def artefacts(root: Path, pattern: str) -> list[Path]:
-    """Return the files below `root`, upper ones first."""
+    """Return the files of a pattern in a folder and the folders in it, upper ones first.
+
+    Of `*.mcap` files those of deployments are returned; a log given by itself is returned as it is.
+    """
     if root.is_file():
         return [root] if pattern == LOGS else []
-    found = [path for path in root.rglob(pattern) if path.is_file()]
-    found = [path for path in found if pattern != LOGS or is_deploy_log(path)]
-    return sorted(found, key=lambda path: (len(path.parts), path))
+    paths = []
+    for path in root.rglob(pattern):
+        if path.is_file() and (pattern != LOGS or is_deploy_log(path)):
+            paths.append(path)
+    return sorted(paths, key=lambda path: (len(path.parts), path))
 
 
 def write_artefact_page(artefact: Path) -> Path:
     """Write the page of one artefact beside it, for instance `match.html` of `match.npz`."""
-    artefact_part = replace(KINDS[artefact.name](artefact), source=artefact.name)
+    part = replace(PART_MAKERS[artefact.name](artefact), source=artefact.name)
     page_path = artefact.with_suffix(".html")
-    write_text(page_path, page(artefact_part.title, [artefact_part]))
+    write_text(page_path, page(part.title, [part]))
     return page_path
 
 
 def write_report(
-    root: Path, progress: Callable[[str, float], None] = lambda stage, share: None
+    root: Path, progress: Callable[[str, float], None] = no_progress
 ) -> tuple[Path, list[Part]]:
-    """Write the page of everything in `root`; return its path and its parts.
+    """Write the page of everything in a folder.
 
-    `root` is a folder, which gets `report.html`, or the log of one deployment, which gets a page of
-    its name beside it. What is missing or damaged is an ArtefactError or LogError.
+    Args:
+        root: A folder, which gets `report.html`, or the log of one deployment, which gets a page of
+            its name beside it.
+        progress: Called with the stage and the share of it that is done, 0 to 1.
+
+    Returns:
+        The path of the page, and its parts.
+
+    Raises:
+        ArtefactError: There is nothing to report, or an artefact is damaged.
+        LogError: The log is damaged, or has no tick.
     """
     if not root.exists():
         raise ArtefactError(
             f"{root}: no such folder; give one that `pronk match --out` or `pronk trial --out` "
             "wrote to, or the log of a deployment."
         )
-    parts = []
-    base = root if root.is_dir() else root.parent
-    for n, (pattern, make) in enumerate(KINDS.items()):
-        progress("report", n / len(KINDS))
-        paths = artefacts(root, pattern)
-        for i, path in enumerate(paths):
-            where = path.relative_to(base)
-            try:
-                part = replace(make(path), source=str(where), number=i)
-            except LogError:
-                # A link that never opened leaves a log without a tick beside others with ticks.
-                if len(paths) == 1:
-                    raise
-                continue
-            if len(paths) > 1:
-                own = where if pattern == LOGS else where.parent
-                part = replace(part, title=f"{part.title}: {own}")
-            parts.append(part)
+    parts: list[Part] = []
+    for number, pattern in enumerate(PART_MAKERS):
+        progress("report", number / len(PART_MAKERS))
+        parts += _parts(root, pattern)
     if not parts:
         raise ArtefactError(
             f"{root}: nothing to report; neither {SUMMARY} (`pronk trial POLICY --out DIR`) nor "
             "match.npz (`pronk match LOG... --out`) nor the log of a deployment (`pronk deploy "
             "--log`) is in it or in a folder in it."
         )
-    written = root.with_suffix(".html") if root.is_file() else root / NAME
-    write_text(written, page("report" if len(parts) > 1 else parts[0].title, parts))
+    page_path = root.with_suffix(".html") if root.is_file() else root / PAGE_NAME
+    title = parts[0].title if len(parts) == 1 else "report"
+    write_text(page_path, page(title, parts))
     progress("report", 1.0)
-    return written, parts
+    return page_path, parts
+
+
+def _parts(root: Path, pattern: str) -> list[Part]:
+    """Make the part of each artefact of a pattern; several are told apart by their paths."""
+    base = root if root.is_dir() else root.parent
+    paths = artefacts(root, pattern)
+    parts = []
+    for number, path in enumerate(paths):
+        relative = path.relative_to(base)
+        try:
+            part = PART_MAKERS[pattern](path)
+        except LogError:
+            # A link that never opened leaves a log without a tick beside others with ticks.
+            if len(paths) == 1:
+                raise
+            continue
+        title = part.title
+        if len(paths) > 1:
+            title = f"{title}: {relative if pattern == LOGS else relative.parent}"
+        parts.append(replace(part, title=title, source=str(relative), number=number))
+    return parts

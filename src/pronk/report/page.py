@@ -19,33 +19,53 @@ class Part:
     """One artefact on the page."""
 
     kind: str
-    """Its template is `templates/KIND.html.j2`."""
+    """Kind of the artefact; its template is `templates/KIND.html.j2`."""
     title: str
     virtual: bool
-    """Measured on the virtual robot."""
+    """True if it was measured on the virtual robot."""
     summary: str
-    """One sentence."""
+    """Outcome in one sentence."""
     warning: bool = False
-    """A result is not as expected."""
+    """True if a result is not as expected."""
     content: Mapping[str, Any]
     """Variables of the template."""
     figures: Mapping[str, Any] = field(default_factory=dict)
-    """What `--json` gives of it."""
+    """Numbers of it that `--json` writes."""
     source: str = ""
-    """The file it is made from, below the folder of the page."""
+    """Path of the artefact, relative to the folder of the page."""
     number: int = 0
-    """Among the parts of its kind on the page."""
+    """Number among the parts of its kind on the page."""
 
     @property
     def anchor(self) -> str:
-        """Begins the anchors of all its sections."""
+        """Text with which the anchors of all its sections begin."""
         return f"{self.kind}{self.number or ''}"
 
 
+_PRINTED_SIGNS = {"+-": "±", ">=": "≥", "<=": "≤"}
+_LONG_TEXT = 24
+"""Characters of a cell from which on a column of text is set to the left."""
+
+
 def _signs(text: str) -> str:
-    for typed, printed in (("+-", "±"), (">=", "≥"), ("<=", "≤")):
+    """Return text with printed signs; a cell of a dash alone with a longer one."""
+    if text == "-":
+        return "–"
+    for typed, printed in _PRINTED_SIGNS.items():
         text = text.replace(typed, printed)
-    return "–" if text == "-" else text
+    return text
+
+
+def _words(name: str) -> str:
+    """Return a name with spaces."""
+    return name.replace("_", " ")
+
+
+def _alignment(text_rows: Sequence[Sequence[str]], column: int) -> str:
+    """Return the class of a column's cells: `left` for long text."""
+    if any(len(text_row[column]) > _LONG_TEXT for text_row in text_rows):
+        return "left"
+    return ""
 
 
 def page(title: str, parts: Sequence[Part]) -> str:
@@ -59,14 +79,12 @@ def page(title: str, parts: Sequence[Part]) -> str:
         lstrip_blocks=True,
     )
     environment.filters["signs"] = _signs
-    environment.filters["words"] = lambda name: name.replace("_", " ")
-    # Columns of text are set to the left.
-    environment.filters["align"] = lambda rows, i: "left" * any(len(row[i]) > 24 for row in rows)
-    rendered = [
-        environment.get_template(f"{part.kind}.html.j2").render(
-            part.content, part=part, many=len(parts) > 1, sections=[]
-        )
-        for part in parts
-    ]
+    environment.filters["words"] = _words
+    environment.filters["align"] = _alignment
+    rendered = []
+    for part in parts:
+        template = environment.get_template(f"{part.kind}.html.j2")
+        html = template.render(part.content, part=part, many=len(parts) > 1, sections=[])
+        rendered.append(html)
     template = environment.get_template("page.html.j2")
     return template.render(version=VERSION, title=title, parts=parts, rendered=rendered)

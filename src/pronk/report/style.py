@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import matplotlib as mpl
 import numpy as np
@@ -34,15 +34,31 @@ PAPER = "#CC79A7"
 BAND = "#f3efe2"
 
 PAGE_WIDTH_IN = 10.0
-"""10 in at 96 px/in is the 960 px column of the page."""
+"""Width of a figure: 10 in at 96 px/in is the 960 px column of the page."""
 LEG_MARKERS = {"FR": "o", "FL": "s", "HR": "^", "HL": "D"}
 """Marker of each leg, in file order; joints of other robots take the first."""
+Sharing = bool | Literal["row", "col"]
 
-NAIVE_LINE: dict[str, Any] = {"color": NAIVE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
-MATCHED_LINE: dict[str, Any] = {"color": MATCHED, "linestyle": "-", "linewidth": 1.4}
-MEASURED_LINE: dict[str, Any] = {"color": MEASURED_WIDE, "linestyle": "-", "linewidth": 3.4}
+
+class Look(TypedDict, total=False):
+    """Properties of a line or a mark, by their names in matplotlib."""
+
+    color: str
+    linestyle: Any
+    linewidth: float
+    marker: str
+    markersize: float
+    markerfacecolor: str
+    markeredgecolor: str
+    markeredgewidth: float
+    zorder: float
+
+
+NAIVE_LINE: Look = {"color": NAIVE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
+MATCHED_LINE: Look = {"color": MATCHED, "linestyle": "-", "linewidth": 1.4}
+MEASURED_LINE: Look = {"color": MEASURED_WIDE, "linestyle": "-", "linewidth": 3.4}
 """Wide and grey: a good match shows as a thin line inside it."""
-ZERO_LINE: dict[str, Any] = {"color": ZERO_ARMATURE, "linestyle": (0, (6, 2, 1, 2))}
+ZERO_LINE: Look = {"color": ZERO_ARMATURE, "linestyle": (0, (6, 2, 1, 2))}
 
 _RC = {
     "font.family": "DejaVu Sans",
@@ -68,16 +84,17 @@ _RC = {
 
 
 def decibel(gain: Any) -> Any:
-    """`20 log10(gain)`, floored at -200 dB so that a zero can be drawn."""
+    """Return `20 log10(gain)` [dB], at least -200 dB, so that a zero can be drawn."""
     return 20.0 * np.log10(np.maximum(np.abs(gain), 1e-10))
 
 
 def rms(values: Any, axis: int | None = None) -> Any:
     """Return the root mean square of the finite values; NaN without any."""
-    known = np.asarray(values, dtype=float)
-    there = np.isfinite(known)
+    numbers = np.asarray(values, dtype=float)
+    finite = np.isfinite(numbers)
+    squares = np.where(finite, numbers, 0.0) ** 2
     with np.errstate(invalid="ignore"):
-        return np.sqrt((np.where(there, known, 0.0) ** 2).sum(axis) / there.sum(axis))
+        return np.sqrt(squares.sum(axis) / finite.sum(axis))
 
 
 def joint_words(name: str) -> str:
@@ -86,19 +103,45 @@ def joint_words(name: str) -> str:
 
 
 def leg_of(name: str) -> str:
-    """Return the leg of `LEG_JOINT`; an empty string for a robot without legs."""
+    """Return the leg of a joint named `LEG_JOINT`; an empty string for a robot without legs."""
     head = name.split("_", 1)[0]
     return head if head in LEG_MARKERS else ""
 
 
 @contextmanager
 def drawing(
-    rows: int = 1, columns: int = 1, *, height: float, **options: Any
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    height: float,
+    sharex: Sharing = False,
+    sharey: Sharing = False,
+    height_ratios: Sequence[float] | None = None,
 ) -> Iterator[tuple[Figure, NDArray[Any]]]:
-    """Make a figure of page width and a height in inches, with a grid of axes in pronk's look."""
+    """Make a figure of page width, with a grid of axes in pronk's look.
+
+    Args:
+        rows: Rows of axes.
+        columns: Columns of axes.
+        height: Height of the figure [in].
+        sharex: Axes that share the horizontal axis: none, all, or those of a row or column.
+        sharey: Axes that share the vertical axis.
+        height_ratios: Relative heights of the rows; equal if None.
+
+    Yields:
+        The figure, and its axes, shape (rows, columns).
+    """
     with mpl.rc_context(_RC):  # type: ignore[arg-type]
         figure = Figure(figsize=(PAGE_WIDTH_IN, height), layout="constrained")
-        yield figure, figure.subplots(rows, columns, squeeze=False, **options)
+        axes = figure.subplots(
+            rows,
+            columns,
+            squeeze=False,
+            sharex=sharex,
+            sharey=sharey,
+            height_ratios=height_ratios,
+        )
+        yield figure, axes
 
 
 @contextmanager
@@ -108,59 +151,103 @@ def joint_panels(
     y_label: str,
     *,
     height: float,
-    sharey: bool | Literal["row"] = True,
+    sharey: Sharing = True,
 ) -> Iterator[tuple[Figure, dict[str, Axes]]]:
-    """Make a figure with one titled panel per joint, `height` inches a row.
+    """Make a figure with one titled panel for each joint.
 
     The lowest panel of each column and the first of each row are labelled.
+
+    Args:
+        names: Names of the joints.
+        x_label: Label of the horizontal axes.
+        y_label: Label of the vertical axes.
+        height: Height of a row of panels [in].
+        sharey: As of `drawing`.
+
+    Yields:
+        The figure, and the axes by joint.
     """
     rows = grid_of_joints(names)
-    shape, size = (len(rows), max(map(len, rows))), height * len(rows) + 0.7
-    with drawing(*shape, height=size, sharex=True, sharey=sharey) as (figure, grid):
-        panels = {name: grid[r, c] for r, row in enumerate(rows) for c, name in enumerate(row)}
-        for axes in set(grid.flat) - set(panels.values()):
+    column_count = max(map(len, rows))
+    figure_height = height * len(rows) + 0.7
+    with drawing(len(rows), column_count, height=figure_height, sharex=True, sharey=sharey) as (
+        figure,
+        grid,
+    ):
+        panels: dict[str, Axes] = {}
+        lowest: dict[int, Axes] = {}
+        for axes in grid.flat:
             axes.set_visible(False)
-        for name, axes in panels.items():
-            axes.set_title(joint_words(name))
-        for row in rows:
+        for row_number, row in enumerate(rows):
+            for column_number, name in enumerate(row):
+                axes = grid[row_number, column_number]
+                axes.set_visible(True)
+                axes.set_title(joint_words(name))
+                panels[name] = axes
+                lowest[column_number] = axes
             panels[row[0]].set_ylabel(y_label)
-        for name in {c: name for row in rows for c, name in enumerate(row)}.values():
-            panels[name].set_xlabel(x_label)
-            panels[name].tick_params(labelbottom=True)
+        for axes in lowest.values():
+            axes.set_xlabel(x_label)
+            axes.tick_params(labelbottom=True)
         yield figure, panels
 
 
 def grid_of_joints(names: Sequence[str]) -> list[list[str]]:
-    """Return joint names in rows: one row per joint group if equally long, else threes."""
+    """Return joint names in rows: a row for each joint group if equally long, otherwise threes."""
     groups: dict[str, list[str]] = {}
     for name in names:
         leg = leg_of(name)
-        groups.setdefault(name.removeprefix(f"{leg}_") if leg else "", []).append(name)
+        group = name.removeprefix(f"{leg}_") if leg else ""
+        groups.setdefault(group, []).append(name)
     rows = list(groups.values())
-    if "" not in groups and len({len(row) for row in rows}) == 1 and len(rows[0]) > 1:
+    lengths = {len(row) for row in rows}
+    if "" not in groups and len(lengths) == 1 and len(rows[0]) > 1:
         return rows
-    return [list(names[i : i + 3]) for i in range(0, len(names), 3)]
+    return [list(names[start : start + 3]) for start in range(0, len(names), 3)]
 
 
-def key(label: str, **look: Any) -> Line2D:
+def key(label: str, **look: Unpack[Look]) -> Line2D:
     """Return an entry of a legend."""
     return Line2D([], [], label=label, **look)
 
 
-def legend(figure: Figure, keys: Sequence[Any], columns: int | None = None, **look: Any) -> None:
-    """Put a legend below all axes of a figure."""
-    columns = columns or min(len(keys), 6)
-    figure.legend(handles=keys, loc="outside lower center", ncols=columns, **look)
+def legend(
+    figure: Figure,
+    keys: Sequence[Any],
+    columns: int | None = None,
+    *,
+    facecolor: str | None = None,
+) -> None:
+    """Put a legend below all axes of a figure.
+
+    Args:
+        figure: The figure.
+        keys: Entries, as `key` makes them.
+        columns: Columns of the legend; up to six if None.
+        facecolor: Colour of a frame behind it; no frame if None.
+    """
+    figure.legend(
+        handles=keys,
+        loc="outside lower center",
+        ncols=columns or min(len(keys), 6),
+        facecolor=facecolor,
+        frameon=facecolor is not None,
+        edgecolor="none",
+    )
 
 
 def frequency_axis(axes: Axes, low_hz: float, high_hz: float) -> None:
     """Set a logarithmic frequency axis with plain numbers; 1, 2, 5 a decade where they fit."""
-    bases = (1, 2, 5) if high_hz < 1000.0 * low_hz else (1,)
-    ticks = [base * 10.0**power for power in range(-3, 4) for base in bases]
+    digits = (1, 2, 5) if high_hz < 1000.0 * low_hz else (1,)
+    ticks_hz = []
+    for power in range(-3, 4):
+        for digit in digits:
+            tick_hz = digit * 10.0**power
+            if low_hz * 0.999 <= tick_hz <= high_hz * 1.001:
+                ticks_hz.append(tick_hz)
     axes.set_xscale("log")
     axes.set_xlim(low_hz, high_hz)
-    inside = [hz for hz in ticks if low_hz * 0.999 <= hz <= high_hz * 1.001]
-    axes.xaxis.set_major_locator(FixedLocator(inside))
+    axes.xaxis.set_major_locator(FixedLocator(ticks_hz))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
@@ -180,12 +267,17 @@ def data_uri(data: bytes, kind: str) -> str:
 
 
 def picture(figure: Figure, *, dense: bool = False) -> str:
-    """Return a figure as a `data:` address; as PNG if `dense`: many marks make a large SVG."""
-    return data_uri(render(figure, "png"), "png") if dense else data_uri(render(figure), "svg+xml")
+    """Return a figure as a `data:` address; as PNG if `dense`.
+
+    Many marks make a large SVG.
+    """
+    if dense:
+        return data_uri(render(figure, "png"), "png")
+    return data_uri(render(figure), "svg+xml")
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as SVG or PNG, by the suffix of `path`, whole or not at all."""
-    with written_whole(path) as aside:
-        aside.write_bytes(render(figure, path.suffix.lstrip("."), dpi=150))
+    """Write a figure as SVG or PNG, by the suffix of the path, whole or not at all."""
+    with written_whole(path) as temporary:
+        temporary.write_bytes(render(figure, path.suffix.lstrip("."), dpi=150))
     return path
