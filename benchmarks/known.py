@@ -20,10 +20,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from benchmarks.peers import POPULATION, Estimate, fit_cma, fit_sysid, import_peers
-from benchmarks.runner import Progress, finish, machine
+from benchmarks.runner import Progress, machine
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.excitation.signals import Chirp
@@ -32,6 +31,7 @@ from pronk.identify.match.match import match
 from pronk.identify.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from pronk.tables import Cell, Column, Table
 from tests.synthetic_log import Excitation, coloured_noise, synthetic_log
 
 ROBOT = "mini_cheetah"
@@ -81,19 +81,22 @@ def known_log(
     threads: int = 2,
 ) -> JointLog:
     """Return a log of `JOINT` with the gains `KNOWN`: the same chirp `repeats` times."""
-    signal, rate = Chirp(length_s=length_s), 1.0 / robot.timestep_s
+    signal = Chirp(length_s=length_s)
+    rate_hz = 1.0 / robot.timestep_s
     chirp = Excitation(
         offsets=signal.samples(robot.policy_rate_hz), band_hz=signal.band_hz, repeats=repeats
     )
     factors = 1.0 + scenario.gain_spread * rng.standard_normal((repeats, 2))
-    shape = (repeats, round((length_s + 2.0) * rate))
-    noise = coloured_noise(rng, shape, deviation=scenario.noise_rad, corner_hz=2.0, rate_hz=rate)
+    shape = (repeats, round((length_s + 2.0) * rate_hz))
+    noise = coloured_noise(rng, shape, deviation=scenario.noise_rad, corner_hz=2.0, rate_hz=rate_hz)
+    stiffness, damping = KNOWN
     return synthetic_log(
         robot,
         JOINT,
         [chirp],
-        *(np.array(KNOWN) * factors).T,
-        rate_hz=rate,
+        stiffness * factors[:, 0],
+        damping * factors[:, 1],
+        rate_hz=rate_hz,
         noise=list(noise),
         delay_s=scenario.delay_s,
         frictionloss=scenario.friction_factor * robot.joint(JOINT).drive.frictionloss,
@@ -106,11 +109,11 @@ def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
     before = time.perf_counter()
     settings = MatchSettings(zero_armature=False, threads=threads)
     result = match([log], robot, method="paper", settings=settings)
-    found = result.gains.joints[JOINT]
+    gains = result.gains.joints[JOINT]
     return Estimate(
-        stiffness=found.stiffness.value,
-        damping=found.damping.value,
-        interval=(found.stiffness.repeat95, found.damping.repeat95),
+        stiffness=gains.stiffness.value,
+        damping=gains.damping.value,
+        interval=(gains.stiffness.repeat95, gains.damping.repeat95),
         seconds=time.perf_counter() - before,
     )
 
@@ -123,7 +126,8 @@ def tools(
     shared: dict[str, Any] = {"joint": JOINT, "robot": robot, "threads": threads}
     shared["bounds"] = robot.grid_stiffness, robot.grid_damping
     shared["start"] = joint.stiffness, joint.damping
-    sysid, cma = partial(fit_sysid, **shared), partial(fit_cma, seed=seed + 1, **shared)
+    sysid = partial(fit_sysid, **shared)
+    cma = partial(fit_cma, seed=seed + 1, **shared)
     chosen: dict[str, Callable[[JointLog], Estimate]] = {
         "pronk": partial(fit_pronk, robot=robot, threads=threads),
         "mujoco.sysid": sysid,
@@ -155,7 +159,7 @@ def run(
         raise PronkError(f"{trials} trials of {repeats} repeats; expected 1 or more of each.")
     import_peers()
     robot = load_robot(ROBOT)
-    found: dict[tuple[str, str], list[Estimate]] = {}
+    estimates: dict[tuple[str, str], list[Estimate]] = {}
     for index, scenario in enumerate(scenarios):
         for trial in range(trials):
             rng = np.random.default_rng([seed, index, trial])
@@ -163,9 +167,12 @@ def run(
                 robot, scenario, rng, repeats=repeats, length_s=length_s, threads=threads
             )
             for name, fit in tools(robot, scenario, seed=seed, threads=threads).items():
-                found.setdefault((scenario.name, name), []).append(fit(log))
+                estimates.setdefault((scenario.name, name), []).append(fit(log))
             progress("known", (index * trials + trial + 1) / (trials * len(scenarios)))
-    return [summary(*key, estimates) for key, estimates in found.items()]
+    rows = []
+    for (scenario_name, tool), tool_estimates in estimates.items():
+        rows.append(summary(scenario_name, tool, tool_estimates))
+    return rows
 
 
 def summary(scenario: str, tool: str, estimates: Sequence[Estimate]) -> dict[str, Any]:
@@ -175,52 +182,75 @@ def summary(scenario: str, tool: str, estimates: Sequence[Estimate]) -> dict[str
     trials, `half_width` of the 95 % intervals. `intervals` were given, `covered` of them hold the
     known gain. Means of `seconds` and `delay_ms`; `estimates` in N m/rad, N m s/rad.
     """
-    gains, known = np.array([(one.stiffness, one.damping) for one in estimates]), np.array(KNOWN)
-    error = 100.0 * (gains / known - 1.0)
-    nan = np.full(2, np.nan)
-    bounds = np.array([one.interval for one in estimates if one.interval]).reshape(-1, 2, 2)
-    half = 50.0 * np.diff(bounds, axis=-1)[..., 0] / known
-    delays = [one.delay_s for one in estimates if one.delay_s is not None]
+    gains = []
+    bounds = []
+    delays_s = []
+    seconds = []
+    for estimate in estimates:
+        gains.append((estimate.stiffness, estimate.damping))
+        seconds.append(estimate.seconds)
+        if estimate.interval:
+            bounds.append(estimate.interval)
+        if estimate.delay_s is not None:
+            delays_s.append(estimate.delay_s)
+    known_gains = np.array(KNOWN)
+    error_percent = 100.0 * (np.array(gains) / known_gains - 1.0)
+    unknown = np.full(2, np.nan)
+    intervals = np.array(bounds).reshape(-1, 2, 2)
+    covered = (intervals[..., 0] <= known_gains) & (known_gains <= intervals[..., 1])
+    half_widths = 50.0 * (intervals[..., 1] - intervals[..., 0]) / known_gains
     return {
         "scenario": scenario,
         "tool": tool,
         "trials": len(estimates),
-        "bias": error.mean(axis=0),
-        "sd": error.std(axis=0, ddof=1) if len(estimates) > 1 else nan,
-        "intervals": 2 * len(bounds),
-        "covered": int(((bounds[..., 0] <= known) & (known <= bounds[..., 1])).sum()),
-        "half_width": half.mean(axis=0) if len(bounds) else nan,
-        "seconds": float(np.mean([one.seconds for one in estimates])),
-        "delay_ms": 1e3 * float(np.mean(delays)) if delays else float("nan"),
-        "estimates": gains,
+        "bias": error_percent.mean(axis=0),
+        "sd": error_percent.std(axis=0, ddof=1) if len(estimates) > 1 else unknown,
+        "intervals": 2 * len(intervals),
+        "covered": int(covered.sum()),
+        "half_width": half_widths.mean(axis=0) if len(intervals) else unknown,
+        "seconds": float(np.mean(seconds)),
+        "delay_ms": 1e3 * float(np.mean(delays_s)) if delays_s else float("nan"),
+        "estimates": np.array(gains),
     }
 
 
-def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
-    """Make a table with a section for each scenario."""
-    columns = ["tool", "logs", "stiffness [%]", "damping [%]", "coverage", "half-widths [%]"]
-    made = console.table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
-    scenario = None
-    for one in rows:
-        if one["scenario"] != scenario:
-            scenario = one["scenario"]
-            made.add_section()
-            made.add_row(f"[bold]{scenario}[/]")
-        errors = [
-            f"{bias:+.2f}" if np.isnan(sd) else f"{bias:+.2f} +/- {sd:.2f}"
-            for bias, sd in zip(one["bias"], one["sd"], strict=True)
-        ]
-        given = one["intervals"] > 0
-        made.add_row(
-            one["tool"],
-            str(one["trials"]),
-            *errors,
-            f"{one['covered']} of {one['intervals']}" if given else "no intervals",
-            "{:.2f} / {:.2f}".format(*one["half_width"]) if given else "",
-            f"{one['seconds']:.2f}",
-            "" if np.isnan(one["delay_ms"]) else f"{one['delay_ms']:.1f}",
+def make_table(rows: Sequence[dict[str, Any]], title: str, notes: Sequence[str] = ()) -> Table:
+    """Make a table of the rows of `summary`."""
+    cells: list[tuple[Cell, ...]] = []
+    for row in rows:
+        errors = []
+        for bias, deviation in zip(row["bias"], row["sd"], strict=True):
+            spread = "" if np.isnan(deviation) else f" +/- {deviation:.2f}"
+            errors.append(f"{bias:+.2f}{spread}")
+        coverage = "no intervals"
+        half_widths = ""
+        if row["intervals"]:
+            coverage = f"{row['covered']} of {row['intervals']}"
+            half_widths = "{:.2f} / {:.2f}".format(*row["half_width"])
+        cells.append(
+            (
+                row["scenario"],
+                row["tool"],
+                row["trials"],
+                *errors,
+                coverage,
+                half_widths,
+                row["seconds"],
+                row["delay_ms"],
+            )
         )
-    return made
+    columns = (
+        Column(heading="scenario"),
+        Column(heading="tool"),
+        Column(heading="logs"),
+        Column(heading="stiffness", unit="%"),
+        Column(heading="damping", unit="%"),
+        Column(heading="coverage"),
+        Column(heading="half-widths", unit="%"),
+        Column(heading="fit", unit="s", digits=2),
+        Column(heading="delay", unit="ms", digits=1),
+    )
+    return Table(title=title, columns=columns, rows=tuple(cells), notes=tuple(notes))
 
 
 def known(trials: int = 5, seed: int = 0) -> console.Outcome:
@@ -233,21 +263,33 @@ def known(trials: int = 5, seed: int = 0) -> console.Outcome:
     begin = time.perf_counter()
     with console.progress() as report:
         rows = run(trials, seed, report)
-    seconds, computer = time.perf_counter() - begin, machine("mujoco")
-    words = "; ".join(f"{one.name}: {one.words}" for one in SCENARIOS)
+    seconds = time.perf_counter() - begin
+    computer = machine("mujoco")
     title = (
         f"{JOINT}, known gains {KNOWN[0]:g} N m/rad and {KNOWN[1]:g} N m s/rad; {trials} logs of 5 "
         f"chirps a scenario, seed {seed}"
     )
-    caption = (
-        f"{words}.\nFree: stiffness and damping, and a delay where the name has it. Errors: "
-        "estimate over known gain, mean +/- sd over the logs. Coverage: 95 % intervals, of "
-        "stiffness and of damping, that hold the known gain. Half-widths: of stiffness / damping.\n"
+    notes = [f"{scenario.name}: {scenario.words}" for scenario in SCENARIOS]
+    notes.append(
+        "Free: stiffness and damping, and a delay where the name has it. Errors: estimate over "
+        "known gain, mean +/- sd over the logs. Coverage: 95 % intervals, of stiffness and of "
+        "damping, that hold the known gain. Half-widths: of stiffness / damping."
+    )
+    notes.append(
         f"CMA-ES in PACE's manner: {POPULATION} simulations a generation on this CPU; PACE runs "
         f"4,096 on a GPU. {computer['cores']} cores ({computer['processor']}), MuJoCo "
         f"{computer['mujoco']}, Python {computer['python']}; {seconds:.0f} s in all."
     )
-    about_known = {"joint": JOINT, "known": KNOWN, "scenarios": [asdict(one) for one in SCENARIOS]}
-    about = {"trials": trials, "seed": seed, "machine": computer, "seconds": seconds}
-    figures = {"schema": "pronk/bench-known/3", "rows": rows} | about_known | about
-    return finish(figures, show(rows, title, caption))
+    console.show(make_table(rows, title, notes))
+    figures = {
+        "schema": "pronk/bench-known/3",
+        "rows": rows,
+        "joint": JOINT,
+        "known": KNOWN,
+        "scenarios": [asdict(scenario) for scenario in SCENARIOS],
+        "trials": trials,
+        "seed": seed,
+        "machine": computer,
+        "seconds": seconds,
+    }
+    return console.Outcome(figures=figures)

@@ -111,10 +111,10 @@ def match(
     members = joints_of_groups(robot_spec, result)
     figures = summary(result)
     print_summary(result)
-    responses = [joint for joint in result.joints.values() if joint.responses is not None]
+    has_responses = has_compared_responses(result)
     if mode == "drive":
         console.show(tables.drives_table(result))
-    if mode == "gains" or responses:
+    if mode == "gains" or has_responses:
         console.show(tables.gains_table(result))
         console.show(tables.ranges_table(result, members))
     positions = tables.positions_table(result)
@@ -153,18 +153,25 @@ def match(
 
 def joints_of_groups(robot: RobotSpec, result: MatchResult) -> dict[str, list[str]]:
     """Return the names of the matched joints of each joint group."""
-    members = {}
+    members: dict[str, list[str]] = {}
     for group in result.groups:
-        names = [joint.name for joint in robot.group(group)]
-        members[group] = [name for name in names if name in result.joints]
+        members[group] = []
+        for joint in robot.group(group):
+            if joint.name in result.joints:
+                members[group].append(joint.name)
     return members
+
+
+def has_compared_responses(result: MatchResult) -> bool:
+    """Return whether measured and simulated responses of any joint were compared."""
+    return any(joint.responses is not None for joint in result.joints.values())
 
 
 def print_summary(result: MatchResult) -> None:
     """Print how many joints were matched, the errors, and every flag."""
     matched = len(result.matched_joints)
     count = len(result.joints)
-    if any(joint.responses is not None for joint in result.joints.values()):
+    if has_compared_responses(result):
         console.say(
             f"{matched} of {count} joints matched. Gain error in the compared band, RMS over the "
             f"joints: {result.nominal_error_db:.2f} dB with the nominal gains of the real drive, "

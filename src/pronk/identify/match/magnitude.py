@@ -87,7 +87,9 @@ def mean_square(error_db: Array) -> Array:
     """Return the mean square [dB^2], shape (...), of gain errors [dB], shape (..., inside)."""
     clipped = np.clip(error_db, -DIVERGED_DB, DIVERGED_DB)
     finite = np.where(np.isfinite(error_db), clipped, DIVERGED_DB)
-    return np.asarray(np.mean(finite**2, axis=-1))
+    count = error_db.shape[-1]
+    # A product is several times faster than a mean along the last axis.
+    return np.asarray(finite**2 @ np.full(count, 1.0 / count))
 
 
 def search_grid(
