@@ -133,8 +133,8 @@ def test_what_no_amplitude_fits_and_what_the_drives_cannot_give_are_refused() ->
     bent = replace(ROBOT, joints=tuple(joints))
     with pytest.raises(PlanError, match="no amplitude fits"):
         make_plan(bent, ["FR_knee"], SHORT, repeats=1).check()
-    strong = {"FR_hip_pitch": 150.0}
-    plan = make_plan(ROBOT, ["FR_hip_pitch"], SHORT, stiffness=strong, amplitudes=(0.25,))
+    strong = {"FR_hip_pitch": (150.0, ROBOT.joint("FR_hip_pitch").damping)}
+    plan = make_plan(ROBOT, ["FR_hip_pitch"], SHORT, drive_gains=strong, amplitudes=(0.25,))
     with pytest.raises(PlanError, match="times the torque that its drive gives"):
         plan.check()
 
@@ -152,7 +152,7 @@ def test_each_amplitude_may_have_repeats_of_its_own() -> None:
         (["FR_knee"], {"repeats": 0}, PlanError, "excites nothing"),
         (["FR_knee"], {"repeats": (3,)}, PlanError, "one an amplitude"),
         (["FR_elbow"], {}, RobotError, "FR_hip_roll, FR_hip_pitch"),
-        (["FR_knee"], {"stiffness": {"FR_knee": -1.0}}, PlanError, "stiffness"),
+        (["FR_knee"], {"drive_gains": {"FR_knee": (-1.0, 0.4)}}, PlanError, "stiffness"),
     ],
 )
 def test_impossible_plans_are_refused(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,40 +20,49 @@ from pronk.robots.robot import RobotSpec
 POSE_RAMP_S = 2.0
 """Time to move softly to the pose before the excitations of a joint [s]."""
 _BISECTIONS = 6
-"""Of an amplitude that is too large, to find one that fits: 1.6 % of it are left."""
+"""Halvings of the interval in which an amplitude that fits is searched: to 1.6 % of the amplitude
+that is too large."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedExcitation:
-    """A signal to one joint; repeats of it are numbered from 0."""
+    """A signal that will be sent to one joint."""
 
     joint: str
+    """Name of the joint."""
     signal: Signal
+    """The signal."""
     repeat: int = 0
+    """Number of this repeat of the same signal, from 0."""
     clamped: tuple[str, ...] = ()
-    """Joints fixed mechanically meanwhile."""
+    """Names of the joints that are fixed mechanically during the excitation."""
     sign: float = 1.0
-    """Mirror-image joints are excited mirrored, so that the match simulates each family once."""
+    """Factor of the signal, 1 or -1: mirror-image joints are excited mirrored, so that the match
+    simulates each family once."""
 
     def offsets(self, rate_hz: float) -> Array:
-        """Command offsets about the pose [rad], shape (ticks,)."""
+        """Return command offsets about the pose at each tick [rad], shape (ticks,)."""
         return np.asarray(self.sign * self.signal.samples(rate_hz))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPlan:
-    """Excitations in the order of the sweep. Build it with `make_plan`."""
+    """Excitations in the order of the sweep, as `make_plan` builds them."""
 
     robot: RobotSpec
+    """The robot."""
     excitations: tuple[PlannedExcitation, ...]
+    """Excitations, joint by joint, the largest amplitude of each joint first."""
     rate_hz: float
-    """Rate of the commands."""
+    """Rate of the commands [Hz]."""
     settle_s: float
     """Rest after each excitation, logged as its part [s]."""
     stiffness: Array
+    """Stiffness on the drives [N m/rad], shape (joints,)."""
     damping: Array
-    """Gains on the drives [N m/rad], [N m s/rad], shape (joints,)."""
+    """Damping on the drives [N m s/rad], shape (joints,)."""
     uncertainty: Uncertainty
+    """Differences of the robot from its model that the worst case covers."""
     forecasts: tuple[Forecast, ...] = ()
     """Worst case of the loudest excitation of each joint, for it and its neighbours, over every
     corner of the uncertainty; quieter ones of the same signal stay inside."""
@@ -66,101 +74,129 @@ class SweepPlan:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Excited joints, in order; one log file each."""
-        return tuple(dict.fromkeys(each.joint for each in self.excitations))
+        """Names of the excited joints, in order; each has a log file of its own."""
+        return tuple(dict.fromkeys(excitation.joint for excitation in self.excitations))
 
     def seconds(self, excitation: PlannedExcitation) -> float:
-        """Time of one excitation, its rest included [s]."""
+        """Return the time of one excitation, its rest included [s]."""
         return excitation.signal.duration_s(self.rate_hz) + self.settle_s
 
     @property
     def duration_s(self) -> float:
         """Time of the whole sweep on the machine's clock [s]."""
-        excited = sum(self.seconds(each) for each in self.excitations)
-        return excited + len(self.joints) * (POSE_RAMP_S + 2.0 * self.settle_s)
+        excited_s = sum(self.seconds(excitation) for excitation in self.excitations)
+        return excited_s + len(self.joints) * (POSE_RAMP_S + 2.0 * self.settle_s)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """The forecasts as a table: a row per joint, worst case over the uncertainty."""
-        units = {
-            **dict.fromkeys(("amplitude", "lowest", "highest"), "rad"),
-            **dict.fromkeys(("speed", "no_load_speed"), "rad_s"),
-            **dict.fromkeys(("torque", "effort_limit"), "nm"),
-            **dict.fromkeys(("mechanical_power", "electrical_power"), "w"),
-            "bus_current": "a",
-        }
-        return [
-            {"joint": f.joint, "torque_share": f.torque_share}
-            | {"range_low_rad": f.range[0], "range_high_rad": f.range[1]}
-            | {f"{name}_{unit}": getattr(f, name) for name, unit in units.items()}
-            for f in self.forecasts
-            if f.amplitude > 0.0
-        ]
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return the worst case of each excited joint, one row a joint, for JSON."""
+        rows: list[dict[str, str | float]] = []
+        for worst in self.forecasts:
+            if worst.amplitude == 0.0:
+                continue
+            rows.append(
+                {
+                    "joint": worst.joint,
+                    "amplitude_rad": worst.amplitude,
+                    "lowest_rad": worst.lowest,
+                    "range_low_rad": worst.range[0],
+                    "highest_rad": worst.highest,
+                    "range_high_rad": worst.range[1],
+                    "speed_rad_s": worst.speed,
+                    "no_load_speed_rad_s": worst.no_load_speed,
+                    "torque_nm": worst.torque,
+                    "effort_limit_nm": worst.effort_limit,
+                    "torque_share": worst.torque_share,
+                    "mechanical_power_w": worst.mechanical_power,
+                    "electrical_power_w": worst.electrical_power,
+                    "bus_current_a": worst.bus_current,
+                }
+            )
+        return rows
 
     def check(self) -> None:
         """Refuse a sweep that could exceed a limit.
 
-        The PlanError names joint, number, limit, and the amplitude that fits in simulation.
+        Raises:
+            PlanError: A joint could exceed a limit; the message names joint, number, limit, and
+                the amplitude that fits in simulation.
         """
         for worst in self.forecasts:
-            if not (breach := next(worst.breaches(), "")):
+            breach = next(worst.breaches(), "")
+            if not breach:
                 continue
             # The forecasts are of the largest amplitude, which comes first.
-            loudest = next(each for each in self.excitations if each.joint == worst.excited)
-            fits, unsure = self._fit(loudest), self.uncertainty
+            loudest = next(
+                excitation for excitation in self.excitations if excitation.joint == worst.excited
+            )
+            fitting_rad = self._fitting_amplitude(loudest)
             way_out = "no amplitude fits, so choose other joints or another pose"
-            if fits > 0.0:
-                way_out = f"an amplitude of {fits:.3g} rad fits"
+            if fitting_rad > 0.0:
+                way_out = f"an amplitude of {fitting_rad:.3g} rad fits"
             raise PlanError(
                 f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
                 f"could {breach} (inertia, gains and friction uncertain by "
-                f"{100 * unsure.inertia:.0f}, {100 * unsure.stiffness:.0f} and "
-                f"{100 * unsure.friction:.0f} %); {way_out}."
+                f"{100 * self.uncertainty.inertia:.0f}, {100 * self.uncertainty.stiffness:.0f} and "
+                f"{100 * self.uncertainty.friction:.0f} %); {way_out}."
             )
 
-    def _fit(self, excitation: PlannedExcitation) -> float:
-        """Largest amplitude that fits, by bisection [rad], rounded down; 0 if none does."""
-        fits, too_much = 0.0, 1.0
+    def _fitting_amplitude(self, excitation: PlannedExcitation) -> float:
+        """Find the largest amplitude that fits by bisection [rad]; 0 if none does."""
+        fitting = 0.0
+        too_large = 1.0
         for _ in range(_BISECTIONS):
-            share = 0.5 * (fits + too_much)
-            amplitude = share * excitation.signal.amplitude
-            quieter = replace(excitation, signal=replace(excitation.signal, amplitude=amplitude))
-            exceeds = any(any(found.breaches()) for found in self._worst(quieter, {}))
-            fits, too_much = (fits, share) if exceeds else (share, too_much)
-        amplitude = fits * excitation.signal.amplitude
+            share = 0.5 * (fitting + too_large)
+            signal = replace(excitation.signal, amplitude=share * excitation.signal.amplitude)
+            if self._exceeds(replace(excitation, signal=signal)):
+                too_large = share
+            else:
+                fitting = share
+        amplitude = fitting * excitation.signal.amplitude
         # Three significant digits.
         scale = 10.0 ** (np.floor(np.log10(amplitude or 1.0)) - 2)
         return float(np.floor(amplitude / scale * (1.0 + 1e-12)) * scale)
 
+    def _exceeds(self, excitation: PlannedExcitation) -> bool:
+        """Return True if a joint could exceed a limit during an excitation."""
+        breaches: list[str] = []
+        for worst in self._worst(excitation, {}):
+            breaches += worst.breaches()
+        return len(breaches) > 0
+
     def _worst(
         self, excitation: PlannedExcitation, cache: dict[tuple[object, ...], list[Forecast]]
     ) -> list[Forecast]:
-        """Forecasts of every joint of the chain; mirror-image legs are simulated once."""
-        robot, joint = self.robot, self.robot.joint(excitation.joint)
-        original, sign = joint.original
-        own = joint.chain or (joint.name,)
-        firsts = robot.joint(original).chain or (original,)
-        columns = [robot.joint_names.index(name) for name in own]
-        stiffness, damping = (
-            dict(zip(firsts, gains[columns].tolist(), strict=True))
-            for gains in (self.stiffness, self.damping)
-        )
-        offsets = sign * robot.joint(original).original[1] * excitation.offsets(self.rate_hz)
-        key = original, str((stiffness, damping)), offsets.tobytes()
+        """Forecast every joint of the chain; mirror-image legs are simulated once."""
+        robot = self.robot
+        excited = robot.joint(excitation.joint)
+        original_name, sign = excited.original
+        original = robot.joint(original_name)
+        chain = excited.chain or (excited.name,)
+        original_chain = original.chain or (original_name,)
+        stiffness = {}
+        damping = {}
+        names = {}
+        for name, simulated_name in zip(chain, original_chain, strict=True):
+            column = robot.joint_names.index(name)
+            stiffness[simulated_name] = float(self.stiffness[column])
+            damping[simulated_name] = float(self.damping[column])
+            names[simulated_name] = name
+        offsets = sign * original.original[1] * excitation.offsets(self.rate_hz)
+        key = (original_name, str((stiffness, damping)), offsets.tobytes())
         if key not in cache:
             cache[key] = forecast(
                 robot,
-                original,
+                original_name,
                 offsets,
                 rate_hz=self.rate_hz,
                 stiffness=stiffness,
                 damping=damping,
                 uncertainty=self.uncertainty,
             )
-        names = dict(zip(firsts, own, strict=True))
-        return [
-            replace(found.mirrored(robot, names[found.joint]), excited=excitation.joint)
-            for found in cache[key]
-        ]
+        forecasts = []
+        for simulated in cache[key]:
+            mirrored = simulated.mirrored(robot, names[simulated.joint])
+            forecasts.append(replace(mirrored, excited=excitation.joint))
+        return forecasts
 
 
 def make_plan(
@@ -171,22 +207,34 @@ def make_plan(
     amplitudes: Sequence[float] = (0.25, 0.125),
     repeats: int | Sequence[int] = 3,
     settle_s: float = 0.5,
-    stiffness: Mapping[str, float] | None = None,
-    damping: Mapping[str, float] | None = None,
+    drive_gains: Mapping[str, tuple[float, float]] | None = None,
     uncertainty: Uncertainty | None = None,
 ) -> SweepPlan:
     """Plan a sweep, and forecast its effect on the robot; call its `check` before anything moves.
 
-    One joint at a time (paper F1), in the order given, all in the robot's order if None. Joints
-    that the robot's file clamps for an excitation are clamped (paper F6), the others are held by
-    their drives (paper F5), with gains by joint instead of the robot's [N m/rad], [N m s/rad].
+    The joints are excited one at a time. Joints that the robot's file clamps for an excitation are
+    clamped, the others are held by their drives. Each excitation ends with a rest.
 
-    The `signal`, the paper's chirp if None, has each of `amplitudes` [rad] as its peak, `repeats`
-    times: one number for all or one each. Two amplitudes show friction; intervals need three
-    repeats of the largest, which is the one matched. Each excitation ends with a rest.
+    Args:
+        robot: The robot.
+        joints: Names of the joints to excite, in order; all in the robot's order if None.
+        signal: The signal; the paper's chirp if None.
+        amplitudes: Peaks of the signal [rad]. Two amplitudes show friction.
+        repeats: Times that each amplitude is repeated, one number for all or one each. Intervals
+            need three repeats of the largest amplitude, which is the one matched.
+        settle_s: Rest after each excitation [s].
+        drive_gains: Stiffness [N m/rad] and damping [N m s/rad] on the drives by joint, where they
+            are not the robot's.
+        uncertainty: Differences of the robot from its model; the defaults of `Uncertainty` if None.
+
+    Raises:
+        PlanError: The plan excites nothing, or a number cannot be.
+        RobotError: The robot has no such joint.
     """
+    # One joint at a time: paper F1. Held by their drives: F5. Clamped: F6.
+    stated_gains = drive_gains or {}
     names = robot.joint_names if joints is None else tuple(dict.fromkeys(joints))
-    for name in (*names, *(stiffness or {}), *(damping or {})):
+    for name in (*names, *stated_gains):
         robot.joint(name)
     counts = [repeats] * len(amplitudes) if isinstance(repeats, int) else list(repeats)
     if not names or not amplitudes or len(counts) != len(amplitudes) or min(counts) < 1:
@@ -197,36 +245,44 @@ def make_plan(
         )
     if not (np.isfinite(settle_s) and settle_s >= 0.0):
         raise PlanError(f"settle_s is {settle_s}; expected 0 s or more, for instance 0.5.")
-    signal = Chirp() if signal is None else signal
-    kp = np.array([(stiffness or {}).get(j.name, j.stiffness) for j in robot.joints])
-    kd = np.array([(damping or {}).get(j.name, j.damping) for j in robot.joints])
-    for label, values in (("stiffness", kp), ("damping", kd)):
+    stiffness = np.array([joint.stiffness for joint in robot.joints])
+    damping = np.array([joint.damping for joint in robot.joints])
+    for name, (joint_stiffness, joint_damping) in stated_gains.items():
+        column = robot.joint_names.index(name)
+        stiffness[column] = joint_stiffness
+        damping[column] = joint_damping
+    for label, values in (("stiffness", stiffness), ("damping", damping)):
         if not (np.isfinite(values).all() and (values >= 0.0).all()):
             raise PlanError(
                 f"a {label} on the drives is negative or not finite; expected 0 or more."
             )
-    times = sorted(zip(amplitudes, counts, strict=True), reverse=True)
-    excitations = tuple(
-        PlannedExcitation(
-            joint=name,
-            signal=replace(signal, amplitude=amplitude),
-            repeat=repeat,
-            clamped=robot.joint(name).clamped,
-            sign=robot.joint(name).original[1],
-        )
-        for name in names
-        for amplitude, count in dict(times).items()
-        for repeat in range(count)
-    )
+    base_signal = Chirp() if signal is None else signal
+    counts_by_amplitude = dict(sorted(zip(amplitudes, counts, strict=True), reverse=True))
+    excitations = []
+    for name in names:
+        joint = robot.joint(name)
+        for amplitude, count in counts_by_amplitude.items():
+            for repeat in range(count):
+                excitation = PlannedExcitation(
+                    joint=name,
+                    signal=replace(base_signal, amplitude=amplitude),
+                    repeat=repeat,
+                    clamped=joint.clamped,
+                    sign=joint.original[1],
+                )
+                excitations.append(excitation)
     plan = SweepPlan(
         robot=robot,
-        excitations=excitations,
+        excitations=tuple(excitations),
         rate_hz=robot.policy_rate_hz,
         settle_s=settle_s,
-        stiffness=kp,
-        damping=kd,
-        uncertainty=uncertainty or Uncertainty(),
+        stiffness=stiffness,
+        damping=damping,
+        uncertainty=Uncertainty() if uncertainty is None else uncertainty,
     )
     cache: dict[tuple[object, ...], list[Forecast]] = {}
-    loudest = [e for e in excitations if e.repeat == 0 and e.signal.amplitude == max(amplitudes)]
-    return replace(plan, forecasts=tuple(f for e in loudest for f in plan._worst(e, cache)))
+    forecasts: list[Forecast] = []
+    for excitation in excitations:
+        if excitation.repeat == 0 and excitation.signal.amplitude == max(amplitudes):
+            forecasts += plan._worst(excitation, cache)
+    return replace(plan, forecasts=tuple(forecasts))

@@ -21,10 +21,10 @@ POLICY_RATE_HZ = 50.0
 
 @dataclass(frozen=True, kw_only=True)
 class Signal(ABC):
-    """Base of the signals."""
+    """An excitation signal; the classes below are its kinds."""
 
     kind: ClassVar[str]
-    """Name in `pronk.identify.logs.joint_log.SIGNAL_KINDS`."""
+    """Name of the kind in `pronk.identify.logs.segment.SIGNAL_KINDS`."""
 
     amplitude: float = 0.25
     """Peak of the command about the pose [rad] (paper F3)."""
@@ -33,15 +33,16 @@ class Signal(ABC):
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite, not positive or out of order."""
-        self._positive("amplitude")
-        self._positive("ramp_s", zero=True)
+        self._require_positive("amplitude", self.amplitude)
+        self._require_not_negative("ramp_s", self.ramp_s)
 
-    def _positive(self, *names: str, zero: bool = False) -> None:
-        for name in names:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and (value > 0.0 or (zero and value == 0.0))):
-                expected = "0 or more" if zero else "a positive number"
-                raise PlanError(f"{type(self).__name__}.{name} is {value}; expected {expected}.")
+    def _require_positive(self, name: str, value: float) -> None:
+        if not (np.isfinite(value) and value > 0.0):
+            raise PlanError(f"{type(self).__name__}.{name} is {value}; expected a positive number.")
+
+    def _require_not_negative(self, name: str, value: float) -> None:
+        if not (np.isfinite(value) and value >= 0.0):
+            raise PlanError(f"{type(self).__name__}.{name} is {value}; expected 0 or more.")
 
     @property
     @abstractmethod
@@ -54,10 +55,15 @@ class Signal(ABC):
         return None
 
     def samples(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Command offsets at the ticks [rad], shape (ticks,); the first and the last are zero.
+        """Return command offsets at the ticks [rad], shape (ticks,), from zero to zero.
 
-        PlanError above half the rate: a held command carries nothing there (F4, reading A15).
+        Args:
+            rate_hz: Rate of the commands [Hz].
+
+        Raises:
+            PlanError: The signal goes above half the rate, where a held command carries nothing.
         """
+        # Paper F4, reading A15.
         if self.band_hz[1] > 0.5 * rate_hz * (1.0 + 1e-9):
             raise PlanError(
                 f"{type(self).__name__} goes up to {self.band_hz[1]:g} Hz, but commands at "
@@ -67,20 +73,20 @@ class Signal(ABC):
 
     @abstractmethod
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Instantaneous frequency at the ticks [Hz], shape (ticks,); NaN where there is none."""
+        """Return the instantaneous frequency at the ticks [Hz], (ticks,); NaN outside a sine."""
 
     @abstractmethod
     def _samples(self, rate_hz: float) -> Array: ...
 
     def duration_s(self, rate_hz: float = POLICY_RATE_HZ) -> float:
-        """Time from the first tick to the end of the last one [s]."""
+        """Return the time from the first tick to the end of the last one [s]."""
         return len(self.frequency(rate_hz)) / rate_hz
 
     def _ramp(self, rate_hz: float) -> int:
         """Ticks in a ramp."""
         return round(self.ramp_s * rate_hz)
 
-    def _ordered(self, low: float, high: float) -> None:
+    def _require_ordered(self, low: float, high: float) -> None:
         if not (np.isfinite(low) and np.isfinite(high) and 0.0 < low < high):
             raise PlanError(
                 f"{type(self).__name__} goes from {low} to {high} Hz; expected two positive "
@@ -89,7 +95,7 @@ class Signal(ABC):
 
 
 def ramps(ticks: int, ramp_ticks: int) -> Array:
-    """Half a cosine up from 0, ones, half a cosine down to exactly 0, shape (ticks,)."""
+    """Return half a cosine up from 0, ones, half a cosine down to exactly 0, shape (ticks,)."""
     if 2 * ramp_ticks > ticks:
         raise PlanError(
             f"two ramps of {ramp_ticks} ticks do not fit a signal of {ticks}; shorten the ramp or "
@@ -111,14 +117,16 @@ class Chirp(Signal):
     kind = "chirp"
 
     start_hz: float = 0.1
+    """Frequency at the start [Hz]."""
     stop_hz: float = 25.0
+    """Frequency at the end [Hz]."""
     length_s: float = 20.0
-    """Ramps included [s]."""
+    """Length, ramps included [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._positive("length_s")
-        self._ordered(self.start_hz, self.stop_hz)
+        self._require_positive("length_s", self.length_s)
+        self._require_ordered(self.start_hz, self.stop_hz)
 
     @property
     def band_hz(self) -> tuple[float, float]:
@@ -140,7 +148,7 @@ class Chirp(Signal):
         return share * (self.start_hz + 0.5 * (self.stop_hz - self.start_hz) * share)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
+        """Return the instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         share = self._time(rate_hz) / self.length_s
         return np.asarray(self.start_hz + (self.stop_hz - self.start_hz) * share)
 
@@ -156,7 +164,7 @@ class LogChirp(Chirp):
         return np.asarray(self.start_hz * np.expm1(ratio * share) / ratio)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
+        """Return the instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         share = self._time(rate_hz) / self.length_s
         return np.asarray(self.start_hz * (self.stop_hz / self.start_hz) ** share)
 
@@ -174,24 +182,31 @@ class Multisine(Signal):
     kind = "multisine"
 
     low_hz: float = 0.1
+    """Lowest frequency [Hz]."""
     high_hz: float = 20.0
+    """Highest frequency [Hz]."""
     lines: int = 40
     """Lines on the logarithmic grid, before those that fall on the same odd harmonic merge."""
     length_s: float = 10.0
-    """One period [s]; the lines are odd multiples of its inverse."""
+    """Length of one period [s]; the lines are odd multiples of its inverse."""
     periods: int = 4
     """Whole periods between the ramps; an estimator drops the first as transient."""
     tilt: float = 0.5
-    """A line's amplitude falls with its frequency to this power; 0 is flat. Speed and torque at
-    the high lines are what limits a flat one."""
+    """Power of the frequency with which the amplitude of a line falls; 0 makes all lines alike,
+    whose amplitude is then limited by speed and torque at the high lines."""
     draws: int = 200
+    """Draws of the phases."""
     seed: int = 0
+    """Seed of the draws."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._positive("length_s", "lines", "periods", "draws")
-        self._ordered(self.low_hz, self.high_hz)
-        self._positive("tilt", zero=True)
+        self._require_positive("length_s", self.length_s)
+        self._require_positive("lines", self.lines)
+        self._require_positive("periods", self.periods)
+        self._require_positive("draws", self.draws)
+        self._require_ordered(self.low_hz, self.high_hz)
+        self._require_not_negative("tilt", self.tilt)
         if not self.harmonic_numbers:
             raise PlanError(
                 f"Multisine: no odd multiple of {1.0 / self.length_s:g} Hz lies between "
@@ -201,13 +216,14 @@ class Multisine(Signal):
     @property
     def harmonic_numbers(self) -> tuple[int, ...]:
         """Excited odd harmonics, increasing: those nearest to a logarithmic grid."""
-        low, high = self.low_hz * self.length_s, self.high_hz * self.length_s
+        low = self.low_hz * self.length_s
+        high = self.high_hz * self.length_s
         lowest = 2 * int(np.ceil((low * (1.0 - 1e-9) - 1.0) / 2.0)) + 1
         highest = 2 * int(np.floor((high * (1.0 + 1e-9) - 1.0) / 2.0)) + 1
         if lowest > highest:
             return ()
         odd = 2 * np.round((np.geomspace(low, high, self.lines) - 1.0) / 2.0).astype(int) + 1
-        return tuple(int(h) for h in np.unique(np.clip(odd, lowest, highest)))
+        return tuple(np.unique(np.clip(odd, lowest, highest)).tolist())
 
     @property
     def lines_hz(self) -> Array:
@@ -225,7 +241,7 @@ class Multisine(Signal):
         return self.length_s
 
     def _period(self, rate_hz: float) -> int:
-        """Ticks in a period."""
+        """Return the ticks in a period; a PlanError if they are not whole."""
         exact = self.length_s * rate_hz
         if abs(exact - round(exact)) > 1e-6:
             raise PlanError(
@@ -235,7 +251,7 @@ class Multisine(Signal):
         return round(exact)
 
     def one_period(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """One period at the ticks, scaled to the amplitude [rad], shape (length_s * rate_hz,)."""
+        """Return one period at the ticks [rad], shape (length_s * rate_hz,)."""
         ticks = self._period(rate_hz)
         numbers = np.array(self.harmonic_numbers)
         if 2 * numbers[-1] >= ticks:
@@ -254,13 +270,14 @@ class Multisine(Signal):
         return np.asarray(self.amplitude * best / np.abs(best).max())
 
     def _samples(self, rate_hz: float) -> Array:
-        period, ramp = self.one_period(rate_hz), self._ramp(rate_hz)
+        period = self.one_period(rate_hz)
+        ramp = self._ramp(rate_hz)
         # Run the period on into both ramps, so that no phase jumps where they meet.
         index = np.arange(-ramp, len(self.frequency(rate_hz)) - ramp) % len(period)
         return np.asarray(period[index] * ramps(len(index), ramp))
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
+        """Return the instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         ramp = self._ramp(rate_hz)
         return np.full(self.periods * self._period(rate_hz) + ramp + max(ramp, 1), np.nan)
 
@@ -276,22 +293,25 @@ class SineSteps(Signal):
 
     kind = "sine_steps"
 
-    frequencies_hz: tuple[float, ...] = tuple(
-        float(f) for f in np.round(np.geomspace(0.5, 20.0, 16), 3)
-    )
+    frequencies_hz: tuple[float, ...] = tuple(np.round(np.geomspace(0.5, 20.0, 16), 3).tolist())
+    """Frequencies of the sines, in order [Hz]."""
     settle_cycles: int = 3
-    """Cycles before the measurement, and at least `settle_s`."""
+    """Cycles of each sine before its measurement, at least."""
     settle_s: float = 0.5
+    """Time of each sine before its measurement, at least [s]."""
     measure_cycles: int = 5
-    """Cycles measured, and at least `measure_s`."""
+    """Cycles of each sine that are measured, at least."""
     measure_s: float = 1.0
+    """Time of each sine that is measured, at least [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._positive("settle_cycles", "measure_cycles")
-        self._positive("settle_s", "measure_s", zero=True)
-        bad = [f for f in self.frequencies_hz if not (np.isfinite(f) and f > 0.0)]
-        if bad or not self.frequencies_hz:
+        self._require_positive("settle_cycles", self.settle_cycles)
+        self._require_positive("measure_cycles", self.measure_cycles)
+        self._require_not_negative("settle_s", self.settle_s)
+        self._require_not_negative("measure_s", self.measure_s)
+        positive = all(np.isfinite(hz) and hz > 0.0 for hz in self.frequencies_hz)
+        if not positive or not self.frequencies_hz:
             raise PlanError(
                 f"SineSteps.frequencies_hz are {self.frequencies_hz}; expected positive numbers."
             )
@@ -302,16 +322,20 @@ class SineSteps(Signal):
         return min(self.frequencies_hz), max(self.frequencies_hz)
 
     def windows(self, rate_hz: float = POLICY_RATE_HZ) -> tuple[tuple[int, int, float], ...]:
-        """First tick, end tick and exact frequency [Hz] of each measurement, whole cycles."""
+        """Return first tick, end tick and exact frequency [Hz] of each measurement.
+
+        Each measurement has whole cycles.
+        """
         if max(self.frequencies_hz) >= 0.5 * rate_hz:
             raise PlanError(
                 f"SineSteps goes up to {max(self.frequencies_hz):g} Hz, but commands at "
                 f"{rate_hz:g} Hz stay below {0.5 * rate_hz:g} Hz; lower the highest frequency."
             )
-        windows, tick = [], self._ramp(rate_hz)
-        for wanted in self.frequencies_hz:
-            cycles = max(self.measure_cycles, int(np.ceil(self.measure_s * wanted)))
-            measured = round(cycles * rate_hz / wanted)
+        windows = []
+        tick = self._ramp(rate_hz)
+        for stated_hz in self.frequencies_hz:
+            cycles = max(self.measure_cycles, int(np.ceil(self.measure_s * stated_hz)))
+            measured = round(cycles * rate_hz / stated_hz)
             exact = cycles * rate_hz / measured
             settle = int(np.ceil(max(self.settle_cycles / exact, self.settle_s) * rate_hz))
             windows.append((tick + settle, tick + settle + measured, exact))
@@ -319,8 +343,9 @@ class SineSteps(Signal):
         return tuple(windows)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
-        windows, begin = self.windows(rate_hz), self._ramp(rate_hz)
+        """Return the instantaneous frequency at the ticks [Hz], shape (ticks,)."""
+        windows = self.windows(rate_hz)
+        begin = self._ramp(rate_hz)
         frequency = np.full(windows[-1][1] + max(begin, 1), np.nan)
         for _, end, exact in windows:
             frequency[begin:end] = exact
@@ -328,7 +353,8 @@ class SineSteps(Signal):
         return frequency
 
     def _samples(self, rate_hz: float) -> Array:
-        windows, frequency = self.windows(rate_hz), self.frequency(rate_hz)
+        windows = self.windows(rate_hz)
+        frequency = self.frequency(rate_hz)
         # The first and the last sine run on into the ramps.
         frequency[: windows[0][0]] = windows[0][2]
         frequency[windows[-1][1] :] = windows[-1][2]

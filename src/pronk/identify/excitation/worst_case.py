@@ -32,53 +32,60 @@ SETTLE_S = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
-    """How far the robot may be from its model, in shares of the model's values."""
+    """Largest differences of the robot from its model, as shares of the model's values."""
 
     inertia: float = 0.2
-    """Masses, link inertias and armature. The paper's own gains amount to 3 to 29 % (reading
-    A10); Cheetah-Software's rotor is 13 % lighter than the paper's (reading A11)."""
+    """Share of masses, link inertias and armature. The paper's own gains amount to 3 to 29 %
+    (reading A10); Cheetah-Software's rotor is 13 % lighter than the paper's (reading A11)."""
     stiffness: float = 0.1
-    """Torque constant and with it both gains. An assumption: no data sheet gives it."""
+    """Share of the torque constant, and with it of both gains. It is assumed, as no data sheet
+    gives it."""
     friction: float = 1.0
-    """Dry friction: from none to twice the model's."""
+    """Share of the dry friction: 1 for none to twice the model's."""
 
     def corners(self) -> list[tuple[float, float, float]]:
-        """(inertia, stiffness, friction) factors: the model itself, then the eight corners."""
-        a, b, c = ((1.0 - w, 1.0 + w) for w in (self.inertia, self.stiffness, self.friction))
-        return [(1.0, 1.0, 1.0), *product(a, b, c)]
+        """Return factors of inertia, stiffness and friction: 1 each, then the eight corners."""
+        inertia = (1.0 - self.inertia, 1.0 + self.inertia)
+        stiffness = (1.0 - self.stiffness, 1.0 + self.stiffness)
+        friction = (1.0 - self.friction, 1.0 + self.friction)
+        return [(1.0, 1.0, 1.0), *product(inertia, stiffness, friction)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """Extremes of one joint over an excitation and over every corner of the uncertainty.
-
-    Positions [rad], speeds [rad/s], torques [N m], powers [W] and the current from the bus [A].
-    """
+    """Extremes of one joint over an excitation and over every corner of the uncertainty."""
 
     joint: str
+    """Name of the joint."""
     excited: str
-    """The excited joint: this one, or a neighbour of it."""
+    """Name of the excited joint: this joint, or a neighbour of it."""
     amplitude: float
-    """Peak of the command; 0 for a joint that is only held."""
+    """Peak of the command [rad]; 0 for a joint that is only held."""
     lowest: float
+    """Lowest position [rad]."""
     highest: float
+    """Highest position [rad]."""
     range: tuple[float, float]
-    """Mechanical limits."""
+    """Lower and upper mechanical limit [rad]."""
     speed: float
+    """Greatest speed [rad/s]."""
     no_load_speed: float
-    """Speed at which back-EMF takes the whole bus voltage."""
+    """Speed at which back-EMF takes all of the bus voltage [rad/s]."""
     torque: float
-    """Greatest torque that the controller commands."""
+    """Greatest torque that the controller commands [N m]."""
     effort_limit: float
+    """Greatest torque of the drive at standstill [N m]."""
     torque_share: float
-    """Greatest share of the torque available at the speed of the moment [1]."""
+    """Greatest torque, as a share of the torque available at the speed of the moment."""
     mechanical_power: float
+    """Greatest mechanical power [W]."""
     electrical_power: float
-    """Greatest power from the bus."""
+    """Greatest power from the bus [W]."""
     bus_current: float
+    """Greatest current from the bus [A]."""
 
     def breaches(self) -> Iterator[str]:
-        """What could be exceeded: what the joint could do, and the limit, in words."""
+        """Yield what the joint could do and the limit that it would exceed, in words."""
         low, high = self.range
         if self.lowest < low:
             yield f"reach {self.lowest:.3f} rad, below its range at {low:.3f} rad"
@@ -97,11 +104,11 @@ class Forecast:
             )
 
     def mirrored(self, robot: RobotSpec, joint: str) -> Forecast:
-        """The same for a joint that mirrors this one."""
-        own = robot.joint(joint)
-        sign = own.original[1] * robot.joint(self.joint).original[1]
-        ends = sorted((sign * self.lowest, sign * self.highest))
-        return replace(self, joint=joint, lowest=ends[0], highest=ends[1], range=own.range)
+        """Return the forecast of a joint that mirrors this one."""
+        mirrored = robot.joint(joint)
+        sign = mirrored.original[1] * robot.joint(self.joint).original[1]
+        ends = (sign * self.lowest, sign * self.highest)
+        return replace(self, joint=joint, lowest=min(ends), highest=max(ends), range=mirrored.range)
 
 
 def forecast(
@@ -115,16 +122,29 @@ def forecast(
     uncertainty: Uncertainty | None = None,
     timestep_s: float = TIMESTEP_S,
 ) -> list[Forecast]:
-    """Simulate the bench model in every corner of the uncertainty; a forecast a joint of the chain.
+    """Simulate the bench model in every corner of the uncertainty.
 
-    `offsets` of the command about the default pose [rad] have shape (ticks,); `stiffness` and
-    `damping` are those of the real drives by joint. PlanError if the simulation diverges.
+    Args:
+        robot: The robot.
+        joint: Name of the excited joint.
+        offsets: Command offsets about the default pose at each tick [rad], shape (ticks,).
+        rate_hz: Rate of the ticks [Hz].
+        stiffness: Stiffness on the real drives by joint [N m/rad].
+        damping: Damping on the real drives by joint [N m s/rad].
+        uncertainty: Differences of the robot from its model; the defaults of `Uncertainty` if None.
+        timestep_s: Physics step [s].
+
+    Returns:
+        A forecast for each joint of the chain.
+
+    Raises:
+        PlanError: The simulation diverges.
     """
     spec = bench_spec(robot, joint, stiffness=stiffness, damping=damping)
     spec.option.timestep = timestep_s
     model = spec.compile()
     order = [model.actuator(i).name for i in range(model.nu)]
-    pose = np.array([robot.joint(n).default_position for n in order])
+    pose = np.array([robot.joint(name).default_position for name in order])
     command = np.tile(pose, (round(SETTLE_S * rate_hz) + len(offsets), 1))
     command[-len(offsets) :, order.index(joint)] += offsets
     steps = np.repeat(command, round(1.0 / (rate_hz * timestep_s)), axis=0)
@@ -138,8 +158,13 @@ def forecast(
         altered.dof_frictionloss[:] *= friction
         mujoco.mj_setConst(altered, mujoco.MjData(altered))
         for name in order:
-            gains = strength * stiffness[name], strength * damping[name]
-            set_drive_gains(altered, name, robot.joint(name).drive, *gains)
+            set_drive_gains(
+                altered,
+                name,
+                robot.joint(name).drive,
+                strength * stiffness[name],
+                strength * damping[name],
+            )
         models.append(altered)
     position, velocity = _roll(models, order, steps)
     if not (np.isfinite(position).all() and np.abs(velocity).max() < 1e4):
@@ -147,18 +172,19 @@ def forecast(
             f"{joint}: the simulation of the excitation diverges; its gains "
             f"({stiffness[joint]:g} N m/rad, {damping[joint]:g} N m s/rad) are not stable."
         )
-    scale = np.array(corners)[:, 1:2]
+    strengths = np.array(corners)[:, 1:2]
     forecasts = []
     for i, name in enumerate(order):
-        q, v = position[..., i], velocity[..., i]
-        torque = scale * stiffness[name] * (steps[:, i] - q) - scale * damping[name] * v
         drive = robot.joint(name).drive
+        q = position[..., i]
+        v = velocity[..., i]
+        torque = strengths * stiffness[name] * (steps[:, i] - q) - strengths * damping[name] * v
         low, high = torque_limits(v, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
         # A drive that can give nothing at this speed exceeds its limit with any command.
         available = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
-        given = np.clip(torque, low, high)
+        produced = np.clip(torque, low, high)
         power = electrical_power(
-            given,
+            produced,
             v,
             gear_ratio=drive.gear_ratio,
             torque_constant=drive.torque_constant,
@@ -178,7 +204,7 @@ def forecast(
                 torque=float(np.abs(torque).max()),
                 effort_limit=drive.effort_limit,
                 torque_share=float((np.abs(torque) / available).max()),
-                mechanical_power=float((given * v).max()),
+                mechanical_power=float((produced * v).max()),
                 electrical_power=float(power.max()),
                 bus_current=float((power / drive.bus_voltage).max()),
             )
@@ -189,7 +215,10 @@ def forecast(
 def _roll(
     models: Sequence[mujoco.MjModel], order: Sequence[str], steps: Array
 ) -> tuple[Array, Array]:
-    """Positions and velocities at the start of each step, each (models, steps, joints)."""
+    """Return positions and velocities at the start of each step, each (models, steps, joints).
+
+    `steps` holds the commands of all joints at each step [rad], shape (steps, joints).
+    """
     model = models[0]
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
@@ -206,6 +235,6 @@ def _roll(
         )
     before = np.concatenate([np.tile(initial, (len(models), 1, 1)), states[:, :-1]], axis=1)
     # Full physics begins with time, then qpos, then qvel (mjtState); a bench has hinges only.
-    columns = np.array([model.joint(n).qposadr[0] for n in order])
-    rates = np.array([model.joint(n).dofadr[0] for n in order])
+    columns = np.array([model.joint(name).qposadr[0] for name in order])
+    rates = np.array([model.joint(name).dofadr[0] for name in order])
     return before[..., 1 + columns], before[..., 1 + model.nq + rates]
