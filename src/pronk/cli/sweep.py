@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,32 +12,19 @@ import tyro
 from pronk.cli import console
 from pronk.cli.link_options import LinkOptions
 from pronk.errors import HardwareError
+from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
+    from pronk.deploy.runtime.limits import AgeLimits
     from pronk.deploy.runtime.plan import Link
     from pronk.deploy.runtime.records import Event
     from pronk.identify.excitation.plan import SweepPlan
+    from pronk.identify.excitation.signals import Signal
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""PlannedExcitation signals: classes of `pronk.identify.excitation.signals`, `log-chirp` for
-`LogChirp`."""
+"""Names of the excitation signals, whose classes are in `pronk.identify.excitation.signals`."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
-COLUMNS = {
-    "joint": "joint",
-    "amplitude [rad]": "amplitude_rad",
-    "lowest [rad];2": "lowest_rad",
-    "of;2": "range_low_rad",
-    "highest [rad];2": "highest_rad",
-    "of ;2": "range_high_rad",
-    "speed [rad/s];1": "speed_rad_s",
-    "of no-load;1": "no_load_speed_rad_s",
-    "torque [N m];1": "torque_nm",
-    "of limit;1": "effort_limit_nm",
-    "power [W];0": "electrical_power_w",
-    "bus [A];1": "bus_current_a",
-}
-"""Heading to field of a row of the plan."""
 
 
 def sweep(
@@ -58,7 +45,7 @@ def sweep(
         out: Folder for the logs, one MCAP per joint.
         machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
-        signal: PlannedExcitation signal.
+        signal: Excitation signal.
         amplitude: Peak of the command in rad; repeat it for several.
         repeats: Times each amplitude is repeated.
         plan_only: Show what it would do to the robot and leave.
@@ -67,34 +54,38 @@ def sweep(
     from pronk.deploy.bench.virtual_sweep import sweep_virtual
     from pronk.deploy.links.address import SIM
     from pronk.deploy.runtime.plan import Link
-    from pronk.identify.excitation import signals
     from pronk.identify.excitation.plan import make_plan
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
 
-    known, address = load_robot(robot), machine.address()
+    spec = load_robot(robot)
+    address = machine.address()
     virtual = address.kind == SIM
     if virtual and (address.interface not in (None, "bench") or machine.release):
         raise HardwareError(
             f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
             "--interface and --disable-onboard-controller; give --seed and --sim-params."
         )
-    names = [part for entry in joints for part in entry.split(",") if part]
+    names: list[str] = []
+    for entry in joints:
+        names += [name for name in entry.split(",") if name]
     with console.progress() as report:
         report("forecast", 0.0)
-        kind = getattr(signals, signal.title().replace("-", ""))
-        sizes = amplitude or AMPLITUDES
-        plan = make_plan(known, names or None, kind(), amplitudes=sizes, repeats=repeats)
+        plan = make_plan(
+            spec,
+            names or None,
+            _signal(signal),
+            amplitudes=amplitude or AMPLITUDES,
+            repeats=repeats,
+        )
         report("forecast", 1.0)
-    title = (
-        f"RunPlan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
-    )
-    console.show_rows(title, COLUMNS, plan.rows())
+    console.show(plan_table(plan))
     plan.check()
     figures: dict[str, Any] = {
-        "robot": known.name,
+        "robot": spec.name,
         "link": str(address),
-        "virtual": virtual or None,  # by wire not known before the first state
+        # Whether a robot behind a wire is virtual is not known before its first state.
+        "virtual": True if virtual else None,
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],
@@ -102,29 +93,107 @@ def sweep(
     if plan_only:
         return console.Outcome(figures=figures, following=["the same command without --plan-only"])
     if not (address.local or machine.yes):
-        console.confirm(known.name, str(address))
+        console.confirm(spec.name, str(address))
     with console.progress() as report:
-        how: Any = {"overwrite": overwrite, "progress": report.bar(f"excite over {address.kind}")}
+        progress = report.bar(f"excite over {address.kind}")
         if virtual:
-            file = address.options.get("params")
-            params = load_sim_params(None if file is None else str(file), known)
-            params.check_joints(known.joint_names, str(file or "sim_params"))
-            seed, cpus = int(address.options.get("seed", 0)), os.cpu_count() or 1
-            logs = sweep_virtual(plan, params, out, seed=seed, processes=cpus, **how)
-            figures["logs"] = logs
+            stated_file = address.options.get("params")
+            params_file = None if stated_file is None else str(stated_file)
+            params = load_sim_params(params_file, spec)
+            params.check_joints(spec.joint_names, params_file or "sim_params")
+            figures["logs"] = sweep_virtual(
+                plan,
+                params,
+                out,
+                seed=int(address.options.get("seed", 0)),
+                processes=os.cpu_count() or 1,
+                overwrite=overwrite,
+                progress=progress,
+            )
         else:
-            link = Link(robot=known.source or known.name, address=address, release=machine.release)
-            figures |= record_wire(plan, out, link, real_time=machine.real_time, **how)
-    where = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
-    console.say(f"wrote {len(figures['logs'])} logs of {where} to {out}")
-    if late := figures.get("servo"):
+            link = Link(robot=spec.source or spec.name, address=address, release=machine.release)
+            figures |= record_wire(
+                plan,
+                out,
+                link,
+                real_time=machine.real_time,
+                overwrite=overwrite,
+                progress=progress,
+            )
+    recorded = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
+    console.say(f"wrote {len(figures['logs'])} logs of {recorded} to {out}")
+    lateness = figures.get("servo")
+    if lateness is not None:
         console.say(
-            f"servo: {late['n']} ticks, late by {late['p50_ms']:.2f} ms (median), "
-            f"{late['p99_ms']:.2f} ms (99 %), {late['max_ms']:.1f} ms at most; "
-            f"{late['missed']} missed"
+            f"servo: {lateness['n']} ticks, late by {lateness['p50_ms']:.2f} ms (median), "
+            f"{lateness['p99_ms']:.2f} ms (99 %), {lateness['max_ms']:.1f} ms at most; "
+            f"{lateness['missed']} missed"
         )
-    match = f"pronk match {out} --robot {robot} --out {out}/gains.yaml"
-    return console.Outcome(figures=figures, following=[f"pronk response {out}", match])
+    return console.Outcome(
+        figures=figures,
+        following=[
+            f"pronk response {out}",
+            f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
+        ],
+    )
+
+
+def _signal(name: SignalName) -> Signal:
+    """Return the signal of a name, with its own defaults."""
+    from pronk.identify.excitation.signals import Chirp, LogChirp, Multisine, SineSteps
+
+    signals: dict[str, Signal] = {
+        "chirp": Chirp(),
+        "log-chirp": LogChirp(),
+        "multisine": Multisine(),
+        "sine-steps": SineSteps(),
+    }
+    return signals[name]
+
+
+def plan_table(plan: SweepPlan) -> Table:
+    """Return the table of the worst case of each excited joint."""
+    rows = []
+    for worst in plan.forecasts:
+        if worst.amplitude == 0.0:
+            continue
+        low, high = worst.range
+        rows.append(
+            (
+                worst.joint,
+                worst.amplitude,
+                worst.lowest,
+                low,
+                worst.highest,
+                high,
+                worst.speed,
+                worst.no_load_speed,
+                worst.torque,
+                worst.effort_limit,
+                worst.electrical_power,
+                worst.bus_current,
+            )
+        )
+    return Table(
+        title=(
+            f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
+        ),
+        columns=(
+            Column(heading="joint"),
+            Column(heading="amplitude", unit="rad"),
+            Column(heading="lowest", unit="rad", digits=2),
+            Column(heading="of", digits=2),
+            Column(heading="highest", unit="rad", digits=2),
+            Column(heading="of", digits=2),
+            Column(heading="speed", unit="rad/s", digits=1),
+            Column(heading="of no-load", digits=1),
+            Column(heading="torque", unit="N m", digits=1),
+            Column(heading="of limit", digits=1),
+            Column(heading="power", unit="W", digits=0),
+            Column(heading="bus", unit="A", digits=1),
+        ),
+        rows=tuple(rows),
+    )
 
 
 def record_wire(
@@ -132,14 +201,26 @@ def record_wire(
     out: Path,
     link: Link,
     *,
+    real_time: bool = True,
+    ages: AgeLimits | None = None,
+    standby_s: float = 0.04,
     overwrite: bool = False,
     progress: Callable[[float], None] = lambda share: None,
-    **more: Any,
 ) -> dict[str, Any]:
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
-    The caller has checked the plan; `more` is of the runtime's `Plan`. Returns the `logs`, whether
-    the robot was `virtual`, and how late the `servo` was.
+    Args:
+        plan: The sweep, which the caller has checked.
+        out: Folder of the logs.
+        link: The robot and how it is reached.
+        real_time: True to ask the operating system for real-time scheduling.
+        ages: Limits of the age of a state; those of the robot if None.
+        standby_s: Silence of the servo after which the standby process damps the joints [s].
+        overwrite: Replace logs that exist.
+        progress: Called with the share of the sweep that is done, 0 to 1.
+
+    Returns:
+        The `logs`, whether the robot was `virtual`, and how late the `servo` was.
 
     Raises:
         PronkError: The robot may not be moved, the filter stopped the sweep, or a process was
@@ -153,17 +234,18 @@ def record_wire(
 
     metadata = {"link": str(link.address), "servo_rate_hz": f"{RunPlan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    job, operator = RunPlan(link=link, sweep=task, **more), BenchOperator(console.RigOperator())
-    whole: list[str] = []
+    run = RunPlan(link=link, sweep=task, real_time=real_time, ages=ages, standby_s=standby_s)
+    operator = BenchOperator(console.RigOperator())
+    complete_logs: list[str] = []
 
     def notify(event: Event) -> None:
         if event.kind == "log":
-            whole.append(event.text)
-        elif event.kind == "system" and job.real_time:
+            complete_logs.append(event.text)
+        elif event.kind == "system" and real_time:
             console.say(event.text)
 
     try:
-        summary = run_plan(job, operator, notify, progress)
+        summary = run_plan(run, operator, notify, progress)
         servo = summary.servo
         if summary.interrupted:
             raise KeyboardInterrupt
@@ -171,18 +253,24 @@ def record_wire(
             raise operator.error
         if summary.log_error:
             raise HardwareError(f"{summary.log_error}; the joints were damped.")
-        if reasons := summary.refusals or servo["faults"]:
+        reasons = summary.refusals or servo["faults"]
+        if reasons:
             raise HardwareError(" ".join(reasons))
         if not servo["finished"]:
             raise HardwareError("the sweep was ended (SIGTERM); the joints were damped.")
     except BaseException:
-        cut = [path.name for path in task.paths if path.exists() and path.name not in whole]
-        if whole or cut:
-            console.warn(
-                f"ended early; in {out} are kept {', '.join(whole) or 'no whole log'} whole"
-                + (f", and {cut[0]} up to the end" if cut else "")
-                + "; sweep the others with --joints"
-            )
+        _warn_of_partial_logs(out, task.paths, complete_logs)
         raise
-    late = {**servo["lateness"], "missed": servo["missed_ticks"]}
-    return {"logs": task.paths, "virtual": bool(servo["virtual"]), "servo": late}
+    lateness = {**servo["lateness"], "missed": servo["missed_ticks"]}
+    return {"logs": task.paths, "virtual": bool(servo["virtual"]), "servo": lateness}
+
+
+def _warn_of_partial_logs(out: Path, paths: Sequence[Path], complete_logs: Sequence[str]) -> None:
+    """Say which logs of a sweep that ended early are complete, and which one was cut."""
+    cut_logs = [path.name for path in paths if path.exists() and path.name not in complete_logs]
+    if not complete_logs and not cut_logs:
+        return
+    text = f"ended early; in {out} are kept {', '.join(complete_logs) or 'no whole log'} whole"
+    if cut_logs:
+        text += f", and {cut_logs[0]} up to the end"
+    console.warn(f"{text}; sweep the others with --joints")
