@@ -187,6 +187,16 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
         machine.inner.capture()
 
 
+def test_a_trajectory_is_refused_where_the_machine_keeps_none(
+    link: FaultyLink, tmp_path: Path
+) -> None:
+    with flown(link, trajectory=tmp_path / "seen.npz") as run:
+        run.until(lambda: run.over)
+        (sentence,) = run.texts("refused")
+        assert "--link sim" in sentence
+        assert run.servo.machine is None
+
+
 def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> None:
     number = 0
     paused = False

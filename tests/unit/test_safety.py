@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import pronk.robots
 from pronk.deploy.runtime.limits import AgeLimits, Limits
 from pronk.deploy.runtime.reasons import REASONS, Decision, FilterAction, Reason
 from pronk.deploy.runtime.rules import SafetyInput, apply_rules, tilt
 from pronk.deploy.runtime.safety import LEAST_DAMPING_S, SafetyFilter
 from pronk.errors import RobotError
+from pronk.robots import load_robot
+from pronk.robots.limits import OperatingLimits
 from pronk.robots.machine import Command, State
+from pronk.robots.robot import RobotSpec
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
 LIMITS = Limits.of(ROBOT)
@@ -265,6 +270,46 @@ def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
         AgeLimits(hold_s=9.0)
     with pytest.raises(RobotError, match="lag"):
         AgeLimits(lag=0.0)
+
+
+def robot_with(folder: Path, old: str, new: str) -> RobotSpec:
+    """The Mini Cheetah with a change in its file."""
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    for name in ("mini_cheetah.xml", "robot.yaml"):
+        (folder / name).write_text((shipped / name).read_text())
+    text = (folder / "robot.yaml").read_text()
+    assert old in text
+    (folder / "robot.yaml").write_text(text.replace(old, new))
+    return load_robot(folder)
+
+
+def test_limits_of_a_robot_are_in_its_file(tmp_path: Path) -> None:
+    limits = Limits.of(robot_with(tmp_path, "  tilt: 0.8 ", "  tilt: 0.5 "))
+    assert limits.operating == replace(LIMITS.operating, tilt=0.5)
+    assert reason_with(limits, rolled(0.6)) is Reason.TILT
+    assert reason_with(LIMITS, rolled(0.6)) is Reason.NONE
+    # A file without the section has the usual limits.
+    assert load_robot("so101").limits == OperatingLimits()
+
+
+def reason_with(limits: Limits, orientation: np.ndarray) -> Reason:
+    """Why a filter acts on a robot with an attitude."""
+    _, decision, _ = judged(state(orientation=orientation), command(), limits=limits)
+    return decision.reason
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("  tilt: 0.8 ", "  tillt: 0.8 ", "tillt"),
+        ("  power_w: 5000.0 ", "  power_w: -1.0 ", "power_w"),
+    ],
+)
+def test_wrong_limits_in_a_robot_file_are_refused(
+    old: str, new: str, word: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RobotError, match=word):
+        robot_with(tmp_path, old, new)
 
 
 def test_tilt_is_the_angle_of_the_z_axis() -> None:
