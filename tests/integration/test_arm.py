@@ -161,6 +161,20 @@ def test_named_parameters_alone_are_fitted() -> None:
     assert low < high
 
 
+def test_progress_rises_to_almost_all() -> None:
+    log = recorded_with_known_drives(commands(20.0, 0.2, 3.0, 0.2))
+    shares: list[float] = []
+    with ChainSimulation(ARM, [log]) as simulation:
+        fit_drives(
+            ChainReplay(simulation),
+            parameters=("damping",),
+            nominal=nominal_drives([log], simulation.joints, ARM),
+            progress=shares.append,
+        )
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] < shares[-1] <= 0.99
+
+
 def test_what_cannot_be_fitted_is_refused() -> None:
     log = commands(5.0, 0.2, 3.0, 0.2)
     with pytest.raises(LogError, match="at least 3"):
