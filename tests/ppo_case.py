@@ -29,7 +29,7 @@ def one_thread() -> Iterator[None]:
 
 
 def observe(rows: int = ROBOTS, *, jump: bool = True) -> TensorDict:
-    """Random groups of the right sizes; without `jump` the jump groups are zero."""
+    """Draw groups of the right sizes; without `jump` the jump groups are zero."""
     groups = {name: torch.randn(rows, size) for name, size in SIZES.items()}
     groups["measured"] = 3.0 * groups["measured"] + 1.0
     groups["jump"] = torch.randint(0, 2, (rows, 1)).float() * jump
@@ -48,24 +48,28 @@ def build(
     **algorithm: Any,
 ) -> EstimatorPPO:
     """Build it as rsl_rl's runner does from mjlab's configuration."""
-    models = {"actor": EstimatorActorCfg(), "critic": JumpCriticCfg()}
-    made = {name: {**asdict(model), "hidden_dims": hidden} for name, model in models.items()}
-    for model in made.values():  # what mjlab's runner strips
+    actor = asdict(EstimatorActorCfg())
+    critic = asdict(JumpCriticCfg())
+    for model in (actor, critic):
+        model["hidden_dims"] = hidden
         for key in ("cnn_cfg", "rnn_type", "rnn_hidden_dim", "rnn_num_layers"):
-            del model[key]
-    del made["critic"]["distribution_cfg"]
+            del model[key]  # as mjlab's runner does
+    del critic["distribution_cfg"]
+    ppo = asdict(EstimatorPpoCfg(**algorithm))
+    ppo["estimator"] = estimator or {}
     cfg = {
-        **made,
-        "algorithm": asdict(EstimatorPpoCfg(**algorithm)) | {"estimator": estimator or {}},
-        "obs_groups": {"actor": [*read], "critic": ["critic", "critic_jump"]},
+        "actor": actor,
+        "critic": critic,
+        "algorithm": ppo,
+        "obs_groups": {"actor": list(read), "critic": ["critic", "critic_jump"]},
         "num_steps_per_env": STEPS,
         "multi_gpu": multi_gpu,
     }
     env: Any = SimpleNamespace(num_envs=ROBOTS, num_actions=12)
     start = observe() if observation is None else observation
-    algorithm: Any = EstimatorPPO.construct_algorithm(start, env, cfg, "cpu")
-    algorithm.train_mode()
-    return algorithm
+    built = EstimatorPPO.construct_algorithm(start, env, cfg, "cpu")
+    built.train_mode()
+    return built
 
 
 def roll_out(algorithm: EstimatorPPO, observe: Any = observe) -> None:
@@ -81,13 +85,13 @@ def roll_out(algorithm: EstimatorPPO, observe: Any = observe) -> None:
 
 
 def learn(algorithm: EstimatorPPO, observe: Any = observe) -> None:
-    """One iteration."""
+    """Learn from one iteration."""
     roll_out(algorithm, observe)
     algorithm.update()
 
 
 def trained(updates: int = 2, *, jump: bool = True, **cfg: Any) -> EstimatorPPO:
-    """An algorithm after some updates on observations with or without jump input."""
+    """Return an algorithm after some updates on observations with or without jump input."""
     algorithm = build(**cfg)
     for _ in range(updates):
         learn(algorithm, lambda: observe(jump=jump))
@@ -95,10 +99,12 @@ def trained(updates: int = 2, *, jump: bool = True, **cfg: Any) -> EstimatorPPO:
 
 
 def weights(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """A copy of all weights and statistics."""
+    """Copy all weights and statistics."""
     return {name: value.detach().clone() for name, value in module.state_dict().items()}
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    """Equal names and, bit for bit, values."""
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    """Return whether names and, bit for bit, values are equal."""
+    if a.keys() != b.keys():
+        return False
+    return all(torch.equal(a[name], b[name]) for name in a)

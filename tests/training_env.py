@@ -55,7 +55,7 @@ _starts = itertools.count(step=10**6)
 
 
 def config(num_envs: int, gains: TrainingGains) -> Any:
-    """The task's environment, with phases that do not end."""
+    """Return the task's environment, with phases that do not end."""
     task = load_task("mini_cheetah")
     return task.env_cfg(
         task.robot, gains, iterations=dict.fromkeys(PHASES, ITERATIONS), num_envs=num_envs
@@ -64,7 +64,7 @@ def config(num_envs: int, gains: TrainingGains) -> Any:
 
 @cache
 def nominal() -> Any:
-    """`N` nominal robots with naive gains, exact measurements, no delay."""
+    """Return `N` nominal robots with nominal gains, exact measurements, no delay."""
     cfg = config(N, training_gains("naive", ROBOT))
     without_randomization(cfg)
     return _built(cfg)
@@ -72,7 +72,7 @@ def nominal() -> Any:
 
 @cache
 def randomized() -> Any:
-    """`MANY` robots with matched gains and everything randomized, as in training."""
+    """Return `MANY` robots with matched gains and everything randomized, as in training."""
     return _built(config(MANY, MATCHED))
 
 
@@ -83,15 +83,15 @@ def _built(cfg: Any) -> Any:
 
 
 def fresh(env: Any, phase: str = "walk", *, scripted: bool = False) -> Any:
-    """The environment at the beginning of a phase and of all episodes, at the nominal rate."""
+    """Take the environment to the beginning of a phase and of all episodes, at the nominal rate."""
     command = motion_command(env)
     command.scripted = scripted
     command.ranges.grown.zero_()
     command.ranges.tracking.zero_()
     env.cfg.decimation = ROBOT.decimation
     # A step that was never counted, so that nothing measured before is taken for this step's.
-    first = list(PHASES).index(phase) * ITERATIONS * STEPS_PER_ITERATION
-    env.common_step_counter = first + next(_starts)
+    phase_start = list(PHASES).index(phase) * ITERATIONS * STEPS_PER_ITERATION
+    env.common_step_counter = phase_start + next(_starts)
     env.reset(seed=0)
     command.velocity.zero_()
     command.jump.zero_()
@@ -101,8 +101,13 @@ def fresh(env: Any, phase: str = "walk", *, scripted: bool = False) -> Any:
 
 def drawn(env: Any) -> dict[str, Tensor]:
     """The randomized parameters by name, (N, size) each; gains in the robot's order of joints."""
-    parts, groups = randomized_parameters(env), len(ROBOT.groups)
-    single, gains = parts[: -2 * groups], parts[-2 * groups :]
+    parts = randomized_parameters(env)
+    groups = len(ROBOT.groups)
     # Each group's gains are one part, leg by leg.
-    both = [torch.stack(half, dim=-1).flatten(1) for half in (gains[:groups], gains[groups:])]
-    return {n: part.clone() for n, part in zip(RANDOMIZED, [*single, *both], strict=True)}
+    stiffness = torch.stack(parts[-2 * groups : -groups], dim=-1).flatten(1)
+    damping = torch.stack(parts[-groups:], dim=-1).flatten(1)
+    numbers = [*parts[: -2 * groups], stiffness, damping]
+    parameters = {}
+    for name, part in zip(RANDOMIZED, numbers, strict=True):
+        parameters[name] = part.clone()
+    return parameters

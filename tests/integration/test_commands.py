@@ -47,15 +47,17 @@ def test_velocities_are_uniform_in_the_given_fractions(command: MotionCommand) -
     The present ranges are half way from .35 to the whole.
     """
     command.ranges.grown.fill_(STEPS / 2)
-    found = []
+    draws = []
     for _ in range(1000):
         command.reset(ALL)
-        found.append(command.velocity.clone())
-    velocity = np.float64(torch.cat(found).numpy())
+        draws.append(command.velocity.clone())
+    velocity = np.float64(torch.cat(draws).numpy())
     moves = velocity != 0.0
-    axes, total = moves.sum(axis=1), len(moves)
+    axes = moves.sum(axis=1)
+    total = len(moves)
     fractions = [(axes == 0, 0.1), (axes == 1, 0.4), (axes == 3, 0.5)]
-    fractions += [(moves[:, axis] & (axes == 1), 0.4 / 3) for axis in range(3)]
+    for axis in range(3):
+        fractions.append((moves[:, axis] & (axes == 1), 0.4 / 3))
     for rows, fraction in fractions:
         assert binomtest(int(rows.sum()), total, fraction).pvalue > 1e-4
     assert not (axes == 2).any()
@@ -63,9 +65,9 @@ def test_velocities_are_uniform_in_the_given_fractions(command: MotionCommand) -
         for rows in (axes == 3, (axes == 1) & moves[:, axis]):
             test = kstest(velocity[rows, axis], "uniform", args=(-limit, 2 * limit))
             assert test.pvalue > 1e-3
-    whole = velocity[axes == 3]
-    correlation = np.corrcoef(whole, rowvar=False)[np.triu_indices(3, 1)]
-    assert np.abs(correlation).max() < 4.0 / math.sqrt(len(whole))
+    along_all_axes = velocity[axes == 3]
+    correlation = np.corrcoef(along_all_axes, rowvar=False)[np.triu_indices(3, 1)]
+    assert np.abs(correlation).max() < 4.0 / math.sqrt(len(along_all_axes))
 
 
 @pytest.mark.parametrize("scripted", [False, True])
@@ -86,12 +88,12 @@ def test_velocities_last_two_to_six_seconds(command: MotionCommand) -> None:
     assert ((before >= 2.0) & (before <= 6.0)).all()
     command.compute(passed)
     torch.testing.assert_close(command.time_left, before - passed)
-    spans, left = [], command.time_left
+    spans = []
     for _ in range(6000):
         before = command.time_left.clone()
         command.compute(DT)
-        left = command.time_left
-        spans += left[left > before].tolist()
+        after = command.time_left
+        spans += after[after > before].tolist()
     assert len(spans) > 150
     assert kstest(spans, "uniform", args=(2.0, 4.0)).pvalue > 1e-3
 
@@ -105,28 +107,47 @@ def test_jump_inputs_have_random_intervals_and_known_times() -> None:
     assert abs(int(jumper.sum()) - N // 2) <= 1
     seen = []
     for _ in range(6000):
-        left, before = command.jump_left.clone(), command.jump.clone()
+        time_to_change = command.jump_left.clone()
+        before = command.jump.clone()
         command.compute(DT)
-        assert torch.equal(command.jump != before, jumper & (left <= DT))
+        assert torch.equal(command.jump != before, jumper & (time_to_change <= DT))
         assert not command.jump_left[~jumper].any()
         seen.append(command.jump.clone())
     jump = np.int64(torch.stack(seen).numpy())
     assert (jump.any(axis=0) == jumper.numpy()).all()
-    on, off = [], []
+    on_spans = []
+    off_spans = []
     for robot in jump.T[jumper.numpy()]:
         for begin, end in itertools.pairwise(np.flatnonzero(np.diff(robot, prepend=0))):
-            (on if robot[begin] else off).append((end - begin) * DT)
-    for spans, (low, high) in ((on, command.cfg.jump_on_s), (off, command.cfg.jump_off_s)):
-        assert len(spans) > 100
-        assert low - 1e-5 <= min(spans)
-        assert max(spans) <= high + DT + 1e-5
-        assert kstest(spans, "uniform", args=(low, high - low + DT)).statistic < 0.15
+            span = (end - begin) * DT
+            if robot[begin]:
+                on_spans.append(span)
+            else:
+                off_spans.append(span)
+    check_spans(on_spans, command.cfg.jump_on_s)
+    check_spans(off_spans, command.cfg.jump_off_s)
+
+
+def check_spans(spans: list[float], limits: tuple[float, float]) -> None:
+    """Require that times in whole steps are uniform between limits [s]."""
+    low, high = limits
+    assert len(spans) > 100
+    assert low - 1e-5 <= min(spans)
+    assert max(spans) <= high + DT + 1e-5
+    assert kstest(spans, "uniform", args=(low, high - low + DT)).statistic < 0.15
 
 
 def tensors(command: MotionCommand) -> dict[str, Tensor]:
-    found = {name: getattr(command, name) for name in ("velocity", "jump", "time_left")}
-    found |= {f"state.{n}": t for n, t in vars(command.state).items() if torch.is_tensor(t)}
-    return {name: tensor.clone() for name, tensor in found.items()}
+    """Copy all that the command term holds of each robot."""
+    copies = {
+        "velocity": command.velocity.clone(),
+        "jump": command.jump.clone(),
+        "time_left": command.time_left.clone(),
+    }
+    for name, value in vars(command.state).items():
+        if torch.is_tensor(value):
+            copies[f"state.{name}"] = value.clone()
+    return copies
 
 
 @pytest.mark.parametrize("through_env", [False, True])
@@ -140,7 +161,10 @@ def test_reset_affects_one_robot_alone(through_env: bool) -> None:
     before = tensors(command)
     assert before["state.mode"].all()
     ids = torch.tensor([3])
-    _ = env.reset(env_ids=ids) if through_env else command.reset(ids)
+    if through_env:
+        env.reset(env_ids=ids)
+    else:
+        command.reset(ids)
     after = tensors(command)
     for name in before:
         assert torch.equal(after[name][ALL != 3], before[name][ALL != 3]), name
@@ -152,9 +176,11 @@ def test_reset_affects_one_robot_alone(through_env: bool) -> None:
 def test_scripted_commands_are_set_by_the_caller_alone() -> None:
     env = training_env.fresh(training_env.nominal(), "jump_a", scripted=True)
     command = motion_command(env)
-    velocity, jump = command.velocity, command.jump
-    velocity[:], jump[:] = torch.rand(N, 3), ALL % 2 == 0
-    given = velocity.clone()
+    velocity = command.velocity
+    jump = command.jump
+    velocity[:] = torch.rand(N, 3)
+    jump[:] = ALL % 2 == 0
+    set_velocity = velocity.clone()
     env.episode_length_buf[1] = 10**6  # an episode that ends has no effect either
     for _ in range(3):
         env.step(torch.zeros(N, 12))
@@ -163,7 +189,7 @@ def test_scripted_commands_are_set_by_the_caller_alone() -> None:
     command.reset(ALL)
     assert command.velocity is velocity
     assert command.jump is jump
-    assert torch.equal(velocity, given)
+    assert torch.equal(velocity, set_velocity)
     assert jump.tolist() == [i % 2 == 0 for i in range(N)]
     assert not command.state.mode.any(), "jumps under way are cleared all the same"
 
@@ -233,7 +259,7 @@ def test_direction_of_a_jump_in_the_world(
 
 
 @pytest.mark.parametrize(
-    ("given", "moves", "pitch", "jumps", "expected"),
+    ("commanded", "moves", "pitch", "jumps", "expected"),
     [
         # With .25 added the target is 2.25 m/s, and `along` goes up to it.
         ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, True, (2.25, 1.0, math.hypot(0.75, 1.0))),
@@ -249,7 +275,7 @@ def test_direction_of_a_jump_in_the_world(
 def test_speed_along_the_command(
     env: Any,
     monkeypatch: Patch,
-    given: Vector,
+    commanded: Vector,
     moves: Vector,
     pitch: float,
     jumps: bool,
@@ -258,7 +284,7 @@ def test_speed_along_the_command(
     command = motion_command(env)
     monkeypatch.setattr(command.cfg, "jump_speed_added", 0.25)
     command.state.mode[:] = jumps
-    command.velocity[:] = torch.tensor((*given, 1.5))
+    command.velocity[:] = torch.tensor((*commanded, 1.5))
     inputs = received(env, monkeypatch, 0.0, pitch, moves)
     speeds = torch.stack([inputs.along, inputs.excess, inputs.velocity_error], dim=1)
     np.testing.assert_allclose(speeds, [expected] * N, atol=1e-5)

@@ -38,17 +38,20 @@ def env() -> Any:
 
 
 def ids(env: Any, kind: str, pattern: str) -> list[int]:
-    """Ids of a part of every leg in the model."""
-    return [getattr(env.sim.mj_model, kind)(f"robot/{leg}_{pattern}").id for leg in BODY.legs]
+    """Return the ids of a part of every leg in the model."""
+    named = getattr(env.sim.mj_model, kind)
+    return [named(f"robot/{leg}_{pattern}").id for leg in BODY.legs]
 
 
 def rotations(qpos: Any) -> Rotation:
+    """Return the attitudes of the trunks."""
     return Rotation.from_quat(np.float64(qpos[:, 3:7]), scalar_first=True)
 
 
 def put(env: Any) -> tuple[Array, Array]:
     """Put every robot into a random state; return positions and velocities."""
-    qpos, qvel = env.sim.data.qpos, env.sim.data.qvel
+    qpos = env.sim.data.qpos
+    qvel = env.sim.data.qvel
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(env.num_envs, 4), dim=1)
     qpos[:, 7:] += torch.rand(env.num_envs, 12) - 0.5
     qvel[:] = torch.randn(qvel.shape)
@@ -57,45 +60,54 @@ def put(env: Any) -> tuple[Array, Array]:
 
 
 def state(env: Any) -> tuple[Array, Array]:
-    """Positions and velocities of every robot."""
-    return np.float64(env.sim.data.qpos.numpy()), np.float64(env.sim.data.qvel.numpy())
+    """Return positions and velocities of every robot."""
+    qpos = np.float64(env.sim.data.qpos.numpy())
+    qvel = np.float64(env.sim.data.qvel.numpy())
+    return qpos, qvel
 
 
-def kept(found: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: group.clone() for name, group in found.items()}
+def kept(groups: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Copy groups of observations."""
+    return {name: group.clone() for name, group in groups.items()}
 
 
 def observe(env: Any) -> dict[str, Tensor]:
+    """Return the observations of the present state."""
     return kept(env.observation_manager.compute(update_history=True))
 
 
 def measured(observation: dict[str, Tensor], name: str) -> Tensor:
+    """Return a part of the measured vector."""
     return observation["measured"][:, list(MEASURED[name])]
 
 
-def close(found: Tensor, expected: Any, atol: float = 1e-5) -> None:
-    np.testing.assert_allclose(found.numpy(), expected, atol=atol, rtol=1e-5)
+def close(value: Tensor, expected: Any, atol: float = 1e-5) -> None:
+    """Require that a value is the expected one but for rounding."""
+    np.testing.assert_allclose(value.numpy(), expected, atol=atol, rtol=1e-5)
 
 
 # --- Motion --------------------------------------------------------------------------------------
 
 
 def references(env: Any, qpos: Array, qvel: Array, ctrl: Any = None) -> list[mujoco.MjData]:
-    """The same states in MuJoCo."""
-    found = []
+    """Return the same states in MuJoCo."""
+    states = []
     for i in range(len(qpos)):
         data = mujoco.MjData(env.sim.mj_model)
-        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        data.qpos[:] = qpos[i]
+        data.qvel[:] = qvel[i]
         if ctrl is not None:
             data.ctrl[:] = ctrl[i]
         mujoco.mj_forward(env.sim.mj_model, data)
-        found.append(data)
-    return found
+        states.append(data)
+    return states
 
 
 def contacts(data: mujoco.MjData, geoms: list[int]) -> list[float]:
-    """1 for each geom that touches something."""
-    touching = {int(geom) for contact in data.contact for geom in contact.geom}
+    """Return 1 for each geom that touches something, 0 for the others."""
+    touching: set[int] = set()
+    for contact in data.contact:
+        touching.update(int(geom) for geom in contact.geom)
     return [float(geom in touching) for geom in geoms]
 
 
@@ -104,21 +116,27 @@ def test_motion_is_that_of_mujoco(env: Any) -> None:
     for _ in range(4):
         env.step(2.0 * torch.rand(N, 12) - 1.0)
     env.cfg.decimation = 1
-    data, model = env.sim.data, env.sim.mj_model
+    data = env.sim.data
+    model = env.sim.mj_model
     qpos, qvel = state(env)
     env.step(torch.rand(N, 12))
     motion = motion_command(env).motion
     legs = motion.legs
-    sites, balls = ids(env, "site", "foot"), ids(env, "geom", "foot_collision")
-    knees, hips = ids(env, "joint", "knee"), ids(env, "joint", "hip_pitch")
-    before = references(env, qpos, qvel, data.ctrl.numpy())
-    twist, wrench = np.zeros(6), np.zeros(6)
-    for i, reference in enumerate(before):
-        force, speed = np.zeros((4, 3)), []
+    sites = ids(env, "site", "foot")
+    balls = ids(env, "geom", "foot_collision")
+    knees = ids(env, "joint", "knee")
+    hips = ids(env, "joint", "hip_pitch")
+    twist = np.zeros(6)
+    wrench = np.zeros(6)
+    for i, reference in enumerate(references(env, qpos, qvel, data.ctrl.numpy())):
+        force = np.zeros((4, 3))
+        speed = []
         for k, contact in enumerate(reference.contact):
             mujoco.mj_contactForce(model, reference, k, wrench)
-            for foot in (balls.index(g) for g in contact.geom if g in balls):
-                force[foot] += contact.frame.reshape(3, 3).T @ wrench[:3]
+            for geom in contact.geom:
+                if geom in balls:
+                    world_force = contact.frame.reshape(3, 3).T @ wrench[:3]
+                    force[balls.index(geom)] += world_force
         for site in sites:
             mujoco.mj_objectVelocity(model, reference, mujoco.mjtObj.mjOBJ_SITE, site, twist, 0)
             speed.append(twist[3:].copy())
@@ -205,17 +223,21 @@ def test_non_foot_contacts_are_counted(env: Any) -> None:
 
 def test_layout_of_the_measured_vector(env: Any) -> None:
     """Written out once more, since policies depend on it; histories run from old to new."""
-    states, actions = [], []
+    positions = []
+    velocities = []
+    actions = []
     for _ in range(4):
         actions.append(torch.rand(N, 12) - 0.5)
-        found = kept(env.step(actions[-1])[0])
-        states.append(state(env))
-    seen, (qpos, qvel) = found["measured"], states[-1]
+        groups = kept(env.step(actions[-1])[0])
+        qpos, qvel = state(env)
+        positions.append(qpos[:, 7:] - DEFAULT)
+        velocities.append(qvel[:, 6:])
+    seen = groups["measured"]
     assert seen.shape == (N, 105)
     close(seen[:, 0:3], qvel[:, 3:6])
     close(seen[:, 3:6], rotations(qpos).inv().apply([0.0, 0.0, -1.0]))
-    close(seen[:, 6:42], np.hstack([q[:, 7:] - DEFAULT for q, _ in states[-3:]]))
-    close(seen[:, 42:78], np.hstack([v[:, 6:] for _, v in states[-3:]]))
+    close(seen[:, 6:42], np.hstack(positions[-3:]))
+    close(seen[:, 42:78], np.hstack(velocities[-3:]))
     close(seen[:, 78:102], np.hstack(actions[-2:]))
     close(seen[:, 102:105], motion_command(env).velocity)
     now = np.hstack([qpos[:, 7:] - DEFAULT, qvel[:, 6:], actions[-1]])
@@ -226,18 +248,23 @@ def test_layout_of_the_measured_vector(env: Any) -> None:
     close(measured(anew, "action")[4], 0.0)
     others = torch.arange(N) != 4
     for name in ("joint_position", "joint_velocity", "action"):
-        assert torch.equal(measured(anew, name)[others], measured(found, name)[others])
+        assert torch.equal(measured(anew, name)[others], measured(groups, name)[others])
 
 
 def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:
     """D7 to D10: drawn anew for every number of every measurement, which keeps it in histories."""
     env = training_env.fresh(training_env.randomized(), scripted=True)
-    widths = {"joint_position": 0.05, "joint_velocity": 0.5}
-    widths |= {"angular_velocity": 0.2, "projected_gravity": 0.05}
-    found: dict[str, list[Array]] = {name: [] for name in widths}
+    widths = {
+        "joint_position": 0.05,
+        "joint_velocity": 0.5,
+        "angular_velocity": 0.2,
+        "projected_gravity": 0.05,
+    }
+    errors: dict[str, list[Array]] = {name: [] for name in widths}
     for _ in range(5):
         qpos, qvel = put(env)
-        first, second = observe(env), observe(env)
+        first = observe(env)
+        second = observe(env)
         exact = {
             "angular_velocity": qvel[:, 3:6],
             "projected_gravity": rotations(qpos).inv().apply([0.0, 0.0, -1.0]),
@@ -247,7 +274,7 @@ def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:
         for name, value in exact.items():
             size = value.shape[1]
             for seen in (first, second):
-                found[name].append(measured(seen, name)[:, -size:].numpy() - value)
+                errors[name].append(measured(seen, name)[:, -size:].numpy() - value)
             if measured(first, name).shape[1] > size:
                 then = measured(second, name)[:, -2 * size : -size]
                 assert torch.equal(then, measured(first, name)[:, -size:])
@@ -255,7 +282,7 @@ def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:
             assert torch.equal(first[name], second[name])
         assert torch.equal(measured(first, "command"), motion_command(env).velocity)
     for name, width in widths.items():
-        noise = np.concatenate(found[name]) / width
+        noise = np.concatenate(errors[name]) / width
         assert np.abs(noise).max() <= 1.0 + 1e-4
         assert kstest(noise.ravel(), "uniform", args=(-1.0, 2.0)).pvalue > 1e-3
         correlation = np.corrcoef(noise, rowvar=False)[np.triu_indices(noise.shape[1], 1)]
@@ -272,7 +299,8 @@ def test_layout_of_the_critic_vector(env: Any) -> None:
     qpos, qvel = put(env)
     command.time_left[:] = torch.arange(N) / 4
     seen = observe(env)
-    trunk, feet = rotations(qpos), ids(env, "site", "foot")
+    trunk = rotations(qpos)
+    feet = ids(env, "site", "foot")
     force = env.scene["feet"].data.force.norm(dim=-1)
     expected = {
         "angular_velocity": qvel[:, 3:6],
@@ -307,7 +335,8 @@ def test_layout_of_the_critic_vector(env: Any) -> None:
 @pytest.mark.parametrize("resets", [False, True])
 def test_contacts_are_those_of_the_present_state(env: Any, resets: bool) -> None:
     """Whether or not another robot's episode ends."""
-    seen, expected = [], []
+    seen = []
+    expected = []
     for _ in range(6):
         if resets:
             env.episode_length_buf[0] = 10**6

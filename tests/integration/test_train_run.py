@@ -31,13 +31,13 @@ from pronk.policy.runtime import load_policy
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 of_one_run = pytest.mark.xdist_group("run")
-"""Of the tests that share the run `whole`: one process has them all."""
+"""Mark of the tests that share `finished_run`: one process has them all."""
 
 GAINS = Path(__file__).parents[2] / "policies" / "gains.yaml"
 SMALL = ("--envs", "8", "--device", "cpu", "--save-interval", "1")
 ALL = ("all", "--gains", str(GAINS), *SMALL)
 ITERATIONS = {"walk": 2, "jump_a": 1, "jump_b": 2}
-SHORT = [word for n, count in ITERATIONS.items() for word in ("--phase", f"{n}={count}")]
+SHORT = ("--phase", "walk=2", "--phase", "jump_a=1", "--phase", "jump_b=2")
 
 
 @pytest.fixture(autouse=True)
@@ -50,12 +50,14 @@ def one_thread() -> Any:
 
 
 def train(*arguments: str | Path) -> int:
-    return cli.run(["train", *map(str, arguments)])
+    """Run `pronk train`; returns its exit status."""
+    return cli.run(["train", *[str(argument) for argument in arguments]])
 
 
 def started(*arguments: str | Path, cwd: Path) -> subprocess.Popen[str]:
+    """Start Python with a program and its arguments."""
     return subprocess.Popen(
-        [sys.executable, "-c", *map(str, arguments)],
+        [sys.executable, "-c", *[str(argument) for argument in arguments]],
         cwd=cwd,
         env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
@@ -65,7 +67,7 @@ def started(*arguments: str | Path, cwd: Path) -> subprocess.Popen[str]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run through all phases."""
     torch.set_num_threads(1)
     folder = RunFolder(tmp_path_factory.mktemp("train") / "all")
@@ -74,32 +76,37 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 @of_one_run
-def test_a_run_writes_policies_checkpoints_and_provenance(whole: RunFolder) -> None:
-    walk, jump = (load_policy(whole.path / f"{name}.onnx").contract for name in ("walk", "policy"))
-    assert (walk.jump, jump.jump) == (False, True)
+def test_a_run_writes_policies_checkpoints_and_provenance(finished_run: RunFolder) -> None:
+    walk = load_policy(finished_run.path / "walk.onnx").contract
+    jump = load_policy(finished_run.path / "policy.onnx").contract
+    assert not walk.jump
+    assert jump.jump
     assert walk.provenance["phases"] == {"walk": 2}
     assert jump.provenance["phases"] == ITERATIONS
     assert jump.gains_sha256 == walk.gains_sha256 != ""
-    found = whole.read()
-    assert found["finished"]
-    assert found["gains"]["virtual"]
+    record = finished_run.read()
+    assert record["finished"]
+    assert record["gains"]["virtual"]
     for name, iterations in ITERATIONS.items():
-        phase = found["phases"][name]
-        assert (phase["iterations"], phase["env_steps"]) == (iterations, iterations * 24 * 8)
+        phase = record["phases"][name]
+        assert phase["iterations"] == iterations
+        assert phase["env_steps"] == iterations * 24 * 8
         assert phase.get("onnx_difference", 0.0) < 1e-5
-        assert name in checkpoint.read_checkpoint(whole.path / f"{name}.pt")["infos"]["phases"]
-    assert not checkpoint.uses_jump_input(checkpoint.read_checkpoint(whole.path / "walk.pt"))
-    assert checkpoint.latest_checkpoint(whole.path) == whole.path / "model_4.pt"
-    assert len(checkpoint.numbered_checkpoints(whole.path)) == 3
-    assert (whole.gains).read_bytes() == GAINS.read_bytes()
-    assert found["sessions"][0]["versions"]["torch"] == torch.__version__
-    assert any(whole.path.glob("events.out.*"))
+        assert (
+            name in checkpoint.read_checkpoint(finished_run.path / f"{name}.pt")["infos"]["phases"]
+        )
+    assert not checkpoint.uses_jump_input(checkpoint.read_checkpoint(finished_run.path / "walk.pt"))
+    assert checkpoint.latest_checkpoint(finished_run.path) == finished_run.path / "model_4.pt"
+    assert len(checkpoint.numbered_checkpoints(finished_run.path)) == 3
+    assert (finished_run.gains).read_bytes() == GAINS.read_bytes()
+    assert record["sessions"][0]["versions"]["torch"] == torch.__version__
+    assert any(finished_run.path.glob("events.out.*"))
 
 
 @of_one_run
-def test_a_finished_run_is_not_trained_again(whole: RunFolder, tmp_path: Path) -> None:
+def test_a_finished_run_is_not_trained_again(finished_run: RunFolder, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
-    shutil.copytree(whole.path, copy)
+    shutil.copytree(finished_run.path, copy)
     assert train("all", "--resume", "--out", copy) == 0
     assert len(RunFolder(copy).read()["sessions"]) == 1
     assert train("all", "--resume", "--out", copy, "--seed", "7") == 2
@@ -121,9 +128,9 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     assert stopped["sessions"][0]["stopped"] == "SIGTERM"
     assert 1 <= checkpoint.read_checkpoint(folder.checkpoint())["iter"] + 1 < 6
     assert train("walk", "--resume", "--out", folder.path) == 0
-    found = folder.read()
-    assert found["finished"]
-    assert found["phases"]["walk"]["iterations"] == 6
+    record = folder.read()
+    assert record["finished"]
+    assert record["phases"]["walk"]["iterations"] == 6
     state = checkpoint.read_checkpoint(folder.path / "walk.pt")
     assert state["iter"] == 5
     assert state["infos"]["env_state"]["common_step_counter"] == 6 * 24
@@ -131,58 +138,75 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
 
 
 @of_one_run
-def test_a_jump_begins_with_a_walking_policy(whole: RunFolder, tmp_path: Path) -> None:
+def test_a_jump_begins_with_a_walking_policy(finished_run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "jump"
     words = ("jump", "--gains", "naive", "--ranges-from", GAINS, *SMALL, "--out", out)
     phases = ("--phase", "jump_a=1", "--phase", "jump_b=1")
-    assert train(*words, *phases, "--init-checkpoint", whole.path / "policy.onnx") == 2
-    assert train(*words, *phases, "--init-checkpoint", whole.path / "jump_b.pt") == 2
+    assert train(*words, *phases, "--init-checkpoint", finished_run.path / "policy.onnx") == 2
+    assert train(*words, *phases, "--init-checkpoint", finished_run.path / "jump_b.pt") == 2
     assert not out.exists()
-    assert train(*words, *phases, "--init-checkpoint", whole.path) == 0
-    found = RunFolder(out).read()
-    assert set(found["phases"]) == {"jump_a", "jump_b"}
+    assert train(*words, *phases, "--init-checkpoint", finished_run.path) == 0
+    record = RunFolder(out).read()
+    assert set(record["phases"]) == {"jump_a", "jump_b"}
     first = checkpoint.read_checkpoint(out / "jump_a.pt")
     assert first["iter"] == TASKS["jump"]["walk"]
     contract = load_policy(out / "policy.onnx").contract
     assert (contract.gains, contract.gains_sha256) == ("naive", "")
-    assert contract.provenance["start_sha256"] == found["start_sha256"] != ""
+    assert contract.provenance["start_sha256"] == record["start_sha256"] != ""
 
 
 @of_one_run
-def test_mjlab_trains_every_phase_of_the_registered_task(whole: RunFolder, tmp_path: Path) -> None:
+def test_mjlab_trains_every_phase_of_the_registered_task(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
     """With the phase settings of `pronk train`, and rewards that its command line has changed."""
-    options = {f"curriculum.phases.params.{n}": count for n, count in ITERATIONS.items()}
-    options |= {"scene.num-envs": 8, "rewards.posture.weight": -0.5}
-    options |= {"rewards.posture.params.jump-scale": 0.25}
     process = started(
         "from mjlab.scripts.train import main; main()",
         "Pronk-Jump-MiniCheetah",
         "--agent.max-iterations=5",
-        *(f"--env.{name.replace('_', '-')}={value}" for name, value in options.items()),
+        "--env.curriculum.phases.params.walk=2",
+        "--env.curriculum.phases.params.jump-a=1",
+        "--env.curriculum.phases.params.jump-b=2",
+        "--env.scene.num-envs=8",
+        "--env.rewards.posture.weight=-0.5",
+        "--env.rewards.posture.params.jump-scale=0.25",
         cwd=tmp_path,
     )
     output, _ = process.communicate()
     assert process.returncode == 0, output[-3000:]
     (folder,) = (tmp_path / "logs" / "rsl_rl" / "pronk_jump").iterdir()
     assert load_policy(folder / "policy.onnx").contract.provenance["phases"] == ITERATIONS
-    files = (path / "params" / "env.yaml" for path in (folder, whole.path))
-    theirs, ours = (yaml.load(file.read_text(), yaml.BaseLoader) for file in files)
-    assert theirs["curriculum"] == ours["curriculum"]
-    changed, _ = (each["rewards"].pop("posture") for each in (theirs, ours))
-    assert (changed["weight"], changed["params"]["jump_scale"]) == ("-0.5", "0.25")
-    assert theirs["rewards"] == ours["rewards"]
+    mjlab_env = env_settings(folder)
+    pronk_env = env_settings(finished_run.path)
+    assert mjlab_env["curriculum"] == pronk_env["curriculum"]
+    changed_reward = mjlab_env["rewards"].pop("posture")
+    del pronk_env["rewards"]["posture"]
+    assert changed_reward["weight"] == "-0.5"
+    assert changed_reward["params"]["jump_scale"] == "0.25"
+    assert mjlab_env["rewards"] == pronk_env["rewards"]
     for name in PHASES:
-        a, b = (checkpoint.read_checkpoint(path / f"{name}.pt") for path in (folder, whole.path))
-        assert a["infos"]["env_state"] == b["infos"]["env_state"]
-        rates = [s["estimator_optimizer_state_dict"]["param_groups"][0]["lr"] for s in (a, b)]
-        assert rates == [PHASES[name].estimator_rate] * 2
+        mjlab_state = checkpoint.read_checkpoint(folder / f"{name}.pt")
+        pronk_state = checkpoint.read_checkpoint(finished_run.path / f"{name}.pt")
+        assert mjlab_state["infos"]["env_state"] == pronk_state["infos"]["env_state"]
+        for state in (mjlab_state, pronk_state):
+            (group,) = state["estimator_optimizer_state_dict"]["param_groups"]
+            assert group["lr"] == PHASES[name].estimator_rate
+
+
+def env_settings(folder: Path) -> Any:
+    """Read the settings of a run's environment."""
+    return yaml.load((folder / "params" / "env.yaml").read_text(), yaml.BaseLoader)
 
 
 def test_the_reward_rises(tmp_path: Path) -> None:
     """16 robots and a small network, phase walk, 35 iterations."""
-    cfg, learning = load_env_cfg("Pronk-Walk-MiniCheetah"), load_rl_cfg("Pronk-Walk-MiniCheetah")
-    cfg.scene.num_envs, cfg.seed, learning.seed = 16, 1, 1
-    learning.actor.hidden_dims = learning.critic.hidden_dims = (64, 64)
+    cfg = load_env_cfg("Pronk-Walk-MiniCheetah")
+    cfg.scene.num_envs = 16
+    cfg.seed = 1
+    learning = load_rl_cfg("Pronk-Walk-MiniCheetah")
+    learning.seed = 1
+    learning.actor.hidden_dims = (64, 64)
+    learning.critic.hidden_dims = (64, 64)
     env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
     runner = PronkRunner(env, asdict(learning), str(tmp_path), "cpu")
     runner.learn(5, init_at_random_ep_len=True)

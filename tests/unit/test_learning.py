@@ -45,7 +45,8 @@ def test_losses_by_hand() -> None:
         for parameter in estimator.parameters():
             parameter.zero_()
         estimator.mlp[-1].bias[:] = torch.tensor([0.0, 0.0, 0.0, math.log(3.0), 1.0, 2.0, 3.0])
-    x, target = torch.randn(1, 103), torch.tensor([[1.0, 0.0, 1.0, 0.0, 0.0, 2.0, 1.0]])
+    x = torch.randn(1, 103)
+    target = torch.tensor([[1.0, 0.0, 1.0, 0.0, 0.0, 2.0, 1.0]])
     with torch.no_grad():
         cross_entropy, squared = estimator.losses(x, target)
     # Probabilities 1/2, 1/2, 1/2 and 3/4 where there is no contact.
@@ -57,7 +58,9 @@ def test_losses_by_hand() -> None:
 
 def test_what_the_networks_read() -> None:
     algorithm = trained(1)
-    actor, critic, obs = algorithm.get_policy(), algorithm.critic, observe()
+    actor = algorithm.get_policy()
+    critic = algorithm.critic
+    obs = observe()
     statistics = actor.obs_normalizer
     measured = (obs["measured"] - statistics.mean) / (statistics.std + 0.01)
     read = torch.cat([measured[:, list(ESTIMATOR_INDICES)], obs["jump"]], dim=1)
@@ -103,17 +106,18 @@ def test_impossible_inputs_are_refused(changes: dict[str, Any], words: str) -> N
 def test_ppo_and_supervision_change_different_weights() -> None:
     """Every weight has one optimizer."""
     algorithm = build()
-    actor, critic = algorithm.get_policy(), algorithm.critic
-    mine, others = (
-        [p for group in optimizer.param_groups for p in group["params"]]
-        for optimizer in (algorithm.estimator_optimizer, algorithm.optimizer)
-    )
-    assert {id(p) for p in mine} == {id(p) for p in actor.estimator.parameters()}
-    everything = [*actor.parameters(), *critic.parameters()]
-    assert sorted(map(id, mine + others)) == sorted(map(id, everything))
+    actor = algorithm.get_policy()
+    (estimator_group,) = algorithm.estimator_optimizer.param_groups
+    (ppo_group,) = algorithm.optimizer.param_groups
+    estimator_ids = sorted(id(parameter) for parameter in estimator_group["params"])
+    assert estimator_ids == sorted(id(parameter) for parameter in actor.estimator.parameters())
+    optimized = [*estimator_group["params"], *ppo_group["params"]]
+    parameters = [*actor.parameters(), *algorithm.critic.parameters()]
+    assert sorted(id(p) for p in optimized) == sorted(id(p) for p in parameters)
     for _ in range(2):  # the second time the estimator has had gradients of its own
         roll_out(algorithm)
-        estimator, network = weights(actor.estimator), weights(actor.mlp)
+        estimator = weights(actor.estimator)
+        network = weights(actor.mlp)
         PPO.update(algorithm)
         assert same(weights(actor.estimator), estimator)
         assert not same(weights(actor.mlp), network)
@@ -126,20 +130,21 @@ def test_losses_are_means_over_the_rollout() -> None:
     # With a learning rate of nearly nothing the mean over mini-batches is that of the rollout.
     algorithm = build(estimator={"learning_rate": 1e-30, "epochs": 2, "mini_batches": 4})
     roll_out(algorithm)
-    actor, rollout = algorithm.get_policy(), algorithm.storage.observations.flatten(0, 1).clone()
+    actor = algorithm.get_policy()
+    rollout = algorithm.storage.observations.flatten(0, 1).clone()
     with torch.no_grad():
         inputs = actor.estimator_input(rollout)
-        expected = actor.estimator.losses(inputs, rollout["estimator_target"])
+        contact_loss, velocity_loss = actor.estimator.losses(inputs, rollout["estimator_target"])
     losses = algorithm.update()
-    found = losses["estimator_contact"], losses["estimator_velocity"]
-    assert found == pytest.approx([float(loss) for loss in expected], rel=1e-5)
+    assert losses["estimator_contact"] == pytest.approx(float(contact_loss), rel=1e-5)
+    assert losses["estimator_velocity"] == pytest.approx(float(velocity_loss), rel=1e-5)
 
 
 def test_the_estimator_learns_a_known_function() -> None:
     torch.manual_seed(0)
     mixing = torch.randn(102, 7) / math.sqrt(102) / 3.0
 
-    def known() -> Any:
+    def observe_known_function() -> Any:
         obs = observe()
         target = (obs["measured"][:, list(ESTIMATOR_INDICES)] - 1.0) @ mixing
         target[:, :4] = (target[:, :4] > 0.0).float()
@@ -148,8 +153,8 @@ def test_the_estimator_learns_a_known_function() -> None:
 
     algorithm = build(hidden=(8,), estimator={"epochs": 4}, num_learning_epochs=1)
     for _ in range(100):
-        learn(algorithm, known)
-    fresh = known()
+        learn(algorithm, observe_known_function)
+    fresh = observe_known_function()
     with torch.no_grad():
         contact, velocity = algorithm.get_policy().estimate(fresh)
     true_contact, true_velocity = fresh["estimator_target"].split([4, 3], dim=1)
@@ -159,10 +164,12 @@ def test_the_estimator_learns_a_known_function() -> None:
 
 
 def test_statistics_are_those_of_all_rollouts_and_the_first_ratio_is_one() -> None:
-    algorithm, history = build(), []
+    algorithm = build()
+    history = []
     for _ in range(3):
         roll_out(algorithm)
-        stored, actor = algorithm.storage, algorithm.get_policy()
+        stored = algorithm.storage
+        actor = algorithm.get_policy()
         history.append(stored.observations.clone())
         actor(stored.observations.flatten(0, 1), stochastic_output=True)
         again = actor.get_output_log_prob(stored.actions.flatten(0, 1))
@@ -181,36 +188,54 @@ def test_statistics_are_those_of_all_rollouts_and_the_first_ratio_is_one() -> No
 
 
 def narrow_state(state: dict[str, Any]) -> dict[str, Any]:
-    """The checkpoint of the same policy without jump inputs, optimizers without their moments."""
-    narrow = {"iter": 9, "infos": {}}
+    """Return the checkpoint of the same policy without jump inputs."""
+    narrow: dict[str, Any] = {"iter": 9, "infos": {}}
     for key in checkpoint.NETWORKS:
-        narrow[key] = {n: v for n, v in state[key].items() if not n.endswith(JUMP_WEIGHT)}
-    # Places of the jump weights: behind weight and bias of the first layer of each network.
-    for key, jump in zip(checkpoint.OPTIMIZERS, ((3, 10), (2,)), strict=True):
-        (group,) = state[key]["param_groups"]
-        kept = [index for index in group["params"] if index not in jump]
-        moments = {i: state[key]["state"][index] for i, index in enumerate(kept)}
-        group = {**group, "params": list(range(len(kept)))}
-        narrow[key] = {"state": moments, "param_groups": [group]}
+        narrow[key] = {}
+        for name, value in state[key].items():
+            if not name.endswith(JUMP_WEIGHT):
+                narrow[key][name] = value
+    # The jump weights are behind weight and bias of the first layer of each network.
+    actor_optimizer, estimator_optimizer = checkpoint.OPTIMIZERS
+    narrow[actor_optimizer] = narrow_optimizer(state[actor_optimizer], jump_places=(3, 10))
+    narrow[estimator_optimizer] = narrow_optimizer(state[estimator_optimizer], jump_places=(2,))
     return narrow
 
 
+def narrow_optimizer(state: dict[str, Any], jump_places: tuple[int, ...]) -> dict[str, Any]:
+    """Return the state of an optimizer without the moments of the jump inputs' weights."""
+    (group,) = state["param_groups"]
+    moments = {}
+    for place in group["params"]:
+        if place not in jump_places:
+            moments[len(moments)] = state["state"][place]
+    narrow_group = {**group, "params": list(range(len(moments)))}
+    return {"state": moments, "param_groups": [narrow_group]}
+
+
 def alike(a: EstimatorPPO, b: EstimatorPPO) -> bool:
-    """The same actor and critic, bit for bit."""
-    pairs = ((a.get_policy(), b.get_policy()), (a.critic, b.critic))
-    return all(same(weights(one), weights(other)) for one, other in pairs)
+    """Return whether actor and critic are the same, bit for bit."""
+    same_actor = same(weights(a.get_policy()), weights(b.get_policy()))
+    return same_actor and same(weights(a.critic), weights(b.critic))
 
 
 def outputs(algorithm: EstimatorPPO, obs: Any) -> list[bytes]:
+    """Return the bytes of all that the networks compute."""
     actor = algorithm.get_policy()
     with torch.inference_mode():
-        found = [actor(obs), algorithm.critic(obs), *actor.estimate(obs)]
-    return [value.numpy().tobytes() for value in found]
+        contact, velocity = actor.estimate(obs)
+        tensors = [actor(obs), algorithm.critic(obs), contact, velocity]
+    return [tensor.numpy().tobytes() for tensor in tensors]
 
 
 def jump_weights(algorithm: EstimatorPPO) -> list[Any]:
-    models = (algorithm.get_policy(), algorithm.critic)
-    return [v for m in models for n, v in m.state_dict().items() if n.endswith(JUMP_WEIGHT)]
+    """Return the weights of the jump inputs in all networks."""
+    values = []
+    for model in (algorithm.get_policy(), algorithm.critic):
+        for name, value in model.state_dict().items():
+            if name.endswith(JUMP_WEIGHT):
+                values.append(value)
+    return values
 
 
 def test_fed_zeros_the_jump_input_stays_blank() -> None:
@@ -223,12 +248,14 @@ def test_fed_zeros_the_jump_input_stays_blank() -> None:
         for rows in (1, 2, 7, 64, 500):
             obs = observe(rows)
             with_jump = outputs(algorithm, obs)
-            obs["jump"], obs["critic_jump"] = obs["jump"] * 0.0, obs["critic_jump"] * 0.0
+            obs["jump"] = obs["jump"] * 0.0
+            obs["critic_jump"] = obs["critic_jump"] * 0.0
             assert outputs(algorithm, obs) == with_jump, (rows, threads)
     # By PyTorch's own linear layer, too.
-    first, x = algorithm.get_policy().mlp[0], torch.randn(7, 53)
-    plain = torch.nn.functional.linear(x[:, :52].contiguous(), first.weight, first.bias)
-    assert torch.equal(first(x), plain)
+    layer = algorithm.get_policy().mlp[0]
+    x = torch.randn(7, 53)
+    plain = torch.nn.functional.linear(x[:, :52].contiguous(), layer.weight, layer.bias)
+    assert torch.equal(layer(x), plain)
     learn(algorithm)
     assert all(value.any() for value in jump_weights(algorithm))
 
@@ -274,7 +301,8 @@ def test_a_checkpoint_without_jump_inputs_is_widened() -> None:
 
 
 def test_saved_and_loaded_it_continues_alike(tmp_path: Path) -> None:
-    first, second = trained(1), build()
+    first = trained(1)
+    second = build()
     path = tmp_path / "model_3.pt"
     checkpoint.write_checkpoint(path, {**first.save(), "iter": 3, "infos": {"note": "x"}})
     assert [p.name for p in tmp_path.iterdir()] == ["model_3.pt"]
@@ -301,15 +329,15 @@ class Harmful:
 
 
 def test_other_files_are_refused_and_run_no_code(tmp_path: Path) -> None:
-    path, mark = tmp_path / "model_1.pt", tmp_path / "mark"
-    for state, words in (
-        ({"actor_state_dict": Harmful(mark)}, "not a checkpoint"),
-        ({"actor_state_dict": {}}, "critic_state_dict"),
-    ):
-        torch.save(state, path)
-        with pytest.raises(ArtefactError, match=words):
-            checkpoint.read_checkpoint(path)
+    path = tmp_path / "model_1.pt"
+    mark = tmp_path / "mark"
+    torch.save({"actor_state_dict": Harmful(mark)}, path)
+    with pytest.raises(ArtefactError, match="not a checkpoint"):
+        checkpoint.read_checkpoint(path)
     assert not mark.exists()
+    torch.save({"actor_state_dict": {}}, path)
+    with pytest.raises(ArtefactError, match="critic_state_dict"):
+        checkpoint.read_checkpoint(path)
     for content in (b"", b"text", path.read_bytes()[:300]):
         path.write_bytes(content)
         with pytest.raises(ArtefactError, match="not a checkpoint"):
@@ -345,10 +373,12 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
     algorithm.broadcast_parameters()
     for _ in range(2):
         learn(algorithm)
-    models = {"actor": algorithm.get_policy(), "critic": algorithm.critic}
-    found = {name: weights(model) for name, model in models.items()}
-    found["data"] = {"measured": algorithm.storage.observations["measured"].clone()}
-    torch.save(found, Path(folder) / f"{rank}.pt")
+    result = {
+        "actor": weights(algorithm.get_policy()),
+        "critic": weights(algorithm.critic),
+        "data": {"measured": algorithm.storage.observations["measured"].clone()},
+    }
+    torch.save(result, Path(folder) / f"{rank}.pt")
     torch.distributed.destroy_process_group()
 
 
@@ -358,7 +388,8 @@ def test_processes_stay_together(tmp_path: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     torch.multiprocessing.spawn(one_of_two, (port, str(tmp_path)), nprocs=2)
-    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
+    first = torch.load(tmp_path / "0.pt", weights_only=True)
+    second = torch.load(tmp_path / "1.pt", weights_only=True)
     assert not same(first["data"], second["data"])
     assert same(first["actor"], second["actor"])
     assert same(first["critic"], second["critic"])

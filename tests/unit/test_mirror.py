@@ -58,33 +58,37 @@ def test_mirror_by_hand(
 def test_a_batch_and_its_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(symmetry, "motion_command", lambda env: SimpleNamespace(body=BODY))
     env = SimpleNamespace(unwrapped=None)
-    groups = {name: torch.randn(4, sum(parts.values())) for name, parts in GROUPS.items()}
-    both, doubled = with_mirror_image(
-        env, TensorDict(groups, batch_size=[4]).exclude("action"), groups["action"]
-    )
-    found = {**both.to_dict(), "action": doubled}
+    groups = {}
+    for name, parts in GROUPS.items():
+        groups[name] = torch.randn(4, sum(parts.values()))
+    observations = TensorDict(groups, batch_size=[4]).exclude("action")
+    doubled_observations, doubled_action = with_mirror_image(env, observations, groups["action"])
+    doubled = {**doubled_observations.to_dict(), "action": doubled_action}
     for name, group in groups.items():
         image = mirrored(name, group, BODY)
         assert torch.equal(mirrored(name, image, BODY), group)
-        assert torch.equal(found[name], torch.cat([group, image]))
+        assert torch.equal(doubled[name], torch.cat([group, image]))
     assert with_mirror_image(env, None, None) == (None, None)
     with pytest.raises(PronkError, match="odour"):
         with_mirror_image(env, TensorDict({"odour": torch.zeros(2, 1)}, batch_size=[2]), None)
 
 
 def critic(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
-    """The critic's vector, with the robot's own velocity as the command."""
+    """Return the critic's vector, with the robot's own velocity as the command."""
     to_trunk = data.body("trunk").xmat.reshape(3, 3).T
-    force, wrench = np.zeros(4), np.zeros(6)
+    force = np.zeros(4)
+    wrench = np.zeros(6)
     feet = [model.geom(f"{leg}_foot_collision").id for leg in BODY.legs]
     for i, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, i, wrench)
         for geom in contact.geom:
             if geom in feet:
                 force[feet.index(geom)] += np.linalg.norm(wrench[:3])
-    velocity, angular = to_trunk @ data.qvel[:3], data.qvel[3:6]
+    velocity = to_trunk @ data.qvel[:3]
+    angular = data.qvel[3:6]
     # What is randomized: ones, as of a robot that is its own mirror image.
-    parts = {name: np.ones(size) for name, size in CRITIC.items()} | {
+    ones = {name: np.ones(size) for name, size in CRITIC.items()}
+    parts = ones | {
         "angular_velocity": angular,
         "projected_gravity": to_trunk @ np.array([0.0, 0.0, -1.0]),
         "command": np.array([velocity[0], velocity[1], angular[2]]),
@@ -101,9 +105,10 @@ def critic(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
 
 
 def rollout(model: mujoco.MjModel, qpos: Array, qvel: Array, actions: Array) -> Array:
-    """The critic's vector after each policy step of a robot with PD drives."""
+    """Return the critic's vector after each policy step of a robot with PD drives."""
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
+    data.qpos[:] = qpos
+    data.qvel[:] = qvel
     seen = []
     for action in actions:
         target = DEFAULT + 0.35 * action
@@ -116,7 +121,7 @@ def rollout(model: mujoco.MjModel, qpos: Array, qvel: Array, actions: Array) -> 
 
 
 def reflected(group: str, x: Array) -> Array:
-    """In double precision: the mirror only moves numbers and changes signs."""
+    """Mirror in double precision: the mirror only moves numbers and changes signs."""
     return np.asarray(mirrored(group, torch.tensor(x).double(), BODY).numpy())
 
 
@@ -127,17 +132,21 @@ def test_mirrored_rollout_is_that_of_the_mirror_image(seed: int) -> None:
     floor.size = (0.0, 0.0, 1.0)
     model = spec.compile()
     # Both sides must be solved to the last bit that matters.
-    model.opt.tolerance, model.opt.iterations = 1e-14, 200
+    model.opt.tolerance = 1e-14
+    model.opt.iterations = 200
     draw = np.random.default_rng(seed)
     actions = draw.normal(0.0, 0.7, (25, 12))
-    joints, rates = draw.normal(0.0, 0.1, 12), draw.normal(0.0, 1.0, 12)
+    joints = draw.normal(0.0, 0.1, 12)
+    rates = draw.normal(0.0, 1.0, 12)
     tilt = np.array([1.0, *draw.normal(0.0, 0.1, 3)])
     pose = np.array([0.1, 0.2, 0.33, *tilt / np.linalg.norm(tilt)])
     twist = np.concatenate([draw.normal(0.0, 0.5, 3), draw.normal(0.0, 1.0, 3)])
     seen = rollout(model, np.append(pose, DEFAULT + joints), np.append(twist, rates), actions)
     pose *= (1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
     twist *= (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
-    joints, rates, actions = (reflected("action", x) for x in (joints, rates, actions))
+    joints = reflected("action", joints)
+    rates = reflected("action", rates)
+    actions = reflected("action", actions)
     image = rollout(model, np.append(pose, DEFAULT + joints), np.append(twist, rates), actions)
     np.testing.assert_allclose(image, reflected("critic", seen), rtol=0.0, atol=1e-9)
     # The half second had contacts, and was not symmetric by itself.
