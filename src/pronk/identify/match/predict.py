@@ -343,13 +343,26 @@ def _played(
 
 def _joined(parts: Sequence[JointPrediction]) -> JointPrediction:
     """Return the predictions of several excitations of one joint, one after another."""
+    times = []
+    commands = []
+    measured = []
+    nominal = []
+    nominal_delayed = []
+    matched = []
+    for part in parts:
+        times.append(part.time)
+        commands.append(part.command)
+        measured.append(part.measured)
+        nominal.append(part.nominal)
+        nominal_delayed.append(part.nominal_delayed)
+        matched.append(part.matched)
     return JointPrediction(
         joint=parts[0].joint,
-        time=np.concatenate([part.time for part in parts]),
-        command=np.concatenate([part.command for part in parts]),
-        measured=np.concatenate([part.measured for part in parts]),
-        nominal=np.concatenate([part.nominal for part in parts]),
-        nominal_delayed=np.concatenate([part.nominal_delayed for part in parts]),
-        matched=np.concatenate([part.matched for part in parts]),
+        time=np.concatenate(times),
+        command=np.concatenate(commands),
+        measured=np.concatenate(measured),
+        nominal=np.concatenate(nominal),
+        nominal_delayed=np.concatenate(nominal_delayed),
+        matched=np.concatenate(matched),
         signal=parts[0].signal,
     )

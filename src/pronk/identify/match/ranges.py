@@ -101,22 +101,30 @@ def matched_gains(
 
 def _training_gains(robot: RobotSpec, joint: str, matched: Sequence[JointGains]) -> GroupGains:
     """Return the training gains of a group whose first matched joint is `joint`."""
-    stiffness_low, stiffness_high = _covering_interval([gains.stiffness for gains in matched])
-    damping_low, damping_high = _covering_interval([gains.damping for gains in matched])
+    stiffnesses = []
+    dampings = []
+    frictions = []
+    point_sets = []
+    for gains in matched:
+        stiffnesses.append(gains.stiffness)
+        dampings.append(gains.damping)
+        frictions.append(gains.frictionloss.value)
+        point_sets.append(interval_points(gains))
+    stiffness_low, stiffness_high = _covering_interval(stiffnesses)
+    damping_low, damping_high = _covering_interval(dampings)
     damping = _nearest_multiple(0.5 * (damping_low + damping_high), DAMPING_STEP)
     stiffness = _training_stiffness(robot, joint, matched, damping)
     stiffness_reach = max(stiffness_high - stiffness, stiffness - stiffness_low)
     damping_reach = max(damping_high - damping, damping - damping_low)
 
-    points = np.concatenate([interval_points(gains) for gains in matched])
-    center, shape = enclosing_ellipsoid(points)
+    center, shape = enclosing_ellipsoid(np.concatenate(point_sets))
     stiffness_row, damping_row = shape.tolist()
     return GroupGains(
         stiffness=stiffness,
         damping=damping,
         stiffness_range=_next_multiple(stiffness_reach, STIFFNESS_STEP),
         damping_range=_next_multiple(damping_reach, DAMPING_STEP),
-        frictionloss=float(np.mean([gains.frictionloss.value for gains in matched])),
+        frictionloss=float(np.mean(frictions)),
         ellipsoid=(tuple(stiffness_row), tuple(damping_row)),
         ellipsoid_center=(float(center[0]), float(center[1])),
     )
@@ -142,8 +150,9 @@ def _training_stiffness(
     With omega the characteristic frequency, `stiffness^2 + (omega damping)^2` of the group equals
     the mean of it over the joints.
     """
-    stiffnesses = np.array([gains.stiffness.value for gains in matched])
-    dampings = np.array([gains.damping.value for gains in matched])
+    pairs = np.array([(gains.stiffness.value, gains.damping.value) for gains in matched])
+    stiffnesses = pairs[:, 0]
+    dampings = pairs[:, 1]
     inertia, _ = bench_inertia(robot, robot.joint(joint).original[0])
     omega = float(dampings.mean()) / (2.0 * inertia)
     square = np.mean(stiffnesses**2) + omega**2 * (np.mean(dampings**2) - damping**2)

@@ -107,12 +107,13 @@ def translate(
 
     groups: dict[str, GroupGains] = {}
     for name, group in gains.groups.items():
-        members = [joint.name for joint in robot.group(name) if joint.name in joints]
-        groups[name] = _translated_group(
-            group,
-            [translations[member] for member in members],
-            [joints[member].frictionloss.value for member in members],
-        )
+        member_translations = []
+        frictions = []
+        for member in robot.group(name):
+            if member.name in joints:
+                member_translations.append(translations[member.name])
+                frictions.append(joints[member.name].frictionloss.value)
+        groups[name] = _translated_group(group, member_translations, frictions)
 
     simulator = replace(to.info, decimation=target.decimation)
     translated_gains = replace(gains, simulator=simulator, joints=joints, groups=groups)
