@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
+from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.checks import check_recordings, check_response
@@ -45,6 +46,8 @@ Method = Literal["time", "paper"]
 Mode = Literal["gains", "drive"]
 Progress = Callable[[str, float], None]
 
+WITHOUT_FRICTION = ("stiffness", "damping", "delay")
+"""Parameters that are fitted for frameworks whose joints have no dry friction as a torque."""
 NO_MATCH_DB = 1.0
 """Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
 of a good log stays below."""
@@ -213,7 +216,7 @@ def fitted_parameters(
     framework = simulation.framework
     if framework is not None and framework.friction != "N m":
         # The framework has no dry friction in newton metres that could be fitted.
-        return tuple(name for name in GAINS_MODE if name != "frictionloss")
+        return WITHOUT_FRICTION
     return GAINS_MODE
 
 
@@ -247,7 +250,9 @@ def search_grids(
         progress("grid", share)
 
     stiffness, damping = grid_axes(rigs.robot, points)
-    targets = [amplitudes[0] for amplitudes in measured.values()]
+    targets = []
+    for amplitudes in measured.values():
+        targets.append(amplitudes[0])
     searches = search_grid(rigs, targets, stiffness, damping, progress=report)
     return dict(zip(measured, searches, strict=True))
 
@@ -311,8 +316,8 @@ def match_chains(
                     robot,
                     name,
                     chain.logs,
-                    matched=[positions[:, column] for positions in matched_positions],
-                    nominal=[positions[:, column] for positions in nominal_positions],
+                    matched=joint_positions(matched_positions, column),
+                    nominal=joint_positions(nominal_positions, column),
                     highest_hz=replay.trusted_hz[name],
                 )
                 if compared is not None:
@@ -324,6 +329,11 @@ def match_chains(
         gains = joint_gains(fit, responses.get(name), recording_flags.get(name, ()))
         joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
     return match_result(simulation, simulation.info(), joints, logs, excluded)
+
+
+def joint_positions(positions: Sequence[Array], column: int) -> list[Array]:
+    """Return the positions of one joint, one array of shape (n,) a log [rad]."""
+    return [log_positions[:, column] for log_positions in positions]
 
 
 def compared_values(fit: DriveFit, method: Method) -> Mapping[str, float]:
@@ -400,14 +410,16 @@ def match_result(
     gains = {name: joint.gains for name, joint in joints.items()}
     simulation.require_stable(gains)
     hashes = {}
+    virtual = False
     for log in logs:
         hashes[Path(log.source or "log").name] = log.origin.sha256
+        virtual = virtual or log.virtual
     return MatchResult(
         robot=simulation.robot.name,
         simulator=simulator,
         joints=joints,
         groups=group_gains(simulation.robot, gains),
         logs=hashes,
-        virtual=any(log.virtual for log in logs),
+        virtual=virtual,
         excluded=excluded or {},
     )

@@ -113,8 +113,8 @@ def _draw_curves(
     axes.axvspan(*responses.band_hz, color=BAND_COLOR, zorder=0, linewidth=0)
     looks = ((MEASURED_COLOR, "-", 3.0), (NOMINAL_COLOR, "--", 1.5), (MATCHED_COLOR, "-", 1.4))
     for (label, values), (color, style, width) in zip(curves.items(), looks, strict=True):
-        shown = np.where(coherent, values, np.nan)
-        axes.plot(frequency_hz, shown, style, color=color, linewidth=width, label=label)
+        drawn_values = np.where(coherent, values, np.nan)
+        axes.plot(frequency_hz, drawn_values, style, color=color, linewidth=width, label=label)
     axes.set_xscale("log")
     axes.set_xlim(max(0.1, float(frequency_hz[coherent].min())), float(frequency_hz.max()))
     axes.grid(color="#e3e3e3", linewidth=0.7)

@@ -238,15 +238,18 @@ class MatchResult:
     @property
     def error_db(self) -> float:
         """Root mean square over the joints of the error with the matched gains [dB]."""
-        qualities = [joint.gains.quality for joint in self.joints.values()]
-        return _rms_of_known([quality.error_db for quality in qualities])
+        errors_db = []
+        for joint in self.joints.values():
+            errors_db.append(joint.gains.quality.error_db)
+        return rms_of_finite(errors_db)
 
     @property
     def nominal_error_db(self) -> float:
         """Root mean square over the joints of the error with the nominal gains [dB]."""
-        return _rms_of_known(
-            [joint.gains.quality.nominal_error_db for joint in self.joints.values()]
-        )
+        errors_db = []
+        for joint in self.joints.values():
+            errors_db.append(joint.gains.quality.nominal_error_db)
+        return rms_of_finite(errors_db)
 
     @property
     def worst_joint(self) -> str:
@@ -315,7 +318,7 @@ class MatchResult:
         return "\n".join(lines)
 
 
-def _rms_of_known(values: Sequence[float]) -> float:
+def rms_of_finite(values: Sequence[float]) -> float:
     """Return the root mean square of the finite values; NaN without any."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.sqrt(np.mean(np.square(finite)))) if finite else NAN
