@@ -20,7 +20,8 @@ from pronk.jump.virtual.robot import VirtualRobot
 from pronk.robots.machine import Command
 from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains
 
-KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]
+KNEES = [index for index, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]
+HIP_PITCHES = [index - 1 for index in KNEES]
 
 
 def hopped(**options: Any) -> VirtualRobot:
@@ -29,7 +30,7 @@ def hopped(**options: Any) -> VirtualRobot:
     machine = connected(base="ground", start=start, **options)
     stretched = POSE.copy()
     stretched[KNEES] = 1.1
-    stretched[[k - 1 for k in KNEES]] = -0.55
+    stretched[HIP_PITCHES] = -0.55
     machine.send(Command(position=stretched, **gains(20.0, 0.5)))
     machine.wait(0.1)
     machine.send(Command(position=POSE, **gains(30.0, 1.5)))
@@ -59,19 +60,21 @@ def posed(model: mujoco.MjModel, seen: Capture, samples: Sequence[int]) -> Itera
     """Put a model into the poses of samples."""
     data = mujoco.MjData(model)
     joints = [model.joint(name).qposadr[0] for name in ROBOT.joint_names]
-    for k in samples:
-        data.qpos[:3], data.qpos[3:7] = seen.position[k], seen.orientation[k]
-        data.qpos[joints] = seen.joint_position[k]
+    for sample in samples:
+        data.qpos[:3] = seen.position[sample]
+        data.qpos[3:7] = seen.orientation[sample]
+        data.qpos[joints] = seen.joint_position[sample]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         yield data
 
 
 def test_feet_are_where_the_trunk_and_the_joints_put_them(seen: Capture) -> None:
-    model, samples = ROBOT.build_spec().compile(), (0, 120, 250, 699)
+    model = ROBOT.build_spec().compile()
+    samples = (0, 120, 250, 699)
     sites = [model.site(f"{leg}_foot").id for leg in ("FR", "FL", "HR", "HL")]
-    for k, data in zip(samples, posed(model, seen, samples), strict=True):
-        np.testing.assert_allclose(seen.foot_position[k], data.site_xpos[sites], atol=1e-12)
+    for sample, data in zip(samples, posed(model, seen, samples), strict=True):
+        np.testing.assert_allclose(seen.foot_position[sample], data.site_xpos[sites], atol=1e-12)
 
 
 def test_positions_are_what_velocities_add_up_to(seen: Capture) -> None:
@@ -125,32 +128,38 @@ def test_a_snapshot_is_the_last_sample(machine: VirtualRobot, seen: Capture) -> 
     now = machine.snapshot()
     assert now.time == pytest.approx([0.699])
     for part in fields(Capture):
-        here, there = getattr(now, part.name)[0], getattr(seen, part.name)[-1]
+        snapshot = getattr(now, part.name)[0]
+        sample = getattr(seen, part.name)[-1]
         # The battery has sagged a little further since: it does so after each state.
-        close = 1e-3 if part.name == "bus_voltage" else 1e-12
-        np.testing.assert_allclose(here, there, rtol=close)
+        tolerance = 1e-3 if part.name == "bus_voltage" else 1e-12
+        np.testing.assert_allclose(snapshot, sample, rtol=tolerance)
 
 
 def test_capture_does_not_change_the_motion() -> None:
-    looked, not_looked, faster = (hopped(capture_rate_hz=rate) for rate in (1000.0, None, 4000.0))
-    looked.capture()
-    looked.snapshot()
-    for machine in (looked, not_looked, faster):
+    captured = hopped(capture_rate_hz=1000.0)
+    not_captured = hopped(capture_rate_hz=None)
+    captured_faster = hopped(capture_rate_hz=4000.0)
+    captured.capture()
+    captured.snapshot()
+    for machine in (captured, not_captured, captured_faster):
         machine.wait(0.75)
-    position = looked.snapshot().position
-    np.testing.assert_array_equal(position, not_looked.snapshot().position)
-    np.testing.assert_array_equal(position, faster.snapshot().position)
-    assert len(faster.capture().time) == 4 * 749 + 1
-    np.testing.assert_array_equal(faster.capture().position[::4], looked.capture().position)
+    position = captured.snapshot().position
+    np.testing.assert_array_equal(position, not_captured.snapshot().position)
+    np.testing.assert_array_equal(position, captured_faster.snapshot().position)
+    fast_capture = captured_faster.capture()
+    assert len(fast_capture.time) == 4 * 749 + 1
+    np.testing.assert_array_equal(fast_capture.position[::4], captured.capture().position)
 
 
 @pytest.mark.parametrize("rate", [300.0, 1500.0])
 def test_samples_between_states_are_taken_at_the_steps_nearest_to_them(rate: float) -> None:
-    whole, some = hopped(capture_rate_hz=4000.0).capture(), hopped(capture_rate_hz=rate).capture()
-    steps = np.rint(np.arange(len(some.time)) * 4000.0 / rate).astype(int)
-    assert steps[-1] < len(whole.time) <= steps[-1] + 4000.0 / rate + 1.0
+    every_step = hopped(capture_rate_hz=4000.0).capture()
+    capture = hopped(capture_rate_hz=rate).capture()
+    steps = np.rint(np.arange(len(capture.time)) * 4000.0 / rate).astype(int)
+    assert steps[-1] < len(every_step.time) <= steps[-1] + 4000.0 / rate + 1.0
     for part in fields(Capture):
-        np.testing.assert_array_equal(getattr(some, part.name), getattr(whole, part.name)[steps])
+        expected = getattr(every_step, part.name)[steps]
+        np.testing.assert_array_equal(getattr(capture, part.name), expected)
 
 
 def test_capture_outlives_the_connection_and_is_stored(seen: Capture, tmp_path: Path) -> None:
@@ -164,9 +173,10 @@ def test_capture_outlives_the_connection_and_is_stored(seen: Capture, tmp_path: 
     save_capture(path, seen)
     back = load_capture(path)
     for part in fields(Capture):
-        got, wanted = getattr(back, part.name), getattr(seen, part.name)
-        assert got.dtype == wanted.dtype
-        np.testing.assert_array_equal(got, wanted)
+        loaded = getattr(back, part.name)
+        saved = getattr(seen, part.name)
+        assert loaded.dtype == saved.dtype
+        np.testing.assert_array_equal(loaded, saved)
 
 
 def test_files_that_are_no_capture(seen: Capture, tmp_path: Path) -> None:

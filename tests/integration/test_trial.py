@@ -89,7 +89,7 @@ def test_draws_depend_on_seed_command_and_number_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         ({"jumps": 0}, "0 jumps"),
         ({"seed": -1}, "seed -1"),
@@ -97,8 +97,8 @@ def test_draws_depend_on_seed_command_and_number_alone() -> None:
         ({"cases": PAPER_COMMANDS[:1] * 2}, "forward 1, forward 1"),
     ],
 )
-def test_impossible_plans_are_refused(changes: Any, what: str) -> None:
-    with pytest.raises(PronkError, match=what):
+def test_impossible_plans_are_refused(changes: Any, message: str) -> None:
+    with pytest.raises(PronkError, match=message):
         TrialPlan(**changes)
 
 
@@ -120,35 +120,36 @@ def test_the_number_of_processes_changes_no_digit(
 ) -> None:
     go([hopper, weak], tmp_path, processes=2, about={"sha256": "ab"})
     assert (tmp_path / "trials.csv").read_bytes() == (tried / "trials.csv").read_bytes()
-    summaries = [json.loads((out / "summary.json").read_text()) for out in (tried, tmp_path)]
-    assert [summary.pop("timing")["processes"] for summary in summaries] == [1, 2]
-    assert summaries[0] == summaries[1]
+    summary = json.loads((tried / "summary.json").read_text())
+    summary_of_two = json.loads((tmp_path / "summary.json").read_text())
+    assert summary.pop("timing")["processes"] == 1
+    assert summary_of_two.pop("timing")["processes"] == 2
+    assert summary == summary_of_two
 
 
 def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
-    made = load_results(tried)
-    first, _ = made.subjects
-    assert (first.name, first.sha256, first.contract["gains_sha256"]) == (
-        "matched",
-        sha256(hopper),
-        "0f" * 32,
-    )
-    assert (made.virtual, made.sim_params) == (True, {"sha256": "ab"})
-    assert made.mass == pytest.approx(12.0)
-    assert made.versions["mujoco"]
+    trial = load_results(tried)
+    subject = trial.subjects[0]
+    assert subject.name == "matched"
+    assert subject.sha256 == sha256(hopper)
+    assert subject.contract["gains_sha256"] == "0f" * 32
+    assert trial.virtual
+    assert trial.sim_params == {"sha256": "ab"}
+    assert trial.mass == pytest.approx(12.0)
+    assert trial.versions["mujoco"]
     # The hop is real, and half as hard is a lower one.
-    strong = made.cell("matched", CASE.name).figures["height"].mean
-    half = made.cell("naive", CASE.name).figures["height"].mean
+    strong = trial.cell("matched", CASE.name).figures["height"].mean
+    half = trial.cell("naive", CASE.name).figures["height"].mean
     assert half < strong
     assert 0.2 < strong < 0.5
     # What is kept measures the same again.
     kept = sorted(path.name for path in (tried / "captures").iterdir())
     assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
-    for row in made.rows:
+    for row in trial.rows:
         seen = capture.load_capture(tried / row.capture)
         again = measure_jump(seen, row.script, ROBOT, began=row.began)
         assert repr(again) == repr(row.figures)
-    jump = made.rows[0].figures
+    jump = trial.rows[0].figures
     assert jump.found
     # The trunk rises about as far as its lift-off velocity takes it.
     assert jump.flight.rise == pytest.approx(jump.flight.ballistic, abs=0.03)
@@ -165,7 +166,8 @@ def test_processes_keep_the_order_and_pass_errors_on() -> None:
 
 
 def test_processes_end_though_an_idle_one_was_stopped(tmp_path: Path) -> None:
-    number, begun = tmp_path / "pid", tmp_path / "begun"
+    number = tmp_path / "pid"
+    begun = tmp_path / "begun"
     commands = [
         f"echo $PPID > {number}; until [ -e {begun} ]; do sleep 0.05; done",
         f"touch {begun}; sleep 1; kill -STOP $(cat {number})",
@@ -181,15 +183,17 @@ def test_processes_end_though_an_idle_one_was_stopped(tmp_path: Path) -> None:
 
 
 def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> None:
-    assert [s.name for s in load_subjects([hopper, weak], ROBOT)] == ["matched", "naive"]
-    other = write_hopper(tmp_path / "other.onnx", 0.7)
-    assert [s.name for s in load_subjects([hopper, other], ROBOT)] == ["policy", "other"]
+    matched, naive = load_subjects([hopper, weak], ROBOT)
+    assert (matched.name, naive.name) == ("matched", "naive")
+    other_file = write_hopper(tmp_path / "other.onnx", 0.7)
+    policy, other = load_subjects([hopper, other_file], ROBOT)
+    assert (policy.name, other.name) == ("policy", "other")
     with pytest.raises(PronkError, match="twice"):
         load_subjects([hopper, hopper], ROBOT)
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         ({"joint_names": tuple(reversed(ROBOT.joint_names))}, "joint_names"),
         ({"jump": False}, "walk only"),
@@ -197,16 +201,16 @@ def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> N
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(
-    changes: dict[str, Any] | None, what: str, tmp_path: Path
+    changes: dict[str, Any] | None, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "policy.onnx"
     if changes is None:
         path.write_bytes(b"not a network")
     else:
         write_hopper(path, **changes)
-    with pytest.raises(ArtefactError, match=what) as caught:
+    with pytest.raises(ArtefactError, match=message) as refusal:
         go([path], tmp_path / "out")
-    assert str(path) in str(caught.value)
+    assert str(path) in str(refusal.value)
     assert not (tmp_path / "out").exists()
 
 
@@ -214,13 +218,13 @@ def test_only_a_trial_is_overwritten(tmp_path: Path) -> None:
     prepare_folder(tmp_path / "new")
     assert (tmp_path / "new").is_dir()
     (tmp_path / "file").write_text("mine")
-    for out, overwrite, what in (
+    for out, overwrite, message in (
         (tmp_path / "file", False, "a file"),
         (tmp_path, False, "not empty"),
         (tmp_path, True, "no trial"),
         (tmp_path / "file" / "below", False, "cannot be written to"),
     ):
-        with pytest.raises(PronkError, match=what):
+        with pytest.raises(PronkError, match=message):
             prepare_folder(out, overwrite=overwrite)
     assert (tmp_path / "file").read_text() == "mine"
     old = tmp_path / "old"
@@ -235,7 +239,8 @@ def test_only_a_trial_is_overwritten(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_tables_page_and_figures(hopper: Path, tmp_path: Path) -> None:
-    out, figures = tmp_path / "trial", tmp_path / "figures.json"
+    out = tmp_path / "trial"
+    figures = tmp_path / "figures.json"
     words = ["trial", hopper, "--out", out, "--commands=0,-1", "--jumps", "1", "--processes", "1"]
     done = invoke([*words, "--no-video", "--definitions", "--json", figures])
     assert done.exit_code == 0, done.stderr
@@ -256,8 +261,8 @@ def test_impossible_parameters_are_refused_before_the_first_step(
     body["joints"]["FR_knee"]["rotor_inertia"] = -1.0
     params = tmp_path / "sim_params.yaml"
     params.write_text(yaml.safe_dump(body))
-    for path, what in ((params, "rotor_inertia"), (tmp_path / "other.yaml", "other.yaml")):
+    for path, named in ((params, "rotor_inertia"), (tmp_path / "other.yaml", "other.yaml")):
         done = invoke(["trial", hopper, "--out", tmp_path / "out", "--sim-params", path])
         assert done.exit_code == 2
-        assert what in done.stderr
+        assert named in done.stderr
     assert not (tmp_path / "out").exists()

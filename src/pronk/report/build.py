@@ -19,7 +19,7 @@ from pronk.report.page import Part, page
 PAGE_NAME = "report.html"
 LOGS = "*.mcap"
 PART_MAKERS: dict[str, Callable[[Path], Part]] = {
-    SUMMARY: trial_page.part,
+    SUMMARY: trial_page.trial_part,
     LOGS: deploy_page.deploy_part,
     "match.npz": match_page.match_part,
 }

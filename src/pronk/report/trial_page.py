@@ -173,7 +173,7 @@ def _picture_address(path: Path) -> str:
 # ---- the part ----
 
 
-def part(path: Path) -> Part:
+def trial_part(path: Path) -> Part:
     """Make the part of the trial in `path`, a `summary.json`."""
     folder = path.parent
     trial = load_results(folder)

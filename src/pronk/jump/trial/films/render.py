@@ -458,7 +458,7 @@ def check_gl() -> None:
             raise PronkError("the image is black.")
 
 
-def main() -> None:
+def render_command_line() -> None:
     """Render the film that the command line names, or check the backend without one."""
     paths = [Path(argument) for argument in sys.argv[1:]]
     if not paths:
@@ -470,6 +470,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     try:
-        main()
+        render_command_line()
     except Exception as error:
         sys.exit(f"{type(error).__name__}: {' '.join(str(error).split())}")
