@@ -53,12 +53,12 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
     knee = [("FR_knee", size * CHIRP) for size in (1.0, 0.4, 1.0, 1.0)]
     write_mcap(tmp_path / "a.mcap", log_of(*knee))
     log = read_log(tmp_path / "a.mcap", robot=ROBOT)
-    found = [(one.repeat, round(one.amplitude, 3)) for one in log.segments]
-    assert found == [(0, 0.25), (0, 0.1), (1, 0.25), (2, 0.25)]
-    for k, one in enumerate(log.segments):
+    repeats = [(segment.repeat, round(segment.amplitude, 3)) for segment in log.segments]
+    assert repeats == [(0, 0.25), (0, 0.1), (1, 0.25), (2, 0.25)]
+    for k, segment in enumerate(log.segments):
         # The chirp, and a part of the rest before and after it.
-        assert 21.0 * k - 0.6 < one.start <= 21.0 * k + 0.03
-        assert 21.0 * k + 20.3 < one.stop < 21.0 * k + 21.03
+        assert 21.0 * k - 0.6 < segment.start <= 21.0 * k + 0.03
+        assert 21.0 * k + 20.3 < segment.stop < 21.0 * k + 21.03
     assert [len(repeats) for repeats in group_repeats(log.excitations("FR_knee"))] == [3, 1]
     with joint_rigs("mujoco", ROBOT) as rigs:
         replay = JointReplay(rigs, log.excitations("FR_knee"))
@@ -67,15 +67,15 @@ def test_repeats_and_amplitudes_in_one_file_are_separated(tmp_path: Path) -> Non
     assert (len(loud.repeats), len(quiet.repeats)) == (3, 1)
     # The same as of the first chirp alone, which a file of its own would hold.
     alone = estimate_response(log_of(knee[0]), "FR_knee")[0]
-    for found in (loud, quiet):
-        np.testing.assert_allclose(found.response, alone.response, atol=0.02)
+    for response in (loud, quiet):
+        np.testing.assert_allclose(response.response, alone.response, atol=0.02)
     assert len(measured_joints([log], "FR_knee", ROBOT, MatchSettings())) == 2
 
 
 def test_joints_after_one_another_do_not_move_together() -> None:
     parts = [(name, size * CHIRP) for name in LEG for size in (1.0, 1.0)]
     log = log_of(*parts, begin=POSE + np.array([0.3, -0.4, 0.5])).segmented()
-    assert [one.joints[0] for one in log.segments] == [name for name, _ in parts]
+    assert [segment.joints[0] for segment in log.segments] == [name for name, _ in parts]
     assert not moves_together(log)
     assert any("changes of pose of FR_hip_roll, FR_hip_pitch" in note for note in log.notes)
     assert log.pose is not None
@@ -124,10 +124,14 @@ STEPS = np.repeat([0.0, 0.1, 0.0, -0.1, 0.0], 500)
     ids=["one", "two kinds", "too short", "pulses", "stairs", "with pulses", "negative"],
 )
 def test_what_is_no_repeat_stays_one_excitation(signals: tuple[np.ndarray, ...]) -> None:
-    made = log_of(*(("FR_knee", signal) for signal in signals))
-    log = made.segmented()
-    (one,) = log.segments
-    assert (one.joints, one.start, one.stop) == (("FR_knee",), made.time[0], made.time[-1])
+    unnamed = log_of(*(("FR_knee", signal) for signal in signals))
+    log = unnamed.segmented()
+    (segment,) = log.segments
+    assert (segment.joints, segment.start, segment.stop) == (
+        ("FR_knee",),
+        unnamed.time[0],
+        unnamed.time[-1],
+    )
 
 
 @pytest.mark.parametrize(
@@ -140,9 +144,13 @@ def test_stairs_and_a_chirp_that_is_cut_are_excitations(other: np.ndarray) -> No
 
 
 def test_noise_of_another_command_is_no_excitation() -> None:
-    made = log_of(("FR_knee", CHIRP))
-    command = made.command + 1e-4 * np.random.default_rng(0).random(made.command.shape) * [1, 1, 0]
-    log = replace(made, command=command).segmented()
+    unnamed = log_of(("FR_knee", CHIRP))
+    command = unnamed.command + 1e-4 * np.random.default_rng(0).random(unnamed.command.shape) * [
+        1,
+        1,
+        0,
+    ]
+    log = replace(unnamed, command=command).segmented()
     assert log.excited_joints == ("FR_knee",)
     assert not moves_together(log)
 

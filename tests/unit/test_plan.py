@@ -20,7 +20,7 @@ EXACT = Uncertainty(inertia=0.0, stiffness=0.0, friction=0.0)
 
 
 def forecasts(joint: str, signal: Signal, **options: Any) -> dict[str, Forecast]:
-    found = forecast(
+    chain_forecasts = forecast(
         ROBOT,
         joint,
         signal.samples(50.0),
@@ -29,7 +29,7 @@ def forecasts(joint: str, signal: Signal, **options: Any) -> dict[str, Forecast]
         damping={joint.name: joint.damping for joint in ROBOT.joints},
         **options,
     )
-    return {each.joint: each for each in found}
+    return {joint_forecast.joint: joint_forecast for joint_forecast in chain_forecasts}
 
 
 @pytest.fixture(scope="module")
@@ -43,23 +43,23 @@ def test_the_papers_sweep_of_all_joints_passes(plan: SweepPlan) -> None:
     assert len(plan.rows()) == 12
     assert len(plan.excitations) == 12 * 2 * 3
     first = plan.excitations[:6]
-    assert [each.signal.amplitude for each in first] == [0.25] * 3 + [0.125] * 3
-    assert [each.repeat for each in first] == [0, 1, 2, 0, 1, 2]
+    assert [excitation.signal.amplitude for excitation in first] == [0.25] * 3 + [0.125] * 3
+    assert [excitation.repeat for excitation in first] == [0, 1, 2, 0, 1, 2]
     assert plan.duration_s == pytest.approx(72 * 20.5 + 12 * 3.0)
     # The thigh is clamped for the knee only.
-    for each in plan.excitations:
-        leg, joint = each.joint.split("_", 1)
+    for excitation in plan.excitations:
+        leg, joint = excitation.joint.split("_", 1)
         expected = (f"{leg}_hip_roll", f"{leg}_hip_pitch") if joint == "knee" else ()
-        assert each.clamped == expected
+        assert excitation.clamped == expected
 
 
 def test_mirrored_joints_have_mirrored_forecasts(plan: SweepPlan) -> None:
     rows = {row["joint"]: row for row in plan.rows()}
     # The chirp begins to the same side for both legs, which is outward for one and inward for the
     # other, so their extremes mirror nearly, not exactly.
-    right, left = rows["FR_hip_roll"], rows["FL_hip_roll"]
-    assert left["highest_rad"] == pytest.approx(-float(right["lowest_rad"]), abs=0.01)
-    assert left["lowest_rad"] == pytest.approx(-float(right["highest_rad"]), abs=0.01)
+    right_row, left_row = rows["FR_hip_roll"], rows["FL_hip_roll"]
+    assert left_row["highest_rad"] == pytest.approx(-float(right_row["lowest_rad"]), abs=0.01)
+    assert left_row["lowest_rad"] == pytest.approx(-float(right_row["highest_rad"]), abs=0.01)
     assert {**rows["HL_knee"], "joint": ""} == {**rows["FR_knee"], "joint": ""}
 
 
@@ -67,27 +67,27 @@ def test_mirrored_forecast_equals_the_simulation_of_the_joint_itself() -> None:
     plan = make_plan(ROBOT, ["FL_hip_roll"], SHORT, amplitudes=(0.25,), repeats=1)
     # Mirror-image joints are excited mirrored.
     np.testing.assert_array_equal(plan.excitations[0].offsets(50.0), -SHORT.samples(50.0))
-    own = forecasts("FL_hip_roll", SHORT)
+    itself = forecasts("FL_hip_roll", SHORT)
     mirrored = forecasts("FR_hip_roll", SHORT)
     for name in ("FL_hip_roll", "FL_hip_pitch", "FL_knee"):
         planned = next(f for f in plan.forecasts if f.joint == name)
         for value in ("speed", "torque", "electrical_power"):
             expected = getattr(mirrored[name.replace("FL", "FR")], value)
             assert getattr(planned, value) == pytest.approx(expected, rel=1e-6, abs=1e-9)
-            assert getattr(planned, value) == pytest.approx(getattr(own[name], value), rel=0.1)
+            assert getattr(planned, value) == pytest.approx(getattr(itself[name], value), rel=0.1)
 
 
 def test_a_slow_excitation_is_followed_statically() -> None:
     """At 0.2 Hz position follows the command; peak torque is stiffness times friction's lag."""
     slow = Chirp(start_hz=0.1, stop_hz=0.3, length_s=10.0, amplitude=0.2)
-    found = forecasts("FR_knee", slow, uncertainty=EXACT)["FR_knee"]
+    worst = forecasts("FR_knee", slow, uncertainty=EXACT)["FR_knee"]
     rest = ROBOT.joint("FR_knee").default_position
-    assert found.highest == pytest.approx(rest + 0.2, abs=0.03)
-    assert found.lowest == pytest.approx(rest - 0.2, abs=0.03)
-    assert found.speed < 2.0
+    assert worst.highest == pytest.approx(rest + 0.2, abs=0.03)
+    assert worst.lowest == pytest.approx(rest - 0.2, abs=0.03)
+    assert worst.speed < 2.0
     # Power from the bus is the mechanical power and the loss in the winding.
-    assert 0.0 < found.mechanical_power < found.electrical_power
-    assert found.bus_current == pytest.approx(found.electrical_power / 24.0)
+    assert 0.0 < worst.mechanical_power < worst.electrical_power
+    assert worst.bus_current == pytest.approx(worst.electrical_power / 24.0)
 
 
 def test_the_corners_enclose_the_model_itself() -> None:
@@ -141,8 +141,8 @@ def test_what_no_amplitude_fits_and_what_the_drives_cannot_give_are_refused() ->
 
 def test_each_amplitude_may_have_repeats_of_its_own() -> None:
     plan = make_plan(ROBOT, ["FR_knee"], amplitudes=(0.125, 0.25), repeats=(1, 3))
-    found = [(each.signal.amplitude, each.repeat) for each in plan.excitations]
-    assert found == [(0.25, 0), (0.25, 1), (0.25, 2), (0.125, 0)]
+    planned = [(excitation.signal.amplitude, excitation.repeat) for excitation in plan.excitations]
+    assert planned == [(0.25, 0), (0.25, 1), (0.25, 2), (0.125, 0)]
 
 
 @pytest.mark.parametrize(

@@ -61,9 +61,9 @@ def errors(
     response: FrequencyResponse, joint: dict[str, float], *, delay: float = 0.0
 ) -> tuple[float, float, int]:
     """Largest gain error (share) and phase error (degrees) where coherent, and how many bins."""
-    known = second_order(response.omega, delay_s=delay, **joint)
+    expected = second_order(response.omega, delay_s=delay, **joint)
     use = response.band(0.25, 24.0, 0.95)
-    ratio = response.response[use] / known[use]
+    ratio = response.response[use] / expected[use]
     gain, phase = np.abs(np.abs(ratio) - 1.0), np.degrees(np.abs(np.angle(ratio)))
     return float(gain.max()), float(phase.max()), int(use.sum())
 
@@ -130,10 +130,10 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
     signals = [(time, size * command, hz) for size in (0.5, 0.5, 1.0, 1.0, 1.0)]
     log = make_log(signals, KNEE_JOINT, kind="chirp")
     segments = tuple(replace(s, amplitude=float("nan")) for s in log.segments)
-    found = estimate_response(replace(log, segments=segments), "knee")
-    assert [r.amplitude for r in found] == pytest.approx([0.25, 0.125], rel=0.01)
-    assert [len(r.repeats) for r in found] == [3, 2]
-    assert np.array_equal(found[0].omega, found[1].omega)
+    responses = estimate_response(replace(log, segments=segments), "knee")
+    assert [r.amplitude for r in responses] == pytest.approx([0.25, 0.125], rel=0.01)
+    assert [len(r.repeats) for r in responses] == [3, 2]
+    assert np.array_equal(responses[0].omega, responses[1].omega)
 
 
 def test_settings_are_checked() -> None:
@@ -155,7 +155,7 @@ def test_logs_without_a_response_are_refused() -> None:
     time, command, hz = steps_command(500.0, (1.0, 2.0))
     bare = make_log([(time, command, None)], KNEE_JOINT, kind="sine_steps")
     hurried = make_log([(time[:600], command[:600], hz[:600])], KNEE_JOINT, kind="sine_steps")
-    both = np.repeat(stuck.command, 2, axis=1)
+    two_columns = np.repeat(stuck.command, 2, axis=1)
     for log, joint, words in (
         (stuck, "knee", "knee did not move"),
         (still, "knee", "stands still"),
@@ -166,7 +166,7 @@ def test_logs_without_a_response_are_refused() -> None:
         (bare, "knee", "instantaneous frequency"),
         (hurried, "knee", "the step at 1 Hz lasts"),
         (
-            replace(stuck, joints=("knee", "hip"), command=both, position=both),
+            replace(stuck, joints=("knee", "hip"), command=two_columns, position=two_columns),
             *("hip", "hip was not excited; knee"),
         ),
     ):
@@ -228,12 +228,16 @@ def test_friction_shows_in_the_third_harmonic() -> None:
         ((time, 0.5 * command, hz), 0.2, "chirp"),
         (steps_command(500.0, (1.0, 2.0, 3.0)), 0.2, "sine_steps"),
     )
-    logs = [make_log([one], friction_joint(dry), kind=k, noise=2e-5) for one, dry, k in signals]
-    none, whole, half, stepped = (estimate_response(log, "knee")[0].third_harmonic for log in logs)
-    assert none < 0.001
-    assert 0.008 < whole < 0.02
-    assert half == pytest.approx(2.0 * whole, rel=0.15)
-    assert stepped == pytest.approx(whole, rel=0.15)
+    logs = [
+        make_log([signal], friction_joint(dry), kind=k, noise=2e-5) for signal, dry, k in signals
+    ]
+    no_friction, full_friction, half_amplitude, by_steps = (
+        estimate_response(log, "knee")[0].third_harmonic for log in logs
+    )
+    assert no_friction < 0.001
+    assert 0.008 < full_friction < 0.02
+    assert half_amplitude == pytest.approx(2.0 * full_friction, rel=0.15)
+    assert by_steps == pytest.approx(full_friction, rel=0.15)
 
 
 # --- uncertainty --------------------------------------------------------------------------------
@@ -250,14 +254,14 @@ def coloured(rng: np.random.Generator, shape: tuple[int, ...], deviation: float)
     return lfilter([1.0], [1.0, -pole], driven)[..., 200:]
 
 
-def covered(omega: np.ndarray, known: np.ndarray, **parts: np.ndarray) -> np.ndarray:
+def covered(omega: np.ndarray, expected: np.ndarray, **parts: np.ndarray) -> np.ndarray:
     """Whether the intervals on gain and phase hold the known response, shape (2, f)."""
     labels = {"joint": "knee", "estimator": "H1", "window": "", "segment_s": SETTINGS.segment_s}
     response = FrequencyResponse(amplitude=AMPLITUDE, omega=omega, **labels, **parts)  # type: ignore[arg-type]
     low, high = response.gain_interval(0.95)
-    gain = (low <= np.abs(known)) & (np.abs(known) <= high)
+    gain = (low <= np.abs(expected)) & (np.abs(expected) <= high)
     low, high = response.phase_interval(0.95)
-    off = np.angle(known / response.response)
+    off = np.angle(expected / response.response)
     return np.array([gain, (low - response.phase <= off) & (off <= high - response.phase)])
 
 
@@ -269,16 +273,16 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     matrix, ones = operator.matrix(time), np.ones(len(operator.omega))
     clean = simulate_second_order(command, 200.0, **KNEE)
     noise = coloured(rng, (300, repeats, len(time)), 2e-3)
-    known, rest = clean @ matrix, {"coherence": ones, "averages": ones}
+    expected, weights = clean @ matrix, {"coherence": ones, "averages": ones}
     hits = np.array(
         [
-            covered(operator.omega, known, response=row.mean(axis=0), repeats=row, **rest)
+            covered(operator.omega, expected, response=row.mean(axis=0), repeats=row, **weights)
             for row in (clean + noise) @ matrix
         ]
     )
-    for each in hits.swapaxes(0, 1):
-        assert 0.93 < each.mean() < 0.97
-        assert each.mean(axis=0).min() > 0.88
+    for shares in hits.swapaxes(0, 1):
+        assert 0.93 < shares.mean() < 0.97
+        assert shares.mean(axis=0).min() > 0.88
     # Between 0.90 and 0.99 for every bin but what chance leaves outside.
     assert np.mean(np.abs(hits[:, 0].mean(axis=0) - 0.945) <= 0.045) > 0.97
 
@@ -294,24 +298,24 @@ def laid_out() -> tuple[SegmentLayout, np.ndarray]:
 def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> None:
     rng, (where, excited) = np.random.default_rng(7), laid_out()
     clean = KNEE_JOINT(chirp_command("chirp", 200.0)[1], 200.0)
-    known = sum_spectra(excited, where.spectra(clean), where).response(where.omega, 200.0)
+    expected = sum_spectra(excited, where.spectra(clean), where).response(where.omega, 200.0)
     hits = []
     for _ in range(150):
         white = 4e-3 * rng.standard_normal(len(clean))
         noise = white if colour == "white" else coloured(rng, (len(clean),), 8e-3)
         s = sum_spectra(excited, where.spectra(clean + noise), where)
-        found = s.response(where.omega, 200.0)
-        parts = {"coherence": s.coherence(), "averages": s.averages(), "repeats": found[None]}
-        hits.append(covered(where.omega, known, response=found, **parts)[0])
+        estimated = s.response(where.omega, 200.0)
+        parts = {"coherence": s.coherence(), "averages": s.averages(), "repeats": estimated[None]}
+        hits.append(covered(where.omega, expected, response=estimated, **parts)[0])
     assert 0.90 < np.mean(hits) < 0.99
 
 
 def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
     rng, (where, excited) = np.random.default_rng(3), laid_out()
     noise = [rng.standard_normal(where.grid.count) for _ in range(150)]
-    each = [sum_spectra(excited, where.spectra(one), where) for one in noise]
-    raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in each], axis=0)
-    assert float((raw * each[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
+    shares = [sum_spectra(excited, where.spectra(one), where) for one in noise]
+    raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in shares], axis=0)
+    assert float((raw * shares[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
     # Nor is a single noisy repeat coherent by construction.
     assert float(np.median(estimate_response(chirps(noise=0.5), "knee")[0].coherence)) < 0.7
 
@@ -335,17 +339,20 @@ IN_MOTION = [tuple(part[:3500] for part in chirp_command("chirp", 200.0))]
 def test_operator_is_the_estimate(log: JointLog, settings: Estimator) -> None:
     (response,) = estimate_response(log, "knee", settings)
     (row,) = operators(log, "knee", settings)
-    positions = [log.cut(segment).position[:, 0] for segment in log.segments]
-    pairs = list(zip(row, positions, strict=True))
-    each = np.array([position @ one.matrix(one.time) for one, position in pairs])
-    weight = np.array([one.excitation for one in row])
+    by_matrix = []
+    by_transforms = []
+    weights = []
+    for repeat_operator, segment in zip(row, log.segments, strict=True):
+        position = log.cut(segment).position[:, 0]
+        by_matrix.append(position @ repeat_operator.matrix(repeat_operator.time))
+        by_transforms.append(repeat_operator.response(repeat_operator.time, position))
+        weights.append(repeat_operator.excitation)
     scale = np.abs(response.response).max()
-    by_transforms = np.array([one.response(one.time, position) for one, position in pairs])
-    assert np.abs(by_transforms - each).max() < 1e-9 * scale
-    if len(each) == len(response.repeats):
-        assert np.abs(each - response.repeats).max() < 1e-9 * scale
-    whole = (each * weight).sum(axis=0) / weight.sum(axis=0)
-    assert np.abs(whole - response.response).max() < 1e-9 * scale
+    assert np.abs(np.array(by_transforms) - by_matrix).max() < 1e-9 * scale
+    if len(by_matrix) == len(response.repeats):
+        assert np.abs(by_matrix - response.repeats).max() < 1e-9 * scale
+    combined = np.average(by_matrix, axis=0, weights=weights)
+    assert np.abs(combined - response.response).max() < 1e-9 * scale
 
 
 def test_matrix_takes_positions_at_physics_steps() -> None:
@@ -353,10 +360,11 @@ def test_matrix_takes_positions_at_physics_steps() -> None:
     time, command, _ = chirp_command("chirp", 500.0)
     operator = H1Operator.build(time, command, Estimator())
     steps = np.arange(round(time[-1] / 0.005)) * 0.005
-    matrix, own = operator.matrix(steps), operator.matrix(time)
-    assert np.allclose((command + 1.7) @ own, command @ own, atol=1e-8)  # Offsets do not matter.
+    matrix, own_matrix = operator.matrix(steps), operator.matrix(time)
+    # Offsets do not matter.
+    assert np.allclose((command + 1.7) @ own_matrix, command @ own_matrix, atol=1e-8)
     for joint in (KNEE, HIP, LIVELY):
-        fine = simulate_second_order(command, 500.0, **joint) @ own
+        fine = simulate_second_order(command, 500.0, **joint) @ own_matrix
         coarse = simulate_second_order(np.repeat(command[::10], 4), 200.0, **joint)[: len(steps)]
         low = operator.omega < 2.0 * np.pi * 15.0
         assert np.abs((coarse @ matrix / fine - 1.0)[low]).max() < 1e-3
