@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -207,7 +207,7 @@ def text(sim_params: SimParams) -> str:
     lines = [HEADER, f"schema: {SCHEMA}", f"robot: {sim_params.robot}"]
     lines.append(MACHINE + BODY + "joints:")
     for name, joint in sim_params.joints.items():
-        entries = [f"{key}: {_decimal(value)}" for key, value in vars(joint).items()]
+        entries = [f"{key}: {_decimal(value)}" for key, value in asdict(joint).items()]
         lines.append(f"  {name}:")
         lines += [
             f"    {{{', '.join(entries[:4])},",
