@@ -28,7 +28,8 @@ import numpy as np
 
 from pronk.cli import console
 from pronk.deploy.links.address import Address
-from pronk.deploy.links.lcm.codec import CHEETAH, decode_command
+from pronk.deploy.links.lcm.codec import decode_lcm_command
+from pronk.deploy.links.lcm.layouts import CHEETAH
 from pronk.deploy.links.lcm.link import url_of
 from pronk.deploy.runtime.deploy_log import is_deploy_log, read_deploy_log
 from pronk.deploy.runtime.plan import Link, RunPlan
@@ -156,7 +157,7 @@ def _heard(port: int) -> Iterator[list[tuple[float, bool]]]:
     wire = lcm.LCM(url_of(port=port))
 
     def hear(_: str, data: bytes) -> None:
-        damps = not decode_command(CHEETAH, data).stiffness.any()
+        damps = not decode_lcm_command(CHEETAH, data).stiffness.any()
         commands.append((time.monotonic(), damps))
 
     def listen() -> None:

@@ -77,7 +77,8 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.deploy.links.lcm.codec import CHEETAH, decode_command, encode_command
+    from pronk.deploy.links.lcm.codec import decode_lcm_command, encode_lcm_command
+    from pronk.deploy.links.lcm.layouts import CHEETAH
     from pronk.deploy.links.lcm.link import url_of
 
     sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
@@ -92,22 +93,28 @@ def over_lcm(port: int) -> Wire:
     listener.subscribe(
         CHEETAH.command.channel, lambda _, data: met.append((time.monotonic(), data))
     ).set_queue_capacity(500)
-    data = encode_command(CHEETAH, OTHER)
+    data = encode_lcm_command(CHEETAH, OTHER)
     return Wire(
         lambda: sender.publish(CHEETAH.command.channel, data),
         listen,
-        lambda data: decode_command(CHEETAH, data),
+        lambda data: decode_lcm_command(CHEETAH, data),
     )
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.deploy.links.dds import codec as idl
-    from pronk.deploy.links.dds.codec import decode_command, encode_command, joint_map
-    from pronk.deploy.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
+    from pronk.deploy.links.dds.codec import decode_dds_command, encode_dds_command, joint_map
+    from pronk.deploy.links.dds.link import (
+        COMMANDS,
+        DdsNetwork,
+        Participant,
+        take_samples,
+        write_bytes,
+    )
+    from pronk.deploy.links.dds.messages import LowCmd
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
-    sender = own.writer(COMMANDS, idl.LowCmd)
-    listener = own.reader(COMMANDS, idl.LowCmd, own=False)
+    sender = own.writer(COMMANDS, LowCmd)
+    listener = own.reader(COMMANDS, LowCmd, own=False)
     counts: Counter[str] = Counter()
     # Every sample says when it was written, by the wall clock.
     wall = time.time() - time.monotonic()
@@ -115,10 +122,13 @@ def over_dds(domain: int) -> Wire:
     def listen() -> list[tuple[float, bytes]]:
         time.sleep(0.002)
         return [
-            (m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(listener, counts)
+            (m.sample_info.source_timestamp * 1e-9 - wall, m.data)
+            for m in take_samples(listener, counts)
         ]
 
-    data = encode_command(joints, OTHER)
+    data = encode_dds_command(joints, OTHER)
     return Wire(
-        lambda: write(sender, data, counts), listen, lambda data: decode_command(joints, data)
+        lambda: write_bytes(sender, data, counts),
+        listen,
+        lambda data: decode_dds_command(joints, data),
     )

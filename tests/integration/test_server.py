@@ -14,15 +14,9 @@ from broken_message import mutated
 from command_line import invoke
 from pronk.deploy.bench.faults import parse_faults
 from pronk.deploy.bench.server import TICK_S, RobotServer, ServerTransport, Watchdog
-from pronk.deploy.links.lcm.codec import (
-    CHEETAH,
-    CONTROL_PARAMETER,
-    VIRTUAL_ROBOT,
-    WTW,
-    Layout,
-    decode_command,
-    encode_command,
-)
+from pronk.deploy.links.lcm.codec import decode_lcm_command, encode_lcm_command
+from pronk.deploy.links.lcm.layouts import CHEETAH, WTW, LcmLayout
+from pronk.deploy.links.lcm.messages import CONTROL_PARAMETER, VIRTUAL_ROBOT
 from pronk.jump.virtual.capture import load_capture
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.robots.machine import Command, RefusedError, State
@@ -198,18 +192,18 @@ def test_real_time_run_ends_when_requested() -> None:
 # --- Broken messages ----------------------------------------------------------------------------
 
 
-def broken(layout: Layout, good: bytes, rng: np.random.Generator) -> bytes:
+def broken(layout: LcmLayout, good: bytes, rng: np.random.Generator) -> bytes:
     """A message that is no possible command, in another way each time."""
     while True:
         data = mutated(good, rng)
         try:
-            decode_command(layout, data)
+            decode_lcm_command(layout, data)
         except RefusedError:
             return data
 
 
 @pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
-def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: Layout) -> None:
+def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: LcmLayout) -> None:
     pytest.importorskip("lcm")
     from pronk.deploy.bench.lcm_server import LcmServerTransport
 
@@ -217,7 +211,7 @@ def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: Layout) -> None
     machine = leg()
     wire = LcmServerTransport(ROBOT, layout=layout.name, url="memq://")
     server = RobotServer(machine, wire, hold=HOLD)
-    good = encode_command(layout, replace(HOLD, position=HOLD.position + 0.5))
+    good = encode_lcm_command(layout, replace(HOLD, position=HOLD.position + 0.5))
     rng, states = np.random.default_rng(2), []
     # Nor may any of these have an effect on the channels of requests.
     channels = (layout.command.channel,) * 8 + (VIRTUAL_ROBOT.channel, CONTROL_PARAMETER.channel)

@@ -19,18 +19,18 @@ pytest.importorskip("cyclonedds")
 
 from pronk.deploy.bench.dds_server import DdsServerTransport
 from pronk.deploy.bench.server import RobotServer
-from pronk.deploy.links.dds import codec as idl
-from pronk.deploy.links.dds.codec import decode_command, encode_command, joint_map
+from pronk.deploy.links.dds.codec import decode_dds_command, encode_dds_command, joint_map
 from pronk.deploy.links.dds.link import (
     COMMANDS,
     SWITCHER,
-    Client,
     DdsMachine,
     DdsNetwork,
-    Message,
     Participant,
-    take,
+    RawSample,
+    ServiceClient,
+    take_samples,
 )
+from pronk.deploy.links.dds.messages import LowCmd
 from pronk.deploy.links.link import Freshness, wait_for
 from pronk.errors import HardwareError, RobotError
 from pronk.jump.virtual.robot import hold_of
@@ -96,12 +96,12 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
     assert machine.counts["commands"] == machine.counts["repeats"] == 0
 
     # What has a wrong checksum, or commands the impossible, moves nothing.
-    other = Participant(network).writer(COMMANDS, idl.LowCmd)
+    other = Participant(network).writer(COMMANDS, LowCmd)
     assert eventually(lambda: len(other.get_matched_subscriptions()) >= 2)
-    far = bytearray(encode_command(JOINTS, turned(0.5)))
+    far = bytearray(encode_dds_command(JOINTS, turned(0.5)))
     far[-1] ^= 1
     for _ in range(20):
-        other.write(Message(bytes(far)))
+        other.write(RawSample(bytes(far)))
         time.sleep(0.002)
     states = machine.wait(machine.now() + 0.2)
     assert max(abs(state.position[PITCH] - begun.position[PITCH]) for state in states) < 0.01
@@ -128,24 +128,24 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
     assert second.counts["commands"] == second.counts["repeats"] == 0
 
     # Expiry: damping on the wire, without a call.
-    received = Participant(network).reader(COMMANDS, idl.LowCmd)
+    received = Participant(network).reader(COMMANDS, LowCmd)
     machine.send(replace(HOLD, made=machine.now(), valid_for=0.1))
     assert eventually(lambda: machine.counts["expired"] == 1)
     time.sleep(0.05)
-    last = idl.LowCmd.deserialize(take(received, Counter())[-1].data).motor_cmd[PITCH]
+    last = LowCmd.deserialize(take_samples(received, Counter())[-1].data).motor_cmd[PITCH]
     assert (last.kp, last.kd, last.q) == (0.0, 1.0, 2.146e9)
 
     # And another writer in the middle of it all is followed by damping.
     machine.send(HOLD)
-    other.write(Message(encode_command(JOINTS, HOLD)))
+    other.write(RawSample(encode_dds_command(JOINTS, HOLD)))
     assert eventually(lambda: machine.counts["foreign"] > 0)
     with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)
-    take(received, Counter())
+    take_samples(received, Counter())
     assert eventually(
         lambda: any(
-            decode_command(JOINTS, sample.data).stiffness[PITCH] == 0.0
-            for sample in take(received, Counter())
+            decode_dds_command(JOINTS, sample.data).stiffness[PITCH] == 0.0
+            for sample in take_samples(received, Counter())
         )
     )
 
@@ -165,7 +165,9 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
 def test_mode_switcher_and_bench_services() -> None:
     network = own_network(1)
     wire = DdsServerTransport(ROBOT, domain=network.domain, mode="mcf")
-    client, bench = (Client(Participant(network), name) for name in (SWITCHER, "pronk_bench"))
+    client, bench = (
+        ServiceClient(Participant(network), name) for name in (SWITCHER, "pronk_bench")
+    )
     with meanwhile(wire.poll, 0.0005):
         assert client.call(1001, {}) == {"form": "0", "name": "mcf"}
         assert client.call(1003, {}) == {}

@@ -19,13 +19,13 @@ import pytest
 from deploy_runs import free_port
 from pronk.deploy.bench.lcm_server import LcmServerTransport
 from pronk.deploy.links.lcm.codec import (
-    CHEETAH,
-    CONTROL_PARAMETER,
-    decode_command,
-    encode_command,
-    mode_request,
+    decode_lcm_command,
+    encode_lcm_command,
+    encode_mode_request,
 )
+from pronk.deploy.links.lcm.layouts import CHEETAH
 from pronk.deploy.links.lcm.link import LcmMachine, url_of
+from pronk.deploy.links.lcm.messages import CONTROL_PARAMETER
 from pronk.deploy.links.link import Freshness, wait_for
 from pronk.errors import HardwareError
 from pronk.jump.virtual.robot import hold_of
@@ -127,7 +127,7 @@ def test_expired_commands_are_followed_by_damping(servers: dict[str, Process]) -
     listener = lcm.LCM(url_of(port=process.port))
     received: list[Command] = []
     listener.subscribe(
-        CHEETAH.command.channel, lambda _, data: received.append(decode_command(CHEETAH, data))
+        CHEETAH.command.channel, lambda _, data: received.append(decode_lcm_command(CHEETAH, data))
     )
     machine.connect()
     machine.send(replace(HOLD, made=machine.now(), valid_for=0.5))
@@ -149,7 +149,7 @@ def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> 
     process = servers["cheetah"]
     machine = process.machine()
     other = lcm.LCM(url_of(port=process.port))
-    data = encode_command(CHEETAH, HOLD)
+    data = encode_lcm_command(CHEETAH, HOLD)
     with (
         meanwhile(lambda: other.publish(CHEETAH.command.channel, data), 0.02),
         pytest.raises(HardwareError, match="another program"),
@@ -159,7 +159,7 @@ def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> 
     machine.connect()
     machine.send(HOLD)
     foreign = replace(HOLD, position=HOLD.position + 0.01)
-    other.publish(CHEETAH.command.channel, encode_command(CHEETAH, foreign))
+    other.publish(CHEETAH.command.channel, encode_lcm_command(CHEETAH, foreign))
     assert wait_for(lambda: machine.counts["foreign"] > 0, LIMIT_S)
     with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)
@@ -191,7 +191,7 @@ def test_own_controller_is_released_and_other_layouts_are_refused(
     servers: dict[str, Process],
 ) -> None:
     process = servers["cheetah"]
-    lcm.LCM(url_of(port=process.port)).publish(CONTROL_PARAMETER.channel, mode_request(4, 1))
+    lcm.LCM(url_of(port=process.port)).publish(CONTROL_PARAMETER.channel, encode_mode_request(4, 1))
     with pytest.raises(HardwareError, match="another program"):
         process.machine().connect()
     machine = process.machine(release=True)

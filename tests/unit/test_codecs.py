@@ -24,14 +24,33 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated, some_state
 from pronk.deploy.links.dds import codec as dds
+from pronk.deploy.links.dds.image import (
+    HEADER,
+    c_image_dtype,
+    deserialize_image,
+    image_checksum,
+    serialize_image,
+)
+from pronk.deploy.links.dds.messages import LowCmd, LowState
 from pronk.deploy.links.lcm import codec as lcm
-from pronk.deploy.links.lcm.codec import CHEETAH, MESSAGES, WTW, Layout, Message
+from pronk.deploy.links.lcm.layouts import CHEETAH, KNEE_RATIO, WTW, LcmLayout, find_layout
+from pronk.deploy.links.lcm.messages import (
+    CONTROL_PARAMETER,
+    LCM_MESSAGES,
+    LEG_CONTROL_COMMAND,
+    SPI_DATA,
+    WTW_LEG_CONTROL_DATA,
+    WTW_PD_TAU_TARGETS,
+    WTW_STATE_ESTIMATOR,
+    LcmMessage,
+)
 from pronk.errors import HardwareError
 from pronk.robots import load_robot
 from pronk.robots.machine import Command, RefusedError, State
 
 ROBOT = load_robot("mini_cheetah")
 JOINTS = dds.joint_map(ROBOT)
+StateDecoder = Callable[[tuple[bytes, ...], float], State | None]
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
 COMMAND = Command(
     position=np.linspace(-1.5, 1.5, 12),
@@ -40,35 +59,65 @@ COMMAND = Command(
 )
 
 
-class Wire:
-    """The codec of a wire; a state is one message or two, a decoder takes all of them."""
+class LcmWire:
+    """The codec of LCM with a layout; a state is two messages."""
 
-    def __init__(self, layout: Layout | None = None) -> None:
-        """Of LCM with a layout, or DDS."""
-        codec, self.of = (dds, JOINTS) if layout is None else (lcm, layout)
-        self.encode: Callable[[Command], bytes] = partial(codec.encode_command, self.of)
-        self.decode: Callable[[bytes], Command] = partial(codec.decode_command, self.of)
-        self.name = layout.name if layout else "dds"
-        # Largest position, stiffness and damping [rad, N m/rad, N m s/rad].
-        self.most = (4.0 * math.pi, 1000.0, 100.0)
-        if layout:
-            self.most = (12.5, 500.0 / lcm.KNEE_RATIO**2, 5.0 / lcm.KNEE_RATIO**2)
+    def __init__(self, layout: LcmLayout) -> None:
+        self.layout = layout
+        self.name = layout.name
+        self.max_position = 12.5  # [rad]
+        self.max_stiffness = 500.0 / KNEE_RATIO**2  # [N m/rad]
+        self.max_damping = 5.0 / KNEE_RATIO**2  # [N m s/rad]
+
+    def encode(self, command: Command) -> bytes:
+        return lcm.encode_lcm_command(self.layout, command)
+
+    def decode(self, data: bytes) -> Command:
+        return lcm.decode_lcm_command(self.layout, data)
 
     def encode_state(self, state: State) -> tuple[bytes, ...]:
-        if self.name == "dds":
-            return (dds.encode_state(JOINTS, state),)
-        return lcm.encode_state(self.of, state)
+        return lcm.encode_lcm_state(self.layout, state)
 
-    def decoder(self) -> Callable[..., State | None]:
-        """A function of the messages of a state and their time [s]."""
-        if self.name == "dds":
-            one = dds.StateDecoder(JOINTS, Counter())
-            return lambda data, now=0.0: one.take(data[0], now)
-        two = lcm.StateDecoder(self.of, Counter())
-        return lambda data, now=0.0: two.attitude(data[0], now) or two.joints(data[1], now)
+    def state_decoder(self) -> StateDecoder:
+        decoder = lcm.LcmStateDecoder(self.layout, Counter())
+
+        def decode(messages: tuple[bytes, ...], now: float) -> State | None:
+            attitude, joints = messages
+            decoder.attitude(attitude, now)
+            return decoder.joints(joints, now)
+
+        return decode
 
 
-WIRES = [Wire(CHEETAH), Wire(WTW), Wire()]
+class DdsWire:
+    """The codec of DDS; a state is one message."""
+
+    name = "dds"
+    max_position = 4.0 * math.pi  # [rad]
+    max_stiffness = 1000.0  # [N m/rad]
+    max_damping = 100.0  # [N m s/rad]
+
+    def encode(self, command: Command) -> bytes:
+        return dds.encode_dds_command(JOINTS, command)
+
+    def decode(self, data: bytes) -> Command:
+        return dds.decode_dds_command(JOINTS, data)
+
+    def encode_state(self, state: State) -> tuple[bytes, ...]:
+        return (dds.encode_dds_state(JOINTS, state),)
+
+    def state_decoder(self) -> StateDecoder:
+        decoder = dds.DdsStateDecoder(JOINTS, Counter())
+
+        def decode(messages: tuple[bytes, ...], now: float) -> State | None:
+            (message,) = messages
+            return decoder.take(message, now)
+
+        return decode
+
+
+Wire = LcmWire | DdsWire
+WIRES = (LcmWire(CHEETAH), LcmWire(WTW), DdsWire())
 EACH = pytest.mark.parametrize("wire", WIRES, ids=lambda wire: wire.name)
 
 
@@ -116,7 +165,7 @@ def test_states_round_trip(
     orientation = quaternion / np.linalg.norm(quaternion)
     hot = np.arange(30.0, 42.0)
     sent = some_state(**values, orientation=orientation, temperature=hot)
-    got = wire.decoder()(wire.encode_state(sent), 3.0)
+    got = wire.state_decoder()(wire.encode_state(sent), 3.0)
     assert got is not None
     assert (got.time, got.sequence) == (3.0, 0)
     if wire.name == "cheetah":  # which has no torque
@@ -157,40 +206,46 @@ def test_impossible_states_are_refused(wire: Wire) -> None:
     if wire.name != "dds":  # has a checksum instead
         changes.append(({"gyro": np.full(3, 36.0)}, "out of range"))
     for change, reason in changes:
-        data, decode = wire.encode_state(some_state(**change)), wire.decoder()
-        assert refusal(partial(decode, data)) == reason
+        messages = wire.encode_state(some_state(**change))
+        assert refusal(partial(wire.state_decoder(), messages, 0.0)) == reason
 
 
 @EACH
 def test_broken_messages_are_refused_or_possible(wire: Wire) -> None:
-    good, rng = wire.encode(COMMAND), np.random.default_rng(1)
+    intact = wire.encode(COMMAND)
+    rng = np.random.default_rng(1)
     refused = 0
     for _ in range(20_000):
         try:
-            got = wire.decode(mutated(good, rng))
+            got = wire.decode(mutated(intact, rng))
         except RefusedError:
             refused += 1
             continue
         # Without a checksum a flipped bit may leave a command that the drives can follow.
-        most = zip((got.position, got.stiffness, got.damping), wire.most, strict=True)
-        assert all(np.abs(values).max() <= limit * (1 + 1e-9) for values, limit in most)
+        assert np.abs(got.position).max() <= wire.max_position * (1 + 1e-9)
+        assert got.stiffness.max() <= wire.max_stiffness * (1 + 1e-9)
+        assert got.damping.max() <= wire.max_damping * (1 + 1e-9)
         assert min(got.stiffness.min(), got.damping.min()) >= 0.0
     assert refused > (19_000 if wire.name == "dds" else 10_000)
-    decode, states = wire.decoder(), wire.encode_state(some_state())
+    decode = wire.state_decoder()
+    messages = wire.encode_state(some_state())
     for _ in range(5_000):
+        cut = tuple(data[: rng.integers(len(data))] for data in messages)
         with pytest.raises(RefusedError):
-            decode(tuple(data[: rng.integers(len(data))] for data in states))
-    assert decode(states) is not None
+            decode(cut, 0.0)
+    assert decode(messages, 0.0) is not None
 
 
 @EACH
 def test_state_numbers_follow_the_robots_count(wire: Wire) -> None:
-    decode, sequence = wire.decoder(), []
+    decode = wire.state_decoder()
+    sequences = []
     for t in (0.0, 0.002, 0.01, 0.012):
         state = some_state(robot_time=t, sequence=10 + round(t / 0.002), gyro=np.full(3, t))
-        found = decode(wire.encode_state(state), t)
-        sequence.append(found and found.sequence)
-    assert sequence == ([0, 1, 2, 3] if wire.name == "cheetah" else [0, 1, 5, 6])
+        decoded = decode(wire.encode_state(state), t)
+        assert decoded is not None
+        sequences.append(decoded.sequence)
+    assert sequences == ([0, 1, 2, 3] if wire.name == "cheetah" else [0, 1, 5, 6])
 
 
 # --- LCM ----------------------------------------------------------------------------------------
@@ -208,21 +263,25 @@ KNOWN = {
 }
 
 
-def class_name(message: Message) -> str:
+def class_name(message: LcmMessage) -> str:
     return message.name.replace(".", "_")
 
 
 def test_bytes_are_those_of_lcm_gen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("lcm")
-    source = "package made;\n" + "".join(
-        f"struct {class_name(message)} {{ {message.layout} }}\n" for message in MESSAGES
-    )
+    source = "package made;\n"
+    for message in LCM_MESSAGES:
+        source += f"struct {class_name(message)} {{\n"
+        for field in message.fields:
+            dimension = "" if field.count is None else f"[{field.count}]"
+            source += f"    {field.kind} {field.name}{dimension};\n"
+        source += "}\n"
     (tmp_path / "all.lcm").write_text(source, encoding="ascii")
     tool = Path(sys.executable).with_name("lcm-gen")
     subprocess.run([tool, "-p", "--ppath", tmp_path, tmp_path / "all.lcm"], check=True)
     monkeypatch.syspath_prepend(tmp_path)
     generated = importlib.import_module("made")
-    for message in MESSAGES:
+    for message in LCM_MESSAGES:
         assert (message.fingerprint, message.dtype.itemsize) == KNOWN[message.name]
         other = getattr(generated, class_name(message))()
         rng = np.random.default_rng(len(message.name))
@@ -231,7 +290,7 @@ def test_bytes_are_those_of_lcm_gen(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         for name, value in values.items():
             setattr(other, name, value.tolist())
         golden = other.encode()
-        assert message.encode(**values) == golden
+        assert message.encode(values) == golden
         decoded = message.decode(golden)
         for name, value in values.items():
             np.testing.assert_array_equal(decoded[name], value)
@@ -244,29 +303,29 @@ def stiff(position: np.ndarray | float = 0.0) -> Command:
 
 def test_knee_gains_orders_and_signs_on_lcm() -> None:
     # rt_spi.cpp does not convert the knee's gains: a wire gain acts as gain / .6429^2.
-    fields = lcm.LEG_CONTROL_COMMAND.decode(lcm.encode_command(CHEETAH, stiff(POSE)))
+    fields = LEG_CONTROL_COMMAND.decode(lcm.encode_lcm_command(CHEETAH, stiff(POSE)))
     np.testing.assert_allclose(fields["kp_joint"], np.tile([17, 17, 17 * 0.41332], 4), rtol=1e-5)
     np.testing.assert_allclose(fields["kd_joint"], np.tile([0.4, 0.4, 0.4 * 0.41332], 4), rtol=1e-5)
     np.testing.assert_allclose(fields["q_des"], np.tile([0, -0.8, 1.6], 4), rtol=1e-6)
     # leg + joint / 8, so that every number identifies its place.
     marks = np.array([leg + joint / 8 for leg in range(4) for joint in range(3)])
-    _, data = lcm.encode_state(CHEETAH, some_state(position=marks, velocity=-marks))
-    fields = lcm.SPI_DATA.decode(data)
+    _, data = lcm.encode_lcm_state(CHEETAH, some_state(position=marks, velocity=-marks))
+    fields = SPI_DATA.decode(data)
     np.testing.assert_array_equal(fields["q_abad"], [0, 1, 2, 3])
     np.testing.assert_array_equal(fields["q_hip"], [0.125, 1.125, 2.125, 3.125])
     np.testing.assert_array_equal(fields["qd_knee"], [-0.25, -1.25, -2.25, -3.25])
     # The same stance in Unitree's signs: thigh +0.8, calf -1.6; the hips as they are.
     stance, unitree = np.tile([0.1, -0.8, 1.6], 4), np.tile([0.1, 0.8, -1.6], 4)
-    sent = lcm.WTW_PD_TAU_TARGETS.decode(lcm.encode_command(WTW, stiff(stance)))
+    sent = WTW_PD_TAU_TARGETS.decode(lcm.encode_lcm_command(WTW, stiff(stance)))
     np.testing.assert_array_equal(sent["q_des"], unitree)
     np.testing.assert_array_equal(sent["kp"], np.full(12, 17.0))
     turned = np.array([math.cos(0.2), 0, math.sin(0.2), 0])
-    attitude, data = lcm.encode_state(WTW, some_state(position=stance, orientation=turned))
-    fields = lcm.WTW_LEG_CONTROL_DATA.decode(data)
+    attitude, data = lcm.encode_lcm_state(WTW, some_state(position=stance, orientation=turned))
+    fields = WTW_LEG_CONTROL_DATA.decode(data)
     np.testing.assert_allclose(fields["q"], unitree, rtol=1e-6)
     np.testing.assert_array_equal(fields["tau_est"][:3], [0.0, -0.25, -0.5])
     assert (fields["id"], fields["timestamp_us"]) == (7, 12_500_000)
-    rpy = lcm.WTW_STATE_ESTIMATOR.decode(attitude)["rpy"]
+    rpy = WTW_STATE_ESTIMATOR.decode(attitude)["rpy"]
     np.testing.assert_allclose(rpy, [0.0, 0.4, 0.0], atol=1e-6)
 
 
@@ -285,37 +344,38 @@ def test_knee_gains_orders_and_signs_on_lcm() -> None:
     ],
 )
 def test_impossible_lcm_commands_are_refused(
-    layout: Layout, name: str, value: float, reason: str
+    layout: LcmLayout, name: str, value: float, reason: str
 ) -> None:
-    fields = layout.command.decode(lcm.encode_command(layout, stiff(POSE))).copy()
-    fields[layout.fields.get(name, name)][5] = value
+    fields = layout.command.decode(lcm.encode_lcm_command(layout, stiff(POSE))).copy()
+    wire_names = {"stiffness": layout.stiffness_field, "damping": layout.damping_field}
+    fields[wire_names.get(name, name)][5] = value
     if layout is CHEETAH and reason == "feed-forward":
         # The Mini Cheetah's controller does not read these fields.
-        lcm.decode_command(layout, fields.tobytes())
+        lcm.decode_lcm_command(layout, fields.tobytes())
     else:
-        assert refusal(lambda: lcm.decode_command(layout, fields.tobytes())) == reason
+        assert refusal(lambda: lcm.decode_lcm_command(layout, fields.tobytes())) == reason
 
 
 def test_states_need_a_recent_attitude_and_no_stamps() -> None:
-    decoder = lcm.StateDecoder(CHEETAH, Counter())
-    attitude, joints = lcm.encode_state(CHEETAH, some_state())
+    decoder = lcm.LcmStateDecoder(CHEETAH, Counter())
+    attitude, joints = lcm.encode_lcm_state(CHEETAH, some_state())
     assert decoder.joints(joints, 0.0) is None
     decoder.attitude(attitude, 1.0)
     assert decoder.joints(joints, 1.03) is None
     assert decoder.counts == {"no attitude": 2}
     assert decoder.joints(joints, 1.01) is not None
-    decoder = lcm.StateDecoder(WTW, Counter())
-    decoder.attitude(lcm.encode_state(WTW, some_state())[0], 0.0)
-    states = [decoder.joints(lcm.WTW_LEG_CONTROL_DATA.encode(q=k), 0.0) for k in (1.0, 1.5)]
+    decoder = lcm.LcmStateDecoder(WTW, Counter())
+    decoder.attitude(lcm.encode_lcm_state(WTW, some_state())[0], 0.0)
+    states = [decoder.joints(WTW_LEG_CONTROL_DATA.encode({"q": k}), 0.0) for k in (1.0, 1.5)]
     assert [s and (s.sequence, s.robot_time) for s in states] == [(0, None), (1, None)]
 
 
 def test_control_mode_round_trip() -> None:
-    assert lcm.read_mode_request(lcm.mode_request(0, 5)) == ""
-    assert lcm.read_mode_request(lcm.mode_request(4, 6)) == "locomotion"
+    assert lcm.decode_mode_request(lcm.encode_mode_request(0, 5)) == ""
+    assert lcm.decode_mode_request(lcm.encode_mode_request(4, 6)) == "locomotion"
     with pytest.raises(RefusedError, match="control_mode"):
-        lcm.read_mode_request(lcm.mode_request(7, 6))
-    data = lcm.CONTROL_PARAMETER.decode(lcm.mode_request(4, 6))
+        lcm.decode_mode_request(lcm.encode_mode_request(7, 6))
+    data = CONTROL_PARAMETER.decode(lcm.encode_mode_request(4, 6))
     # The robot copies the value from memory: a little-endian double.
     assert data["value"].tobytes()[:8] == bytes.fromhex("0000000000001040")
     assert data["name"].tobytes().rstrip(b"\0") == b"control_mode"
@@ -324,8 +384,8 @@ def test_control_mode_round_trip() -> None:
 def test_clamps_round_trip() -> None:
     names = ROBOT.joint_names
     for held, number in ((), 0), (names[::5], 2**62), (names, 7):
-        data = lcm.clamp_message(names, held, number)
-        assert lcm.read_clamp_message(names, data) == (number, held)
+        data = lcm.encode_clamps(names, held, number)
+        assert lcm.decode_clamps(names, data) == (number, held)
 
 
 # --- DDS ----------------------------------------------------------------------------------------
@@ -334,7 +394,7 @@ def test_clamps_round_trip() -> None:
 C_COMMAND = "<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55Bx2I"
 C_STATE = "<4B4IH2x" + "13fb3x" + "B3x7fb3x3I" * 20 + "4BiH4b15H" + "8hI41B3xf2b2x2f4h2I"
 ZEROS = np.zeros(12)
-IDLE = dds.encode_command(JOINTS, Command(position=ZEROS, stiffness=ZEROS, damping=ZEROS))
+IDLE = dds.encode_dds_command(JOINTS, Command(position=ZEROS, stiffness=ZEROS, damping=ZEROS))
 
 
 def bitwise_crc(words: bytes) -> int:
@@ -349,35 +409,37 @@ def bitwise_crc(words: bytes) -> int:
 
 @given(st.binary(min_size=8, max_size=80).filter(lambda data: len(data) % 4 == 0))
 def test_checksum_is_the_textbook_one_without_the_last_word(data: bytes) -> None:
-    assert dds.checksum(data) == bitwise_crc(data[:-4])
+    assert image_checksum(data) == bitwise_crc(data[:-4])
 
 
 def test_golden_checksum_and_unitrees_stop_values() -> None:
     assert IDLE[-4:] == bytes.fromhex("cd77e506")
-    data = dds.encode_command(JOINTS, Command(position=ZEROS, stiffness=ZEROS, damping=ZEROS + 2))
-    motors = dds.LowCmd.deserialize(data).motor_cmd
+    data = dds.encode_dds_command(
+        JOINTS, Command(position=ZEROS, stiffness=ZEROS, damping=ZEROS + 2)
+    )
+    motors = LowCmd.deserialize(data).motor_cmd
     assert [motor.q for motor in motors] == [2.146e9] * 20
     assert [motor.dq for motor in motors] == [0.0] * 12 + [16000.0] * 8
-    off = dds.decode_command(JOINTS, with_motor(mode=0, tau=3.0))
+    off = dds.decode_dds_command(JOINTS, with_motor(mode=0, tau=3.0))
     assert (off.stiffness[4], off.damping[4]) == (0.0, 0.0)
     assert off.stiffness[3] > 0.0
 
 
 @pytest.mark.parametrize(
-    ("message", "c_format", "wire"), [(dds.LowCmd, C_COMMAND, 808), (dds.LowState, C_STATE, 1176)]
+    ("message", "c_format", "wire"), [(LowCmd, C_COMMAND, 808), (LowState, C_STATE, 1176)]
 )
 def test_images_are_those_of_c_and_of_the_librarys_own_serializer(
     message: Any, c_format: str, wire: int
 ) -> None:
-    assert dds.record(message).itemsize == struct.calcsize(c_format)
-    values = np.zeros(1, dtype=dds.record(message))
+    assert c_image_dtype(message).itemsize == struct.calcsize(c_format)
+    values = np.zeros(1, dtype=c_image_dtype(message))
     fill(values[0], np.random.default_rng(3))
-    data = dds.pack(message, values)
-    assert len(data) == len(dds.HEADER) + wire
+    data = serialize_image(message, values)
+    assert len(data) == len(HEADER) + wire
     decoded = message.deserialize(data)
     assert decoded.serialize() == data
     assert decoded.crc == int.from_bytes(data[-4:], "little")
-    assert dds.unpack(message, data).tobytes()[:-4] == values.tobytes()[:-4]
+    assert deserialize_image(message, data).tobytes()[:-4] == values.tobytes()[:-4]
 
 
 def fill(values: np.void, rng: np.random.Generator) -> None:
@@ -393,7 +455,7 @@ def fill(values: np.void, rng: np.random.Generator) -> None:
 
 
 def test_golden_offsets_on_dds() -> None:
-    data = dds.encode_command(JOINTS, COMMAND)[len(dds.HEADER) :]
+    data = dds.encode_dds_command(JOINTS, COMMAND)[len(HEADER) :]
     for k in range(12):
         found = struct.unpack_from("<5f", data, 24 + 36 * k)
         # The Mini Cheetah's pitch axes point the other way.
@@ -403,7 +465,7 @@ def test_golden_offsets_on_dds() -> None:
     assert (data[:4], data[22]) == (bytes([0xFE, 0xEF, 0xFF, 0]), 1)
 
     state = some_state()
-    data = dds.encode_state(JOINTS, state)[len(dds.HEADER) :]
+    data = dds.encode_dds_state(JOINTS, state)[len(HEADER) :]
     trunk = (*state.orientation, *state.gyro, *state.accelerometer)
     assert struct.unpack_from("<10f", data, 24) == trunk
     assert data[77] == 1
@@ -413,10 +475,10 @@ def test_golden_offsets_on_dds() -> None:
 
 
 def with_motor(**fields: float) -> bytes:
-    values = dds.unpack(dds.LowCmd, dds.encode_command(JOINTS, COMMAND)).copy()
+    values = deserialize_image(LowCmd, dds.encode_dds_command(JOINTS, COMMAND)).copy()
     for name, value in fields.items():
         values["motor_cmd"][name][0, 4] = value
-    return dds.pack(dds.LowCmd, values)
+    return serialize_image(LowCmd, values)
 
 
 @pytest.mark.parametrize(
@@ -425,7 +487,7 @@ def with_motor(**fields: float) -> bytes:
         (b"", "header"),
         (b"\0\0" + IDLE[2:], "header"),
         (IDLE[:-1], "length"),
-        (dds.encode_state(JOINTS, some_state()), "length"),
+        (dds.encode_dds_state(JOINTS, some_state()), "length"),
         (IDLE[:-1] + b"\0", "checksum"),
         (with_motor(mode=2), "mode"),
         (with_motor(q=math.nan), "not finite"),
@@ -437,11 +499,11 @@ def with_motor(**fields: float) -> bytes:
     ],
 )
 def test_impossible_dds_commands_are_refused(data: bytes, reason: str) -> None:
-    assert refusal(lambda: dds.decode_command(JOINTS, data)) == reason
+    assert refusal(lambda: dds.decode_dds_command(JOINTS, data)) == reason
 
 
 def test_layouts_and_robots_that_do_not_exist_are_refused() -> None:
     with pytest.raises(HardwareError, match="go2"):
-        lcm.layout_of("go2")
+        find_layout("go2")
     with pytest.raises(HardwareError, match="so101"):
         dds.joint_map(load_robot("so101"))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from broken_message import some_state
+from pronk.deploy.bench.paced import PacedRobot
 from pronk.deploy.links import address as addresses
 from pronk.deploy.links import link as links
 from pronk.deploy.links.address import Address
@@ -31,7 +32,6 @@ from pronk.deploy.links.link import (
     wait_for,
 )
 from pronk.errors import HardwareError, PronkError, RobotError
-from pronk.jump.virtual.robot import VirtualRobot
 from pronk.robots import load_robot
 from pronk.robots.machine import Command, RefusedError, State, TorqueKind, check_command
 from pronk.robots.robot import RobotSpec
@@ -106,8 +106,6 @@ def test_states_must_come_often_and_without_gaps(
         link.fresh_states(until=until)
 
 
-NAMES = ("position", "velocity", "torque", "gyro", "accelerometer", "bus_voltage")
-VALUES = {name: getattr(some_state(), name) for name in NAMES}
 TICKS = {"per_state": 2, "bits": 32}  # a clock in ms
 
 
@@ -130,20 +128,23 @@ def test_states_are_numbered_by_the_robots_count(
     options: dict[str, int], counts: tuple[int, ...], sequence: list[int], counted: dict[str, int]
 ) -> None:
     numbering = StateNumbering(Counter(), 500.0, **options)
-    made = [
-        numbering.number(VALUES | {"gyro": np.full(3, count % 1000)}, count, 10.0 + 0.002 * k)
-        for k, count in enumerate(counts)
-    ]
-    assert [found.sequence for found in made if found is not None] == sequence
+    sequences = []
+    for index, count in enumerate(counts):
+        gyro = np.full(3, count % 1000)
+        numbered = numbering.number(some_state(time=10.0 + 0.002 * index, gyro=gyro), count)
+        if numbered is not None:
+            sequences.append(numbered.sequence)
+    assert sequences == sequence
     assert numbering.counts == counted
 
 
 def test_values_that_repeat_make_no_states_and_times_increase() -> None:
     numbering = StateNumbering(Counter(), 500.0)
-    made = [numbering.number(VALUES, 10 + k, 7.0) for k in range(50)]
-    assert [found is None for found in made] == [False] + [True] * 49
+    assert numbering.number(some_state(time=7.0), 10) is not None
+    for count in range(11, 60):
+        assert numbering.number(some_state(time=7.0), count) is None
     assert numbering.counts == {"repeated": 49}
-    later = numbering.number(VALUES | {"gyro": np.zeros(3)}, 60, 7.0)
+    later = numbering.number(some_state(time=7.0, gyro=np.zeros(3)), 60)
     assert later is not None
     assert later.time == pytest.approx(7.0 + 50e-6, abs=1e-8)
 
@@ -251,7 +252,7 @@ def test_addresses_are_read_and_written() -> None:
         assert (found.interface, found.options, found.local) == (interface, options, local)
         assert Address.parse(str(found)) == found
         assert Address.parse(text.partition(":")[0], interface, **options) == found
-    assert isinstance(Address.parse("sim://bench?seed=4").machine(ROBOT), VirtualRobot)
+    assert isinstance(Address.parse("sim://bench?seed=4").machine(ROBOT), PacedRobot)
 
 
 @pytest.mark.parametrize(

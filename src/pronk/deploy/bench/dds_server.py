@@ -6,9 +6,20 @@ import json
 from typing import Any
 
 from pronk.deploy.bench.server import ServerTransport
-from pronk.deploy.links.dds import codec, link
-from pronk.deploy.links.dds.codec import decode_command, encode_command, encode_state, joint_map
-from pronk.deploy.links.dds.link import BAD_PARAMETER, DONE, UNKNOWN_API, take, write
+from pronk.deploy.links.dds import link, messages
+from pronk.deploy.links.dds.codec import (
+    decode_dds_command,
+    encode_dds_command,
+    encode_dds_state,
+    joint_map,
+)
+from pronk.deploy.links.dds.link import (
+    BAD_PARAMETER,
+    DONE,
+    UNKNOWN_API,
+    take_samples,
+    write_bytes,
+)
 from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
@@ -26,14 +37,14 @@ class DdsServerTransport(ServerTransport):
         self._joints = joint_map(robot)
         # Another writer is another participant.
         own, other = link.Participant(network), link.Participant(network)
-        self._commands = own.reader(link.COMMANDS, codec.LowCmd)
-        self._states = own.writer(link.STATES, codec.LowState)
-        self._other = other.writer(link.COMMANDS, codec.LowCmd)
+        self._commands = own.reader(link.COMMANDS, messages.LowCmd)
+        self._states = own.writer(link.STATES, messages.LowState)
+        self._other = other.writer(link.COMMANDS, messages.LowCmd)
         # A handler takes a function's number and its parameter, and returns code and data.
         self._services = [
             (
-                own.reader(f"rt/api/{name}/request", codec.Request),
-                own.writer(f"rt/api/{name}/response", codec.Response),
+                own.reader(f"rt/api/{name}/request", messages.Request),
+                own.writer(f"rt/api/{name}/response", messages.Response),
                 handler,
             )
             for name, handler in ((link.SWITCHER, self._switch), (link.BENCH, self._bench))
@@ -46,20 +57,22 @@ class DdsServerTransport(ServerTransport):
         if self._polls % _SERVICE_POLLS == 1:
             self._respond()
         arrived = []
-        for message in take(self._commands, self.counts):
+        for message in take_samples(self._commands, self.counts):
             with self.refusing():
-                arrived.append(decode_command(self._joints, self.corrupt_in(message.data)))
+                arrived.append(decode_dds_command(self._joints, self.corrupt_in(message.data)))
                 self.counts["commands"] += 1
         return arrived
 
     def publish(self, state: State) -> None:
         """Put a state on the wire."""
-        write(self._states, self.corrupt_out(encode_state(self._joints, state)), self.counts)
+        write_bytes(
+            self._states, self.corrupt_out(encode_dds_state(self._joints, state)), self.counts
+        )
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
-        write(self._other, encode_command(self._joints, command), self.counts)
+        write_bytes(self._other, encode_dds_command(self._joints, command), self.counts)
 
     def close(self) -> None:
         """Leave the wire."""
@@ -67,7 +80,7 @@ class DdsServerTransport(ServerTransport):
 
     def _respond(self) -> None:
         for requests, responses, handler in self._services:
-            for request in take(requests, self.counts):
+            for request in take_samples(requests, self.counts):
                 identity = request.header.identity
                 try:
                     parameter = json.loads(request.parameter or "null")
@@ -77,10 +90,10 @@ class DdsServerTransport(ServerTransport):
                     code, data = handler(identity.api_id, parameter)
                 if code != DONE:
                     self.counts["refused: request"] += 1
-                status = codec.ResponseStatus(code=code)
-                header = codec.ResponseHeader(identity=identity, status=status)
+                status = messages.ResponseStatus(code=code)
+                header = messages.ResponseHeader(identity=identity, status=status)
                 text = "" if data is None else json.dumps(data)
-                responses.write(codec.Response(header=header, data=text, binary=[]))
+                responses.write(messages.Response(header=header, data=text, binary=[]))
 
     def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
         """The service that reports and changes which controller holds the joints."""

@@ -8,8 +8,14 @@ from __future__ import annotations
 
 from pronk.deploy.bench.server import ServerTransport
 from pronk.deploy.links.lcm import codec
-from pronk.deploy.links.lcm.codec import CONTROL_PARAMETER, VIRTUAL_ROBOT
+from pronk.deploy.links.lcm.layouts import find_layout
 from pronk.deploy.links.lcm.link import open_lcm, url_of
+from pronk.deploy.links.lcm.messages import (
+    BEACON_CHANNEL,
+    CONTROL_PARAMETER,
+    RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
+)
 from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
@@ -33,8 +39,8 @@ class LcmServerTransport(ServerTransport):
 
         `mode` names the controller that holds the joints at first.
         """
-        super().__init__(robot, mode, codec.MODES.values())
-        self._layout = known = codec.layout_of(layout)
+        super().__init__(robot, mode, codec.CONTROL_MODES.values())
+        self._layout = known = find_layout(layout)
         # Another writer is another sender.
         self._lcm, self._other = (open_lcm(url or url_of(port=port)) for _ in range(2))
         self._arrived: list[Command] = []
@@ -54,30 +60,32 @@ class LcmServerTransport(ServerTransport):
         """Take one message, whatever it is. Never raises."""
         with self.refusing():
             if channel == self._layout.command.channel:
-                self._arrived.append(codec.decode_command(self._layout, self.corrupt_in(data)))
+                self._arrived.append(codec.decode_lcm_command(self._layout, self.corrupt_in(data)))
                 self.counts["commands"] += 1
             elif channel == CONTROL_PARAMETER.channel:
-                self.mode = codec.read_mode_request(data)
+                self.mode = codec.decode_mode_request(data)
                 self.counts["mode switches"] += 1
-                self._lcm.publish(codec.RESPONSE_CHANNEL, data)
+                self._lcm.publish(RESPONSE_CHANNEL, data)
             elif channel == VIRTUAL_ROBOT.channel:
-                self._bench_request, self.clamps = codec.read_clamp_message(self._names, data)
+                self._bench_request, self.clamps = codec.decode_clamps(self._names, data)
                 self._requested = True
 
     def publish(self, state: State) -> None:
         """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
         messages = (self._layout.attitude, self._layout.joints)
-        for message, data in zip(messages, codec.encode_state(self._layout, state), strict=True):
+        for message, data in zip(
+            messages, codec.encode_lcm_state(self._layout, state), strict=True
+        ):
             self._lcm.publish(message.channel, self.corrupt_out(data))
         if self._requested or self.counts["states"] % _BEACON_STATES == 0:
             self._requested = False
-            beacon = codec.clamp_message(self._names, self.clamps, self._bench_request)
-            self._lcm.publish(codec.BEACON_CHANNEL, beacon)
+            beacon = codec.encode_clamps(self._names, self.clamps, self._bench_request)
+            self._lcm.publish(BEACON_CHANNEL, beacon)
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
-        data = codec.encode_command(self._layout, command)
+        data = codec.encode_lcm_command(self._layout, command)
         self._other.publish(self._layout.command.channel, data)
 
     def close(self) -> None:

@@ -41,7 +41,6 @@ _KEPT_STATES = 10_000
 # in which a pause of this computer of 0.2 s with the burst after it passes [s].
 _MOST_RATE, _RATE_S = 1.2, 1.0
 _MOST_DROPPED = 0.2  # share of the states that may be out of order before a robot is commanded
-_MEASURED = ("position", "velocity", "gyro", "accelerometer")  # never repeat to the last bit
 # A robot's count that went back by more than this belongs to a robot that was started again; one
 # that runs ahead of this computer's clock by more than this has jumped [s].
 _COUNT_BACK_S, _COUNT_AHEAD_S = 1.0, 0.5
@@ -126,9 +125,18 @@ class StateNumbering:
         self._sequence = -1
         self._measured = b""
 
-    def number(self, values: dict[str, Any], count: int | None, arrived: float) -> State | None:
-        """Make a state of the other fields; `arrived` [s]. Simultaneous states are 1 us apart."""
+    def number(self, measurement: State, count: int | None) -> State | None:
+        """Number a measurement.
+
+        Args:
+            measurement: A state whose time is its arrival [s]; its sequence does not matter.
+            count: The robot's own count, None if it has none.
+
+        Returns:
+            The state; simultaneous ones are 1 us apart. None if it is dropped.
+        """
         steps = 1
+        arrived = measurement.time
         if count is not None and self._count is not None:
             half = self._wrap // 2
             ahead = ((count - self._count + half) % self._wrap - half) / self._per_state
@@ -141,13 +149,19 @@ class StateNumbering:
                 steps = max(1, round(ahead))
         self._count = count
         self._time = arrived = max(arrived, self._time + _LEAST_STEP_S)
-        measured = b"".join(values[name].tobytes() for name in _MEASURED)
+        # What never repeats to the last bit while the robot lives.
+        measured = (
+            measurement.position.tobytes()
+            + measurement.velocity.tobytes()
+            + measurement.gyro.tobytes()
+            + measurement.accelerometer.tobytes()
+        )
         if measured == self._measured:
             self.counts["repeated"] += 1
             return None
         self._measured = measured
         self._sequence += steps
-        return State(time=arrived, sequence=self._sequence, **values)
+        return replace(measurement, time=arrived, sequence=self._sequence)
 
 
 class CommandWriter:

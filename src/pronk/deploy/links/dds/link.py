@@ -29,8 +29,13 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from pronk.deploy.links.dds import codec
-from pronk.deploy.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
+from pronk.deploy.links.dds import messages
+from pronk.deploy.links.dds.codec import (
+    STATE_RATE_HZ,
+    DdsStateDecoder,
+    encode_dds_command,
+    joint_map,
+)
 from pronk.deploy.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain
 from pronk.errors import HardwareError
 from pronk.robots.machine import damping_command
@@ -83,7 +88,7 @@ class DdsNetwork:
         return f"DDS domain {self.domain} on {self.interface or 'loopback'}"
 
 
-class Message:
+class RawSample:
     """A sample that stays bytes, header and payload."""
 
     def __init__(self, data: bytes) -> None:
@@ -94,13 +99,13 @@ class Message:
         return self.data
 
     @classmethod
-    def deserialize(cls, data: bytes) -> Message:
+    def deserialize(cls, data: bytes) -> RawSample:
         """A sample of the bytes from the wire."""
         return cls(data)
 
 
 class Participant:
-    """One member of a domain. Samples of `LowCmd` and `LowState` stay bytes (`Message`)."""
+    """One member of a domain. Samples of `LowCmd` and `LowState` stay bytes (`RawSample`)."""
 
     def __init__(self, network: DdsNetwork) -> None:
         """Join; HardwareError for a missing interface, or a domain in use with another."""
@@ -137,12 +142,12 @@ class Participant:
 
     def _topic(self, name: str, message: Any) -> Any:
         topic = Topic(self.entity, name, message)
-        if message in (codec.LowCmd, codec.LowState):
-            topic.data_type = Message  # only for Python; the type's name and description stay
+        if message in (messages.LowCmd, messages.LowState):
+            topic.data_type = RawSample  # only for Python; the type's name and description stay
         return topic
 
 
-def take(reader: Any, counts: Counter[str]) -> list[Any]:
+def take_samples(reader: Any, counts: Counter[str]) -> list[Any]:
     """The samples that have come, oldest first; bytes that cannot be read are counted."""
     try:
         samples = reader.take(_QUEUE)
@@ -152,41 +157,41 @@ def take(reader: Any, counts: Counter[str]) -> list[Any]:
     return [sample for sample in samples if sample.sample_info.valid_data]
 
 
-def write(writer: Any, data: bytes, counts: Counter[str]) -> None:
+def write_bytes(writer: Any, data: bytes, counts: Counter[str]) -> None:
     """Write bytes; those that the library does not take in time are counted and dropped."""
     try:
-        writer.write(Message(data))
+        writer.write(RawSample(data))
     except DDSException:
         counts["not written"] += 1
 
 
-class Client:
+class ServiceClient:
     """Calls a service."""
 
     def __init__(self, participant: Participant, service: str) -> None:
         self._service = service
-        self._requests = participant.writer(f"rt/api/{service}/request", codec.Request)
-        self._responses = participant.reader(f"rt/api/{service}/response", codec.Response)
+        self._requests = participant.writer(f"rt/api/{service}/request", messages.Request)
+        self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
 
     def call(self, api_id: int, parameter: Any) -> dict[str, Any] | None:
         """Call a function by its number, repeatedly while there is no response.
 
         None without one within `RESPONSE_S`; HardwareError for a code other than 0, or no object.
         """
-        identity = codec.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
-        header = codec.RequestHeader(
+        identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
+        header = messages.RequestHeader(
             identity=identity,
-            lease=codec.RequestLease(id=0),
-            policy=codec.RequestPolicy(priority=0, noreply=False),
+            lease=messages.RequestLease(id=0),
+            policy=messages.RequestPolicy(priority=0, noreply=False),
         )
-        request = codec.Request(header=header, parameter=json.dumps(parameter), binary=[])
+        request = messages.Request(header=header, parameter=json.dumps(parameter), binary=[])
         end = time.monotonic() + RESPONSE_S
         again = -1.0
         while time.monotonic() < end:
             if time.monotonic() >= again and self._requests.get_matched_subscriptions():
                 self._requests.write(request)
                 again = time.monotonic() + RESPONSE_S / 4
-            for response in take(self._responses, Counter()):
+            for response in take_samples(self._responses, Counter()):
                 if response.header.identity == identity:
                     return self._data(api_id, response)
             time.sleep(_POLL_S)
@@ -209,12 +214,12 @@ class Client:
 
 def check_own_controller(participant: Participant, *, release: bool) -> None:
     """Check that none of the robot's own controllers holds the joints; `release` one that does."""
-    switcher = Client(participant, SWITCHER)
+    switcher = ServiceClient(participant, SWITCHER)
     response = switcher.call(CHECK_MODE, {})
     if response is None:
         # Older firmware ends its sport mode by another service.
         sport = {"name": "sport_mode", "switch": 0}
-        if release and Client(participant, OLDER).call(SERVICE_SWITCH, sport) is not None:
+        if release and ServiceClient(participant, OLDER).call(SERVICE_SWITCH, sport) is not None:
             return
         raise HardwareError(
             f"the robot did not respond on its service {SWITCHER} within {RESPONSE_S:g} s, so it "
@@ -237,7 +242,7 @@ def check_own_controller(participant: Participant, *, release: bool) -> None:
 
 
 class DdsMachine(NetworkLink):
-    """A robot with twelve joints behind Unitree's codec. Implements `Machine`."""
+    """A robot with twelve joints behind Unitree's messages. Implements `Machine`."""
 
     torque_kind = "measured"  # tau_est, by the drives from their currents
     state_rate_hz = STATE_RATE_HZ
@@ -261,24 +266,24 @@ class DdsMachine(NetworkLink):
 
     def open_damper(self) -> Callable[[], None]:
         """Join the domain by itself, and return what writes damping."""
-        out = Participant(self._network).writer(COMMANDS, codec.LowCmd)
-        data = encode_command(self._joints, self._sinking)
-        return lambda: write(out, data, self.counts)
+        out = Participant(self._network).writer(COMMANDS, messages.LowCmd)
+        data = encode_dds_command(self._joints, self._sinking)
+        return lambda: write_bytes(out, data, self.counts)
 
     def _open(self) -> tuple[Encode, Publish]:
-        self._decoder = StateDecoder(self._joints, self.counts)
+        self._decoder = DdsStateDecoder(self._joints, self.counts)
         self._senders: set[int] = set()
         self._participant = own = Participant(self._network)
-        self._states_in = own.reader(STATES, codec.LowState)
-        self._others = own.reader(COMMANDS, codec.LowCmd, own=False)
-        out = own.writer(COMMANDS, codec.LowCmd)
-        self._bench = Client(own, BENCH)
+        self._states_in = own.reader(STATES, messages.LowState)
+        self._others = own.reader(COMMANDS, messages.LowCmd, own=False)
+        out = own.writer(COMMANDS, messages.LowCmd)
+        self._bench = ServiceClient(own, BENCH)
         anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
         self._wake = core.WaitSet(own.entity)
         for reader in (self._states_in, self._others):
             self._wake.attach(core.ReadCondition(reader, anything))
-        encode = partial(encode_command, self._joints)
-        return encode, lambda data: write(out, data, self.counts)
+        encode = partial(encode_dds_command, self._joints)
+        return encode, lambda data: write_bytes(out, data, self.counts)
 
     def _shut(self) -> None:
         del self._wake, self._states_in, self._others, self._bench, self._participant
@@ -303,11 +308,11 @@ class DdsMachine(NetworkLink):
     def _receive(self) -> None:
         self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))
         arrived = time.monotonic()
-        if take(self._others, self.counts):
+        if take_samples(self._others, self.counts):
             self.counts["foreign"] += 1
             if self._writer is not None and self._writer.wrote:
                 self._writer.damp()
-        samples = take(self._states_in, self.counts)
+        samples = take_samples(self._states_in, self.counts)
         for sample in samples:
             # Samples that arrived together are distinguished by when they were sent.
             last, this = (each.sample_info.source_timestamp for each in (samples[-1], sample))

@@ -22,7 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from pronk.deploy.links.lcm import codec
-from pronk.deploy.links.lcm.codec import BEACON_CHANNEL, RESPONSE_CHANNEL
+from pronk.deploy.links.lcm.layouts import find_layout
+from pronk.deploy.links.lcm.messages import (
+    BEACON_CHANNEL,
+    CONTROL_PARAMETER,
+    RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
+)
 from pronk.deploy.links.link import (
     RESPONSE_S,
     Encode,
@@ -144,7 +150,7 @@ class LcmMachine(NetworkLink):
     ) -> None:
         """Describe the link; see `LAYOUTS`, `url_of` and, for `common`, `NetworkLink`."""
         super().__init__(robot, **common)
-        self._layout = known = codec.layout_of(layout)
+        self._layout = known = find_layout(layout)
         if len(robot.joints) != 12:
             raise HardwareError(
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
@@ -160,12 +166,12 @@ class LcmMachine(NetworkLink):
     def open_damper(self) -> Callable[[], None]:
         """Open a handle of its own, and return what writes damping."""
         out = open_lcm(self._url)
-        data = codec.encode_command(self._layout, self._sinking)
+        data = codec.encode_lcm_command(self._layout, self._sinking)
         return lambda: out.publish(self._command_topic, data)
 
     def _open(self) -> tuple[Encode, Publish]:
         layout = self._layout
-        decoder = codec.StateDecoder(layout, self.counts)
+        decoder = codec.LcmStateDecoder(layout, self.counts)
         # Last request for clamps that the virtual robot received, and the joints it holds.
         self._held: tuple[int, tuple[str, ...]] | None = None
         self._responses: list[bytes] = []
@@ -186,7 +192,7 @@ class LcmMachine(NetworkLink):
                 channel, lambda _, data, handler=handler: self._take(handler, data)
             )
             subscription.set_queue_capacity(_QUEUE)
-        return partial(codec.encode_command, layout), self._command
+        return partial(codec.encode_lcm_command, layout), self._command
 
     def _shut(self) -> None:
         self._senders.close()
@@ -219,13 +225,13 @@ class LcmMachine(NetworkLink):
                 self.counts["foreign"] += 1
 
     def _met_beacon(self, data: bytes) -> None:
-        self._held = codec.read_clamp_message(self._robot.joint_names, data)
+        self._held = codec.decode_clamps(self._robot.joint_names, data)
 
     def _prepare(self) -> None:
         if not self._release:
             return
-        data = codec.mode_request(0, time.monotonic_ns())
-        self._publish(codec.CONTROL_PARAMETER.channel, data)
+        data = codec.encode_mode_request(0, time.monotonic_ns())
+        self._publish(CONTROL_PARAMETER.channel, data)
         if not wait_for(lambda: data in self._responses):
             raise HardwareError(
                 f"{self.robot} did not confirm control_mode 0 on {RESPONSE_CHANNEL} within "
@@ -240,10 +246,10 @@ class LcmMachine(NetworkLink):
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
         names, request = self._robot.joint_names, time.monotonic_ns()
-        data = codec.clamp_message(names, joints, request)
+        data = codec.encode_clamps(names, joints, request)
         held = (request, tuple(name for name in names if name in joints))
         for _ in range(4):  # for messages may be lost
-            self._publish(codec.VIRTUAL_ROBOT.channel, data)
+            self._publish(VIRTUAL_ROBOT.channel, data)
             if wait_for(lambda: self._held == held, RESPONSE_S / 4):
                 return True
         return False

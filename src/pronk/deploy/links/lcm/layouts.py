@@ -1,0 +1,95 @@
+"""Layouts: the LCM messages of a stack, and how their numbers become pronk's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pronk.arrays import Array
+from pronk.deploy.links.lcm.messages import (
+    LEG_CONTROL_COMMAND,
+    MICROSTRAIN,
+    SPI_DATA,
+    WTW_LEG_CONTROL_DATA,
+    WTW_PD_TAU_TARGETS,
+    WTW_STATE_ESTIMATOR,
+    LcmMessage,
+)
+from pronk.errors import HardwareError
+from pronk.robots.machine import TorqueKind
+
+JOINT_COUNT = 12
+KNEE_RATIO = 0.6429
+"""Motor to joint beyond the hips' 6:1, as `rt_spi.cpp` has it (6 / 9.33 = .6431)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LcmLayout:
+    """Messages of a stack, and how their numbers become pronk's.
+
+    Common to all: `q_des` of a command; `q`, `qd`, `tau_est` of the joints, of which `SPI_DATA` has
+    the first two by joint; `quat` of the attitude.
+    """
+
+    name: str
+    command: LcmMessage
+    joints: LcmMessage
+    attitude: LcmMessage
+    stiffness_field: str
+    """Field of the stiffness in a command."""
+    damping_field: str
+    """Field of the damping in a command."""
+    gyro_field: str
+    """Field of the angular velocity in the trunk's frame in an attitude."""
+    accelerometer_field: str
+    """Field of the specific force in the trunk's frame in an attitude."""
+    numbered: bool
+    """Whether commands and states carry `timestamp_us` and `id`."""
+    signs: Array
+    """pronk's angles are signs times the wire's, shape (12,)."""
+    gain_ratios: Array
+    """The wire's stiffness and damping divided by the joint's own, shape (12,)."""
+    torque_kind: TorqueKind
+    state_rate_hz: float = 500.0
+
+
+CHEETAH = LcmLayout(
+    name="cheetah",
+    command=LEG_CONTROL_COMMAND,
+    joints=SPI_DATA,
+    attitude=MICROSTRAIN,
+    stiffness_field="kp_joint",
+    damping_field="kd_joint",
+    gyro_field="omega",
+    accelerometer_field="acc",
+    numbered=False,
+    signs=np.ones(JOINT_COUNT),
+    gain_ratios=np.tile([1.0, 1.0, KNEE_RATIO**2], 4),
+    # spi_data_t carries none, and what leg_control_data_lcmt calls tau_est is computed from the
+    # command on the host, on the knee wrongly.
+    torque_kind="absent",
+)
+WTW = LcmLayout(
+    name="wtw",
+    command=WTW_PD_TAU_TARGETS,
+    joints=WTW_LEG_CONTROL_DATA,
+    attitude=WTW_STATE_ESTIMATOR,
+    stiffness_field="kp",
+    damping_field="kd",
+    gyro_field="omegaBody",
+    accelerometer_field="aBody",
+    numbered=True,
+    signs=np.tile([1.0, -1.0, -1.0], 4),
+    gain_ratios=np.ones(JOINT_COUNT),
+    # Unitree's tauEst, which the motor board computes from its current.
+    torque_kind="measured",
+)
+LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
+
+
+def find_layout(name: str) -> LcmLayout:
+    """Look a layout up; HardwareError for an unknown name."""
+    if name not in LAYOUTS:
+        raise HardwareError(f"no LCM layout {name!r}; there are {', '.join(LAYOUTS)}.")
+    return LAYOUTS[name]
