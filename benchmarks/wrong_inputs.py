@@ -101,11 +101,11 @@ def recorded(robot: RobotSpec, seed: int, number: int, cache: Path) -> Case:
     return Case(log=read_logs([path], robot=robot)[0], joint=joint, robot=robot)
 
 
-def wrong_number(right: Case, wrong: Case) -> bool:
+def wrong_number(right: Case, corrupted: Case) -> bool:
     """Return whether a corruption moves a matched number by more than the limits."""
     settings = MatchSettings(zero_armature=False, threads=1)
     before = match([right.log], right.robot, settings=settings).gains.joints[right.joint]
-    after = match([wrong.log], wrong.robot, settings=settings).gains.joints[wrong.joint]
+    after = match([corrupted.log], corrupted.robot, settings=settings).gains.joints[corrupted.joint]
     return (
         abs(after.stiffness.value / before.stiffness.value - 1.0) > WRONG_STIFFNESS
         or abs(after.damping.value / before.damping.value - 1.0) > WRONG_DAMPING
@@ -120,16 +120,16 @@ def judge_corruption(right: Case, name: str, rng: np.random.Generator) -> dict[s
         outcome = "other" if checks else "silent"
         return {"joint": right.joint, "outcome": outcome, "wrong": False, "sentences": sentences}
     corruption = CORRUPTIONS[name]
-    wrong = corruption.change(right, rng)
-    checks, sentences = judge(wrong)
+    corrupted = corruption.change(right, rng)
+    checks, sentences = judge(corrupted)
     if REFUSED in checks:
         outcome = "refused"
     elif corruption.check in checks:
         outcome = "named"
     else:
         outcome = "other" if checks else "silent"
-    changed = outcome == "silent" and wrong_number(right, wrong)
-    return {"joint": wrong.joint, "outcome": outcome, "wrong": changed, "sentences": sentences}
+    changed = outcome == "silent" and wrong_number(right, corrupted)
+    return {"joint": corrupted.joint, "outcome": outcome, "wrong": changed, "sentences": sentences}
 
 
 def judge_robot(number: int, *, seed: int, cache: Path) -> list[dict[str, Any]]:
