@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 from pronk.jump.trial.condition_trial import ConditionResults
 from pronk.jump.trial.criteria import CRITERIA_JUMPS, Check, trial_checks
@@ -496,31 +494,3 @@ def condition_table(results: ConditionResults) -> Table:
             "the jump input.",
         ),
     )
-
-
-# ---- tables of text, until their last callers have changed to `pronk.tables` ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sheet:
-    """A table of text."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
-
-
-def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
-    """Return a table of text; headers have ` | ` between them, `;2` behind one sets its digits."""
-    headings = []
-    for heading in columns.split(" | "):
-        name, _, digits = heading.partition(";")
-        headings.append(Column(heading=name, digits=int(digits or 3)))
-    text_rows = []
-    for row in rows:
-        text_rows.append(
-            tuple(column.text(cell) for column, cell in zip(headings, row, strict=True))
-        )
-    names = tuple(column.heading for column in headings)
-    return Sheet(title=title, columns=names, rows=tuple(text_rows), notes=notes)
