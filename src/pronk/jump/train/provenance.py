@@ -20,7 +20,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import pronk
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
@@ -126,7 +125,7 @@ def git_state() -> dict[str, Any] | None:
 
     An installed pronk may lie inside another repository; then that is not its commit.
     """
-    folder = str(Path(pronk.__file__).parent)
+    folder = str(Path(__file__).parents[2])  # of the package pronk
 
     def git(*words: str) -> str:
         process = subprocess.run(
