@@ -121,7 +121,7 @@ def _write(folder: Path) -> None:
     cases.write_match(folder / "page", result, prediction=True)
     cases.write_trial(folder / "page" / "trial", ("matched",), cases.CASES[:1])
     shutil.copytree(folder / "tree" / "trial" / "videos", folder / "page" / "trial" / "videos")
-    responses = cases.joint_fit("knee").responses
+    responses = cases.joint_result("knee").responses.measured
     response_file.save_responses(folder / "tree" / "a.response.npz", responses)
     log = logs.example(600, ("FR_hip_pitch", "FR_knee"))
     for name in ("npz", "csv", "mcap"):
