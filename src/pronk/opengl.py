@@ -8,18 +8,24 @@ from __future__ import annotations
 
 import os
 
-_MUJOCO = "MUJOCO_GL"
-_REQUESTED = "PRONK_GL"
-_NONE = "disable"  # MuJoCo's name for no OpenGL
+_MUJOCO_VARIABLE = "MUJOCO_GL"
+_REQUESTED_VARIABLE = "PRONK_GL"
+_NO_OPENGL = "disable"
+"""MuJoCo's name for no OpenGL."""
 
 
-def keep_out() -> None:
-    """Keep OpenGL out of this process and its children; `requested` still returns the choice."""
-    if chosen := os.environ.get(_MUJOCO):
-        os.environ.setdefault(_REQUESTED, chosen)
-        os.environ[_MUJOCO] = _NONE
+def keep_opengl_out() -> None:
+    """Keep OpenGL out of this process and its children.
+
+    `requested_opengl` still returns what the user has chosen.
+    """
+    chosen = os.environ.get(_MUJOCO_VARIABLE)
+    if chosen:
+        os.environ.setdefault(_REQUESTED_VARIABLE, chosen)
+        os.environ[_MUJOCO_VARIABLE] = _NO_OPENGL
 
 
-def requested() -> str:
-    """The value of MUJOCO_GL that the user has set, in small letters; empty if none."""
-    return os.environ.get(_REQUESTED, os.environ.get(_MUJOCO, "")).lower()
+def requested_opengl() -> str:
+    """Return the value of MUJOCO_GL that the user has set, in small letters; empty if none."""
+    value = os.environ.get(_MUJOCO_VARIABLE, "")
+    return os.environ.get(_REQUESTED_VARIABLE, value).lower()

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from hopper import DEFAULT, ROBOT, write_hopper
-from pronk import opengl
 from pronk.errors import PronkError
 from pronk.jump.trial.films import record, render
 from pronk.jump.trial.films.film import FPS, Film, JumpEvents, plan_film
@@ -25,6 +24,7 @@ from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.trial import TrialPlan, TrialSetup, run_trial
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.sim_params import load_sim_params
+from pronk.opengl import keep_opengl_out, requested_opengl
 from pronk.policy.script import STILL, Script
 from seen_jump import STANDING, G, motion
 
@@ -193,9 +193,9 @@ def test_only_rendering_needs_the_requested_opengl(
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert str(missing) in done.stderr.replace("\n", "")
-    opengl.keep_out()
+    keep_opengl_out()
     assert os.environ["MUJOCO_GL"] == "disable"
-    assert opengl.requested() == "nonsense"
+    assert requested_opengl() == "nonsense"
     found = record.environment("osmesa")
     assert found["MUJOCO_GL"] == "osmesa"
     assert "PYOPENGL_PLATFORM" not in found

@@ -19,8 +19,8 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from pronk import opengl
 from pronk.errors import PronkError
+from pronk.opengl import keep_opengl_out
 from pronk.version import VERSION
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def _sentence(box: str, program: str) -> str:
 
 def main() -> None:
     """Entry point of the `pronk` command."""
-    opengl.keep_out()
+    keep_opengl_out()
     sys.exit(run(sys.argv[1:]))
 
 

@@ -17,12 +17,12 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
-from pronk import opengl
 from pronk.errors import PronkError
 from pronk.files import save_artefact
 from pronk.jump.trial.films.film import SCHEMA, Film, JumpEvents, plan_film
 from pronk.jump.trial.results import TrialResults, TrialRun
 from pronk.jump.virtual import capture as captures
+from pronk.opengl import requested_opengl
 from pronk.robots.robot import RobotSpec
 
 SLOW = 4.0
@@ -63,7 +63,7 @@ def find_gl() -> str:
         PronkError: There is none.
     """
     candidates = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
-    requested = opengl.requested()
+    requested = requested_opengl()
     if requested:
         candidates = [requested, *(name for name in candidates if name != requested)]
     for backend in candidates:
