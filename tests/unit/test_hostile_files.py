@@ -13,8 +13,8 @@ import orjson
 import pytest
 import yaml
 
-from benchmarks.fuzz import fuzz
 from command_line import accepted
+from mutated_files import fuzz
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.files import SIZE_LIMIT, read_yaml, write_text
 from pronk.identify.logs.joint_log import JointLog
