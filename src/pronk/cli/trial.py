@@ -133,7 +133,7 @@ def _trial_of_jumps(
     from pronk.jump.trial.results import SUMMARY, TABLE
     from pronk.jump.trial.trial import CAPTURES, VIDEOS, run_trial
     from pronk.jump.trial.walk import add_walks
-    from pronk.report.build import write_report
+    from pronk.report.trial_page import write_trial_page
 
     with console.progress() as report:
         results = run_trial(
@@ -183,7 +183,9 @@ def _trial_of_jumps(
             )
             study_tables.append(tables.crossing_table(crossings))
             wrote.append(output.out / crossings.run_kind.table)
-        page, _ = write_report(output.out, report)
+        report("report", 0.0)
+        page = write_trial_page(output.out)
+        report("report", 1.0)
     for table in study_tables:
         console.show(table)
     wrote.append(page)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import ArtefactError
+from pronk.files import write_text
 from pronk.jump.trial import tables
 from pronk.jump.trial.criteria import trial_checks
 from pronk.jump.trial.protocol import RATES, in_paper_order
@@ -24,7 +25,7 @@ from pronk.jump.trial.results import (
 )
 from pronk.jump.virtual import capture as capture_file
 from pronk.report import style
-from pronk.report.page import Part
+from pronk.report.page import Part, page
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture, rms
 from pronk.report.trial_figures import JumpPanel, Values, draw_jumps, draw_traces
@@ -225,6 +226,14 @@ def trial_part(path: Path) -> Part:
         content=content,
         figures={"checks": [check.row() for check in checks]},
     )
+
+
+def write_trial_page(folder: Path) -> Path:
+    """Write the page of the trial in a folder, `report.html`, and return its path."""
+    part = replace(trial_part(folder / SUMMARY), source=SUMMARY)
+    path = folder / "report.html"
+    write_text(path, page(part.title, [part]))
+    return path
 
 
 def _total(trial: TrialResults, policy: str) -> dict[str, float]:
