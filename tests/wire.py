@@ -114,7 +114,7 @@ def over_dds(domain: int) -> Wire:
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     sender = own.writer(COMMANDS, LowCmd)
-    listener = own.reader(COMMANDS, LowCmd, own=False)
+    listener = own.reader(COMMANDS, LowCmd, include_local=False)
     counts: Counter[str] = Counter()
     # Every sample says when it was written, by the wall clock.
     wall = time.time() - time.monotonic()

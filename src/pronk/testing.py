@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pronk.deploy.links.link import Codec, Transport
+from pronk.deploy.links.stream import Codec, Transport
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.options import ReadOptions

@@ -31,7 +31,7 @@ from pronk.deploy.links.dds.link import (
     take_samples,
 )
 from pronk.deploy.links.dds.messages import LowCmd
-from pronk.deploy.links.link import Freshness, wait_for
+from pronk.deploy.links.link import Freshness, LinkSettings, wait_for
 from pronk.errors import HardwareError, RobotError
 from pronk.jump.virtual.robot import hold_of
 from pronk.robots.machine import Command
@@ -87,7 +87,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="normal"):
         DdsMachine(ROBOT, domain=network.domain).connect()
-    machine = DdsMachine(ROBOT, domain=network.domain, release=True, exclusive_s=0.3, fresh=FRESH)
+    settings = LinkSettings(release=True, exclusive_s=0.3, fresh=FRESH)
+    machine = DdsMachine(ROBOT, domain=network.domain, settings=settings)
     machine.connect()
     assert machine.virtual
     begun = machine.latest()
@@ -122,7 +123,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
     machine.clamp(())
 
     # A second pronk finds the first one writing.
-    second = DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.3, fresh=FRESH)
+    settings = LinkSettings(exclusive_s=0.3, fresh=FRESH)
+    second = DdsMachine(ROBOT, domain=network.domain, settings=settings)
     with pytest.raises(HardwareError, match="another program"):
         second.connect()
     assert second.counts["commands"] == second.counts["repeats"] == 0
@@ -204,7 +206,8 @@ def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
             wire.poll()
             wire.publish(next(states))
 
-    machine = DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH)
+    settings = LinkSettings(exclusive_s=0.0, fresh=FRESH)
+    machine = DdsMachine(ROBOT, domain=network.domain, settings=settings)
     with meanwhile(speak, 0.002):
         machine.connect()
         machine.send(HOLD)

@@ -26,7 +26,7 @@ from pronk.deploy.links.lcm.codec import (
 from pronk.deploy.links.lcm.layouts import CHEETAH
 from pronk.deploy.links.lcm.link import LcmMachine, url_of
 from pronk.deploy.links.lcm.messages import CONTROL_PARAMETER
-from pronk.deploy.links.link import Freshness, wait_for
+from pronk.deploy.links.link import Freshness, LinkSettings, wait_for
 from pronk.errors import HardwareError
 from pronk.jump.virtual.robot import hold_of
 from pronk.robots.machine import Command, State
@@ -52,11 +52,11 @@ class Process:
         command, env = [sys.executable, "-c", code, *words], {**os.environ, "OMP_NUM_THREADS": "1"}
         self.running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env)
 
-    def machine(self, **options: object) -> LcmMachine:
+    def machine(self, *, release: bool = False) -> LcmMachine:
         # A computer that runs tests side by side is busy; what is tested here is not that.
         fresh = Freshness(share=0.02, longest_gap_s=10.0)
-        common = {"layout": self.layout, "port": self.port, "exclusive_s": 0.3, "fresh": fresh}
-        return LcmMachine(ROBOT, **common, **options)  # type: ignore[arg-type]
+        settings = LinkSettings(release=release, exclusive_s=0.3, fresh=fresh)
+        return LcmMachine(ROBOT, layout=self.layout, port=self.port, settings=settings)
 
 
 @pytest.fixture(scope="module")

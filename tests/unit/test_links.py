@@ -21,16 +21,15 @@ from pronk.deploy.links import address as addresses
 from pronk.deploy.links import link as links
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.link import (
-    CommandWriter,
-    Encode,
     Freshness,
+    LinkSettings,
     NetworkLink,
-    Publish,
-    StateNumbering,
-    StreamLink,
     await_rest,
     wait_for,
 )
+from pronk.deploy.links.numbering import StateNumbering
+from pronk.deploy.links.stream import StreamLink
+from pronk.deploy.links.writer import CommandWriter, Encode, Publish
 from pronk.errors import HardwareError, PronkError, RobotError
 from pronk.robots import load_robot
 from pronk.robots.machine import Command, RefusedError, State, TorqueKind, check_command
@@ -64,13 +63,15 @@ class Windows(NetworkLink):
     torque_kind: TorqueKind = "absent"
     state_rate_hz = 500.0
 
-    def __init__(self, *windows: np.ndarray, **options: object) -> None:
-        super().__init__(ROBOT, **options)  # type: ignore[arg-type]
-        self.left = list(windows)
+    def __init__(self, *windows: np.ndarray, settings: LinkSettings | None = None) -> None:
+        super().__init__(ROBOT, settings)
+        self.windows = list(windows)
 
     def wait(self, until: float) -> list[State]:
         # Before each window, what had come until then is dropped.
-        return [state(when) for when in self.left.pop(0).tolist()] if until else [state()]
+        if not until:
+            return [state()]
+        return [state(when) for when in self.windows.pop(0).tolist()]
 
     def _open(self) -> tuple[Encode, Publish]:
         raise NotImplementedError
@@ -85,20 +86,20 @@ REGULAR = np.arange(100) * 2e-3
 @pytest.mark.parametrize(
     ("windows", "until", "fresh", "found"),
     [
-        ([REGULAR], 0.0, None, 100),
-        ([REGULAR[:80]], 0.0, None, "80"),
-        ([np.append(np.arange(95) * 1.7e-3, 0.1898)], 0.0, None, "30 ms"),
+        ([REGULAR], 0.0, Freshness(), 100),
+        ([REGULAR[:80]], 0.0, Freshness(), "80"),
+        ([np.append(np.arange(95) * 1.7e-3, 0.1898)], 0.0, Freshness(), "30 ms"),
         ([np.arange(5) * 40e-3], 0.0, Freshness(share=0.05, longest_gap_s=1.0), 5),
-        ([np.array([])], 0.0, None, "sent 0"),
+        ([np.array([])], 0.0, Freshness(), "sent 0"),
         # A busy computer may miss windows for a while.
-        ([REGULAR[:20], REGULAR[:0], REGULAR], math.inf, None, 100),
-        ([REGULAR[:20], REGULAR], 0.0, None, "20"),
+        ([REGULAR[:20], REGULAR[:0], REGULAR], math.inf, Freshness(), 100),
+        ([REGULAR[:20], REGULAR], 0.0, Freshness(), "20"),
     ],
 )
 def test_states_must_come_often_and_without_gaps(
-    windows: list[np.ndarray], until: float, fresh: Freshness | None, found: int | str
+    windows: list[np.ndarray], until: float, fresh: Freshness, found: int | str
 ) -> None:
-    link = Windows(*windows, fresh=fresh)
+    link = Windows(*windows, settings=LinkSettings(fresh=fresh))
     if isinstance(found, int):
         assert len(link.fresh_states(until=until)) == found
         return
@@ -151,13 +152,14 @@ def test_values_that_repeat_make_no_states_and_times_increase() -> None:
 
 def test_clamps_need_a_person() -> None:
     requests: list[tuple[str, ...]] = []
-    Windows(clamp_operator=requests.append).clamp(("FL_knee",))
+    attended = LinkSettings(clamp_operator=requests.append)
+    Windows(settings=attended).clamp(("FL_knee",))
     assert requests == [("FL_knee",)]
     Windows().clamp(())
     with pytest.raises(HardwareError, match="FL_knee, FR_knee"):
         Windows().clamp(("FL_knee", "FR_knee"))
     with pytest.raises(RobotError, match="tail"):
-        Windows(clamp_operator=requests.append).clamp(("FR_knee", "tail"))
+        Windows(settings=attended).clamp(("FR_knee", "tail"))
     assert len(requests) == 1
 
 
@@ -317,8 +319,14 @@ class Loop:
     def close(self) -> None: ...
 
 
-def serial(robot: RobotSpec, *, interface: str | None = None, speed: int = 9600, **common: object):  # type: ignore[no-untyped-def]
-    link = StreamLink(robot, Serial(), Loop, **common)  # type: ignore[arg-type]
+def serial(
+    robot: RobotSpec,
+    *,
+    interface: str | None = None,
+    settings: LinkSettings | None = None,
+    speed: int = 9600,
+) -> StreamLink:
+    link = StreamLink(robot, Serial(), Loop, settings=settings)
     link.counts = Counter(speed=speed)
     return link
 
@@ -326,7 +334,7 @@ def serial(robot: RobotSpec, *, interface: str | None = None, speed: int = 9600,
 def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    point = EntryPoint("serial", f"{__name__}:serial", addresses.GROUP)
+    point = EntryPoint("serial", f"{__name__}:serial", addresses.ENTRY_POINT_GROUP)
     monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([point]))
     monkeypatch.setattr(EntryPoint, "load", lambda self: serial)
     machine = Address.parse("serial://ttyUSB0?speed=115200").machine(ROBOT)
@@ -336,7 +344,7 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
         Address.parse("can")
     check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)
     monkeypatch.undo()
-    broken = EntryPoint("serial", "no_such_package:serial", addresses.GROUP)
+    broken = EntryPoint("serial", "no_such_package:serial", addresses.ENTRY_POINT_GROUP)
     monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([broken]))
     with pytest.raises(PronkError, match="no_such_package:serial"):
         Address.parse("serial://ttyUSB0")

@@ -36,15 +36,16 @@ class DdsServerTransport(ServerTransport):
         super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
         # Another writer is another participant.
-        own, other = link.Participant(network), link.Participant(network)
-        self._commands = own.reader(link.COMMANDS, messages.LowCmd)
-        self._states = own.writer(link.STATES, messages.LowState)
-        self._other = other.writer(link.COMMANDS, messages.LowCmd)
+        participant = link.Participant(network)
+        rival = link.Participant(network)
+        self._commands = participant.reader(link.COMMANDS, messages.LowCmd)
+        self._states = participant.writer(link.STATES, messages.LowState)
+        self._other = rival.writer(link.COMMANDS, messages.LowCmd)
         # A handler takes a function's number and its parameter, and returns code and data.
         self._services = [
             (
-                own.reader(f"rt/api/{name}/request", messages.Request),
-                own.writer(f"rt/api/{name}/response", messages.Response),
+                participant.reader(f"rt/api/{name}/request", messages.Request),
+                participant.writer(f"rt/api/{name}/response", messages.Response),
                 handler,
             )
             for name, handler in ((link.SWITCHER, self._switch), (link.BENCH, self._bench))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pronk.deploy.links.link import ClampOperator, Freshness
+from pronk.deploy.links.link import LinkSettings
 from pronk.deploy.links.realtime import sleep_until
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.robot import VirtualRobot
@@ -95,9 +95,7 @@ def open_sim(
     interface: str | None = None,
     seed: int = 0,
     params: str | None = None,
-    clamp_operator: ClampOperator | None = None,
-    release: bool = False,
-    fresh: Freshness | None = None,
+    settings: LinkSettings | None = None,
 ) -> PacedRobot:
     """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`, not yet connected.
 
@@ -106,9 +104,7 @@ def open_sim(
         interface: What holds the trunk, `bench` or `ground`; the ground if None.
         seed: Seed of all noise.
         params: Path of the virtual robot's parameters; those that ship with pronk if None.
-        clamp_operator: Of a network link; without meaning here.
-        release: Of a network link; without meaning here.
-        fresh: Of a network link; without meaning here.
+        settings: Settings of a network link, without meaning here.
     """
     base: Any = interface or "ground"
     sim_params = load_sim_params(params, robot)

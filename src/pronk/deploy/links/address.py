@@ -2,7 +2,7 @@
 
 The scheme names a link: one of `BUILT_IN`, or an entry point of the group `pronk.links`. After `//`
 follows the network interface to a real robot; without one nothing leaves this computer. A link is a
-callable `(robot, *, interface=None, **common) -> Machine`, `common` as of `NetworkLink`; its other
+callable `(robot, *, interface=None, settings=None) -> Machine`, with `LinkSettings`; its other
 keyword arguments are the options of its addresses.
 """
 
@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 import msgspec
 
+from pronk.deploy.links.link import LinkSettings
 from pronk.errors import HardwareError
 from pronk.plugins import load_entry_point
 from pronk.robots.machine import Machine
@@ -29,19 +30,21 @@ BUILT_IN = {
     "lcm": "pronk.deploy.links.lcm.link:LcmMachine",
     "dds": "pronk.deploy.links.dds.link:DdsMachine",
 }
-GROUP = "pronk.links"
-_COMMON = ("robot", "interface", "clamp_operator", "release", "exclusive_s", "fresh")
+ENTRY_POINT_GROUP = "pronk.links"
+_COMMON_PARAMETERS = ("robot", "interface", "settings")
+"""Parameters of every link, which are no options of an address."""
 
 
 def find_link(name: str) -> Callable[..., Machine]:
     """Import a link; HardwareError for an unknown name or a library that is not installed."""
-    if target := BUILT_IN.get(name):
-        return EntryPoint(name, target, GROUP).load()  # type: ignore[no-any-return]
-    known = entry_points(group=GROUP)
-    if name not in known.names:
-        names = ", ".join((*BUILT_IN, *sorted(known.names)))
+    if name in BUILT_IN:
+        entry_point = EntryPoint(name, BUILT_IN[name], ENTRY_POINT_GROUP)
+        return entry_point.load()  # type: ignore[no-any-return]
+    installed = entry_points(group=ENTRY_POINT_GROUP)
+    if name not in installed.names:
+        names = ", ".join((*BUILT_IN, *sorted(installed.names)))
         raise HardwareError(f"no link {name!r}; the links are {names}.")
-    return load_entry_point(known[name])  # type: ignore[no-any-return]
+    return load_entry_point(installed[name])  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,36 +61,47 @@ class Address:
 
     @classmethod
     def parse(cls, text: str, interface: str | None = None, **options: str | int | None) -> Address:
-        """Parse a URI or a short name; HardwareError for an unknown link or option.
+        """Parse a URI or a short name.
 
-        `interface` applies where the text names none; `options` other than None are added.
+        Args:
+            text: The URI or the name of a link.
+            interface: Network interface, where the text names none.
+            options: Options of the link besides those of the text; those that are None are left
+                out.
+
+        Raises:
+            HardwareError: The link or an option is unknown, or an option has another type.
         """
-        kind, found, query = text, "", ""
+        kind = text
+        named_interface = ""
+        query = ""
         if "://" in text:
             parts = urlsplit(text)
-            kind, found, query = parts.scheme, parts.netloc, parts.query
-        if found and interface not in (None, found):
-            raise HardwareError(f"{text} names the interface {found}; leave out {interface}.")
-        link = find_link(kind)
-        hints = get_type_hints(link.__init__ if inspect.isclass(link) else link)
-        known = {
-            name: hints.get(name, str | NoneType)
-            for name, parameter in inspect.signature(link).parameters.items()
-            if parameter.kind is parameter.KEYWORD_ONLY and name not in _COMMON
-        }
-        merged = dict(parse_qsl(query)) | {k: v for k, v in options.items() if v is not None}
-        for name, value in merged.items():
-            if name not in known:
+            kind = parts.scheme
+            named_interface = parts.netloc
+            query = parts.query
+        if named_interface and interface not in (None, named_interface):
+            raise HardwareError(
+                f"{text} names the interface {named_interface}; leave out {interface}."
+            )
+        types = _option_types(find_link(kind))
+        texts: dict[str, str | int] = dict(parse_qsl(query))
+        for name, value in options.items():
+            if value is not None:
+                texts[name] = value
+        converted = {}
+        for name, value in texts.items():
+            if name not in types:
                 raise HardwareError(
-                    f"link {kind} has no {name}; its options are {', '.join(known) or 'none'}."
+                    f"link {kind} has no {name}; its options are {', '.join(types) or 'none'}."
                 )
             try:
-                merged[name] = msgspec.convert(value, known[name], strict=False)
+                converted[name] = msgspec.convert(value, types[name], strict=False)
             except msgspec.ValidationError:
                 raise HardwareError(
-                    f"{name} of link {kind} is {value!r}; expected {known[name]}."
+                    f"{name} of link {kind} is {value!r}; expected {types[name]}."
                 ) from None
-        return cls(kind=kind, interface=found or interface, options=merged)
+        return cls(kind=kind, interface=named_interface or interface, options=converted)
 
     @property
     def local(self) -> bool:
@@ -95,9 +109,24 @@ class Address:
         return self.kind == SIM or self.interface is None
 
     def __str__(self) -> str:
-        query = "&".join(f"{name}={quote(str(value))}" for name, value in self.options.items())
-        return f"{self.kind}://{self.interface or ''}" + (f"?{query}" if query else "")
+        """The URI of this address."""
+        uri = f"{self.kind}://{self.interface or ''}"
+        if self.options:
+            query = "&".join(f"{name}={quote(str(value))}" for name, value in self.options.items())
+            uri += f"?{query}"
+        return uri
 
-    def machine(self, robot: RobotSpec, **common: Any) -> Machine:
-        """Make the machine, not yet connected; `common` are keyword arguments of `NetworkLink`."""
-        return find_link(self.kind)(robot, interface=self.interface, **common, **self.options)
+    def machine(self, robot: RobotSpec, settings: LinkSettings | None = None) -> Machine:
+        """Make the machine, not yet connected, with the usual settings if there are none."""
+        link = find_link(self.kind)
+        return link(robot, interface=self.interface, settings=settings, **self.options)
+
+
+def _option_types(link: Callable[..., Machine]) -> dict[str, Any]:
+    """Types of a link's options by name: of its keyword-only parameters but the common ones."""
+    hints = get_type_hints(link.__init__ if inspect.isclass(link) else link)
+    types = {}
+    for name, parameter in inspect.signature(link).parameters.items():
+        if parameter.kind is parameter.KEYWORD_ONLY and name not in _COMMON_PARAMETERS:
+            types[name] = hints.get(name, str | NoneType)
+    return types

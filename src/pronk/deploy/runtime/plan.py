@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from pronk.deploy.links.address import Address
-from pronk.deploy.links.link import ClampOperator, Freshness
+from pronk.deploy.links.link import ClampOperator, Freshness, LinkSettings
 from pronk.deploy.links.realtime import Wanted
 from pronk.deploy.runtime.limits import AgeLimits, Limits
 from pronk.deploy.runtime.poses import RunTiming
@@ -33,20 +33,18 @@ class Link:
     """Address of the machine."""
     release: bool = False
     """Whether the robot's own controller is disabled first."""
-    fresh: Freshness | None = None
-    """How fresh states must be at first; the usual if None."""
+    fresh: Freshness = field(default_factory=Freshness)
+    """How fresh states must be at first."""
 
     def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
         """Make the machine, not yet connected.
 
         HardwareError if the link's library is not installed.
         """
-        return self.address.machine(
-            load_robot(self.robot),
-            clamp_operator=clamp_operator,
-            release=self.release,
-            fresh=self.fresh,
+        settings = LinkSettings(
+            clamp_operator=clamp_operator, release=self.release, fresh=self.fresh
         )
+        return self.address.machine(load_robot(self.robot), settings)
 
     def __str__(self) -> str:
         return str(self.address)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.deploy.links.dds.image import c_image_dtype, deserialize_image, serialize_image
 from pronk.deploy.links.dds.messages import LowCmd, LowState
-from pronk.deploy.links.link import StateNumbering, unit_quaternion
+from pronk.deploy.links.numbering import StateNumbering, unit_quaternion
 from pronk.errors import HardwareError
 from pronk.robots.machine import Command, RefusedError, State, check_command
 from pronk.robots.robot import RobotSpec

@@ -36,22 +36,30 @@ from pronk.deploy.links.dds.codec import (
     encode_dds_command,
     joint_map,
 )
-from pronk.deploy.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain
+from pronk.deploy.links.link import RESPONSE_S, LinkSettings, NetworkLink, port_or_domain
+from pronk.deploy.links.writer import Encode, Publish
 from pronk.errors import HardwareError
 from pronk.robots.machine import damping_command
 from pronk.robots.robot import RobotSpec
 
-COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"  # topics
-LOOPBACK_DOMAIN = 77  # pronk's own; Unitree's robots use 0, unitree_mujoco 1
+COMMANDS = "rt/lowcmd"
+"""Topic of commands."""
+STATES = "rt/lowstate"
+"""Topic of states."""
+LOOPBACK_DOMAIN = 77
+"""pronk's own domain; Unitree's robots use 0, unitree_mujoco 1."""
 ROBOT_DOMAIN = 0
-_DOMAINS = range(233)  # the ports of higher ones would exceed 65535
-_QUEUE = 64  # messages kept between two reads; at 500 Hz an eighth of a second
-_WRITE_NS = 1_000_000  # longest time that a slow reader may hold a writer up
+_DOMAINS = range(233)
+"""Possible domains; the ports of higher ones would exceed 65535."""
+_QUEUE = 64
+"""Messages kept between two reads; at 500 Hz an eighth of a second."""
+_WRITE_NS = 1_000_000
+"""Longest time that a slow reader may hold a writer up [ns]."""
 
-_NAMED = """<CycloneDDS><Domain Id="any"><General>
+_ON_INTERFACE = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface name={}/></Interfaces></General></Domain></CycloneDDS>"""
 # Loopback often has no multicast: query the ports of the first participants one by one.
-_LOCAL = """<CycloneDDS><Domain Id="any"><General>
+_ON_LOOPBACK = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -61,26 +69,49 @@ _LOCAL = """<CycloneDDS><Domain Id="any"><General>
 # Domains that this process has opened; the library holds one configuration for each.
 _domains: dict[int, tuple[DdsNetwork, Any]] = {}
 
-SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
-OLDER, SERVICE_SWITCH = "robot_state", 1001
-BENCH, CLAMP = "pronk_bench", 1  # of the virtual robot alone: requests for clamps
-DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204  # codes of a response, as in unitree_sdk2
+# Services, and numbers of their functions, as in unitree_sdk2.
+SWITCHER = "motion_switcher"
+CHECK_MODE = 1001
+SELECT_MODE = 1002
+RELEASE_MODE = 1003
+ROBOT_STATE = "robot_state"
+"""Service of older firmware."""
+SERVICE_SWITCH = 1001
+BENCH = "pronk_bench"
+"""Service of the virtual robot alone: requests for clamps."""
+CLAMP = 1
+# Codes of a response, as in unitree_sdk2.
+DONE = 0
+UNKNOWN_API = 3203
+BAD_PARAMETER = 3204
 
 _POLL_S = 0.002
-_RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
-_LONGEST_BURST_S, _LONGEST_PAUSE_S = 0.1, 0.05
+_RELEASE_TRIES = 10
+_RELEASE_PAUSE_S = 0.2
+_LONGEST_BURST_S = 0.1
+"""Longest time over which samples that arrived together were sent [s]."""
+_LONGEST_PAUSE_S = 0.05
+"""Longest wait for a sample [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DdsNetwork:
     """A domain on an interface."""
 
-    interface: str | None = None  # by name, for instance `eth0`; None for loopback only
-    domain: int | None = None  # None for 0 where an interface is named, else pronk's own, 77
+    interface: str | None = None
+    """Name of the interface, for instance `eth0`; None for loopback only."""
+    domain: int | None = None
+    """Number of the domain; None for 0 where an interface is named, else pronk's own, 77."""
 
     def __post_init__(self) -> None:
+        """Choose the domain; HardwareError for one that is not allowed."""
         domain = port_or_domain(
-            "DDS domain", self.domain, self.interface, ROBOT_DOMAIN, LOOPBACK_DOMAIN, _DOMAINS
+            "DDS domain",
+            self.domain,
+            self.interface,
+            real=ROBOT_DOMAIN,
+            virtual=LOOPBACK_DOMAIN,
+            allowed=_DOMAINS,
         )
         object.__setattr__(self, "domain", domain)
 
@@ -94,8 +125,8 @@ class RawSample:
     def __init__(self, data: bytes) -> None:
         self.data = data
 
-    def serialize(self, **_: Any) -> bytes:
-        """The bytes for the wire."""
+    def serialize(self, use_version_2: bool | None = None) -> bytes:
+        """The bytes for the wire, whichever version of CDR the library asks for."""
         return self.data
 
     @classmethod
@@ -109,16 +140,20 @@ class Participant:
 
     def __init__(self, network: DdsNetwork) -> None:
         """Join; HardwareError for a missing interface, or a domain in use with another."""
-        domain, interface = network.domain, network.interface
+        domain = network.domain
         assert domain is not None
-        known = _domains.get(domain)
-        if known is not None and known[0] != network:
-            raise HardwareError(
-                f"this process already uses {known[0]}; close it and start anew for {network}."
-            )
+        if domain in _domains:
+            opened_network, _ = _domains[domain]
+            if opened_network != network:
+                raise HardwareError(
+                    f"this process already uses {opened_network}; close it and start anew for "
+                    f"{network}."
+                )
+        configuration = _ON_LOOPBACK
+        if network.interface:
+            configuration = _ON_INTERFACE.format(quoteattr(network.interface))
         try:
-            if known is None:
-                configuration = _NAMED.format(quoteattr(interface)) if interface else _LOCAL
+            if domain not in _domains:
                 _domains[domain] = (network, Domain(domain, configuration))
             self.entity = DomainParticipant(domain)
         except DDSException as error:
@@ -128,17 +163,23 @@ class Participant:
                 "has it an address? (`ip addr` lists them)"
             ) from None
 
-    def reader(self, topic: str, message: Any, *, own: bool = True) -> Any:
-        """Make a reader of an IDL type; `own` samples are of this participant."""
+    def reader(self, topic: str, message: Any, *, include_local: bool = True) -> Any:
+        """Make a reader.
+
+        Args:
+            topic: Name of the topic.
+            message: Its IDL type.
+            include_local: Whether samples of this participant are read too.
+        """
         policies = [Policy.History.KeepLast(_QUEUE)]
-        if not own:
+        if not include_local:
             policies.append(Policy.IgnoreLocal.Participant)
         return DataReader(self.entity, self._topic(topic, message), Qos(*policies))
 
     def writer(self, topic: str, message: Any) -> Any:
         """Make a writer, which fits every reader and waits for none."""
-        waits = Policy.Reliability.Reliable(_WRITE_NS)
-        return DataWriter(self.entity, self._topic(topic, message), Qos(waits))
+        reliability = Policy.Reliability.Reliable(_WRITE_NS)
+        return DataWriter(self.entity, self._topic(topic, message), Qos(reliability))
 
     def _topic(self, name: str, message: Any) -> Any:
         topic = Topic(self.entity, name, message)
@@ -174,9 +215,17 @@ class ServiceClient:
         self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
 
     def call(self, api_id: int, parameter: Any) -> dict[str, Any] | None:
-        """Call a function by its number, repeatedly while there is no response.
+        """Call a function, repeatedly while there is no response.
 
-        None without one within `RESPONSE_S`; HardwareError for a code other than 0, or no object.
+        Args:
+            api_id: Number of the function.
+            parameter: Its argument, which is sent in JSON.
+
+        Returns:
+            What the function returned; None without a response within `RESPONSE_S`.
+
+        Raises:
+            HardwareError: The response has a code other than 0, or no JSON object.
         """
         identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
         header = messages.RequestHeader(
@@ -186,11 +235,11 @@ class ServiceClient:
         )
         request = messages.Request(header=header, parameter=json.dumps(parameter), binary=[])
         end = time.monotonic() + RESPONSE_S
-        again = -1.0
+        next_request = -1.0
         while time.monotonic() < end:
-            if time.monotonic() >= again and self._requests.get_matched_subscriptions():
+            if time.monotonic() >= next_request and self._requests.get_matched_subscriptions():
                 self._requests.write(request)
-                again = time.monotonic() + RESPONSE_S / 4
+                next_request = time.monotonic() + RESPONSE_S / 4
             for response in take_samples(self._responses, Counter()):
                 if response.header.identity == identity:
                     return self._data(api_id, response)
@@ -198,17 +247,19 @@ class ServiceClient:
         return None
 
     def _data(self, api_id: int, response: Any) -> dict[str, Any]:
-        code, data = response.header.status.code, None
-        got = f"code {code}"
+        """Return the JSON object of a response."""
+        code = response.header.status.code
+        result = f"code {code}"
         if code == DONE:
-            got = f"{response.data[:60]!r}"
+            result = f"{response.data[:60]!r}"
+            data = None
             with contextlib.suppress(ValueError):
                 data = json.loads(response.data or "{}") or {}
             if isinstance(data, dict):
                 return data
         raise HardwareError(
-            f"the robot's service {self._service} returned {got} for function {api_id}, expected "
-            "code 0 and a JSON object; switch by the robot's own remote or app instead."
+            f"the robot's service {self._service} returned {result} for function {api_id}, "
+            "expected code 0 and a JSON object; switch by the robot's own remote or app instead."
         )
 
 
@@ -218,27 +269,35 @@ def check_own_controller(participant: Participant, *, release: bool) -> None:
     response = switcher.call(CHECK_MODE, {})
     if response is None:
         # Older firmware ends its sport mode by another service.
-        sport = {"name": "sport_mode", "switch": 0}
-        if release and ServiceClient(participant, OLDER).call(SERVICE_SWITCH, sport) is not None:
-            return
+        if release:
+            robot_state = ServiceClient(participant, ROBOT_STATE)
+            sport_mode_off = {"name": "sport_mode", "switch": 0}
+            if robot_state.call(SERVICE_SWITCH, sport_mode_off) is not None:
+                return
         raise HardwareError(
             f"the robot did not respond on its service {SWITCHER} within {RESPONSE_S:g} s, so it "
             "is not known whether its own controller is off; check the network, and its firmware."
         )
-    tries = _RELEASE_TRIES if release else 0
-    while (name := (response or {}).get("name", "")) and tries:
-        tries -= 1
+    controller = response.get("name", "")
+    if not controller:
+        return
+    if not release:
+        raise HardwareError(
+            f"the robot's own controller {controller!r} holds the joints; lay the robot down or "
+            "hang it up, and have the controller released (--disable-onboard-controller)."
+        )
+    for _ in range(_RELEASE_TRIES):
         switcher.call(RELEASE_MODE, {})
         time.sleep(_RELEASE_PAUSE_S)
         response = switcher.call(CHECK_MODE, {})
-    if name:
-        raise HardwareError(
-            f"the robot's own controller {name!r} was not switched off after {_RELEASE_TRIES} "
-            "requests; switch it off by the robot's app."
-            if release
-            else f"the robot's own controller {name!r} holds the joints; lay the robot down or "
-            "hang it up, and have the controller released (--disable-onboard-controller)."
-        )
+        # Without a response the controller counts as switched off.
+        controller = "" if response is None else response.get("name", "")
+        if not controller:
+            return
+    raise HardwareError(
+        f"the robot's own controller {controller!r} was not switched off after {_RELEASE_TRIES} "
+        "requests; switch it off by the robot's app."
+    )
 
 
 class DdsMachine(NetworkLink):
@@ -255,38 +314,49 @@ class DdsMachine(NetworkLink):
         *,
         interface: str | None = None,
         domain: int | None = None,
-        **common: Any,
+        settings: LinkSettings | None = None,
     ) -> None:
-        """Describe the link on a `DdsNetwork`; `common` is as of `NetworkLink`."""
-        super().__init__(robot, **common)
+        """Describe the link.
+
+        Args:
+            robot: The robot.
+            interface: Network interface to a real robot, None for loopback only.
+            domain: Number of the domain, as of `DdsNetwork`.
+            settings: Settings of every link; the usual if None.
+        """
+        super().__init__(robot, settings)
         self._joints = joint_map(robot)
         self._sinking = damping_command(len(robot.joints), self._joints.sink_damping)
         self._network = DdsNetwork(interface=interface, domain=domain)
-        self._command_topic, self._address = COMMANDS, f"{STATES} in {self._network}"
+        self._command_topic = COMMANDS
+        self._address = f"{STATES} in {self._network}"
 
     def open_damper(self) -> Callable[[], None]:
         """Join the domain by itself, and return what writes damping."""
-        out = Participant(self._network).writer(COMMANDS, messages.LowCmd)
+        commands = Participant(self._network).writer(COMMANDS, messages.LowCmd)
         data = encode_dds_command(self._joints, self._sinking)
-        return lambda: write_bytes(out, data, self.counts)
+        return lambda: write_bytes(commands, data, self.counts)
 
     def _open(self) -> tuple[Encode, Publish]:
         self._decoder = DdsStateDecoder(self._joints, self.counts)
         self._senders: set[int] = set()
-        self._participant = own = Participant(self._network)
-        self._states_in = own.reader(STATES, messages.LowState)
-        self._others = own.reader(COMMANDS, messages.LowCmd, own=False)
-        out = own.writer(COMMANDS, messages.LowCmd)
-        self._bench = ServiceClient(own, BENCH)
-        anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
-        self._wake = core.WaitSet(own.entity)
-        for reader in (self._states_in, self._others):
-            self._wake.attach(core.ReadCondition(reader, anything))
+        self._participant = Participant(self._network)
+        self._states_reader = self._participant.reader(STATES, messages.LowState)
+        self._foreign_commands = self._participant.reader(
+            COMMANDS, messages.LowCmd, include_local=False
+        )
+        commands = self._participant.writer(COMMANDS, messages.LowCmd)
+        self._bench = ServiceClient(self._participant, BENCH)
+        any_sample = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
+        self._samples_come = core.WaitSet(self._participant.entity)
+        for reader in (self._states_reader, self._foreign_commands):
+            self._samples_come.attach(core.ReadCondition(reader, any_sample))
         encode = partial(encode_dds_command, self._joints)
-        return encode, lambda data: write_bytes(out, data, self.counts)
+        return encode, lambda data: write_bytes(commands, data, self.counts)
 
     def _shut(self) -> None:
-        del self._wake, self._states_in, self._others, self._bench, self._participant
+        del self._samples_come, self._states_reader, self._foreign_commands
+        del self._bench, self._participant
 
     def _prepare(self) -> None:
         self.virtual = self._decoder.virtual
@@ -295,7 +365,7 @@ class DdsMachine(NetworkLink):
                 f"the robot in {self._network} is not pronk's virtual robot, and no real "
                 f"{self.robot} sends Unitree's messages; give the robot's name."
             )
-        check_own_controller(self._participant, release=self._release)
+        check_own_controller(self._participant, release=self._settings.release)
 
     @property
     def sources(self) -> int:
@@ -306,16 +376,19 @@ class DdsMachine(NetworkLink):
         return self._bench.call(CLAMP, {"joints": list(joints)}) is not None
 
     def _receive(self) -> None:
-        self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))
+        self._samples_come.wait(int(_LONGEST_PAUSE_S * 1e9))
         arrived = time.monotonic()
-        if take_samples(self._others, self.counts):
+        if take_samples(self._foreign_commands, self.counts):
             self.counts["foreign"] += 1
             if self._writer is not None and self._writer.wrote:
                 self._writer.damp()
-        samples = take_samples(self._states_in, self.counts)
+        samples = take_samples(self._states_reader, self.counts)
+        if not samples:
+            return
+        newest_ns = samples[-1].sample_info.source_timestamp
         for sample in samples:
             # Samples that arrived together are distinguished by when they were sent.
-            last, this = (each.sample_info.source_timestamp for each in (samples[-1], sample))
-            stamp = arrived - min(max((last - this) * 1e-9, 0.0), _LONGEST_BURST_S)
+            age_s = (newest_ns - sample.sample_info.source_timestamp) * 1e-9
+            stamp = arrived - min(max(age_s, 0.0), _LONGEST_BURST_S)
             self._senders.add(sample.sample_info.publication_handle)
             self._take(self._decoder.take, sample.data, stamp)

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from pronk.arrays import Array
 from pronk.deploy.links.lcm.layouts import JOINT_COUNT, WTW, LcmLayout
 from pronk.deploy.links.lcm.messages import CONTROL_PARAMETER, VIRTUAL_ROBOT, LcmMessage
-from pronk.deploy.links.link import StateNumbering, unit_quaternion
+from pronk.deploy.links.numbering import StateNumbering, unit_quaternion
 from pronk.robots.machine import Command, RefusedError, State, check_command
 
 _RANGES = {

@@ -31,23 +31,30 @@ from pronk.deploy.links.lcm.messages import (
 )
 from pronk.deploy.links.link import (
     RESPONSE_S,
-    Encode,
+    LinkSettings,
     NetworkLink,
-    Publish,
     port_or_domain,
     wait_for,
 )
+from pronk.deploy.links.writer import Encode, Publish
 from pronk.errors import HardwareError
+from pronk.robots.machine import State
 from pronk.robots.robot import RobotSpec
 
-# LCM's multicast group and port, those of every robot too.
-GROUP, ROBOT_PORT = "239.255.76.67", 7667
+MULTICAST_GROUP = "239.255.76.67"
+"""LCM's default multicast group, that of every robot."""
+ROBOT_PORT = 7667
+"""LCM's default UDP port, that of every robot."""
 VIRTUAL_PORT = 7768
-"""The virtual robot's, so that nothing here ever reaches a real one."""
+"""UDP port of the virtual robot, so that nothing here ever reaches a real one."""
 _ROUTES = Path("/proc/net/route")
+_ROUTE_UP = 1
+"""Flag of a route in use, RTF_UP of route(8)."""
 _PORTS = range(1024, 65536)
 _QUEUE = 100
-_REMEMBERED = 512  # commands kept to recognize one's own
+"""Messages of a channel kept between two reads."""
+_REMEMBERED_COMMANDS = 512
+"""Commands kept to recognize one's own."""
 
 
 def url_of(*, port: int | None = None, interface: str | None = None) -> str:
@@ -55,31 +62,47 @@ def url_of(*, port: int | None = None, interface: str | None = None) -> str:
 
     HardwareError for an impossible UDP port, or where multicast does not leave by that interface.
     """
-    number = port_or_domain("LCM port", port, interface, ROBOT_PORT, VIRTUAL_PORT, _PORTS)
+    number = port_or_domain(
+        "LCM port", port, interface, real=ROBOT_PORT, virtual=VIRTUAL_PORT, allowed=_PORTS
+    )
     if interface in (None, "lo"):
-        return f"udpm://{GROUP}:{number}?ttl=0"
-    way = multicast_interface(_ROUTES.read_text(encoding="ascii")) if _ROUTES.exists() else None
-    if way != interface:
+        return f"udpm://{MULTICAST_GROUP}:{number}?ttl=0"
+    route = None
+    if _ROUTES.exists():
+        route = multicast_interface(_ROUTES.read_text(encoding="ascii"))
+    if route != interface:
         raise HardwareError(
-            f"LCM's multicast leaves by {way or 'no interface'}, expected {interface}; set the "
-            f"route: `sudo ip route add {GROUP} dev {interface}`."
+            f"LCM's multicast leaves by {route or 'no interface'}, expected {interface}; set the "
+            f"route: `sudo ip route add {MULTICAST_GROUP} dev {interface}`."
         )
     # One hop: the robot's own cable, and no router.
-    return f"udpm://{GROUP}:{number}?ttl=1"
+    return f"udpm://{MULTICAST_GROUP}:{number}?ttl=1"
 
 
 def multicast_interface(table: str) -> str | None:
-    """The interface by which LCM's packets leave, or None, by a table as in /proc/net/route."""
-    group = int(ipaddress.IPv4Address(GROUP))
-    found: list[tuple[int, int, str]] = []
-    for words in map(str.split, table.splitlines()[1:]):
-        if len(words) < 8 or not int(words[3], 16) & 1:
+    """Find the interface by which LCM's packets leave, or None.
+
+    Args:
+        table: Routes as in /proc/net/route: interface, destination, gateway, flags, two counts,
+            metric, mask; addresses in hexadecimal digits, last byte first.
+    """
+    group = int(ipaddress.IPv4Address(MULTICAST_GROUP))
+    routes: list[tuple[int, int, str]] = []
+    for line in table.splitlines()[1:]:
+        words = line.split()
+        if len(words) < 8 or not int(words[3], 16) & _ROUTE_UP:
             continue
-        target, mask = (int.from_bytes(bytes.fromhex(words[k])[::-1], "big") for k in (1, 7))
-        if group & mask == target:
-            found.append((mask, -int(words[6]), words[0]))
+        interface = words[0]
+        destination = int.from_bytes(bytes.fromhex(words[1]), "little")
+        metric = int(words[6])
+        mask = int.from_bytes(bytes.fromhex(words[7]), "little")
+        if group & mask == destination:
+            routes.append((mask, -metric, interface))
+    if not routes:
+        return None
     # The longest mask wins, then the smallest metric.
-    return max(found)[2] if found else None
+    _, _, interface = max(routes)
+    return interface
 
 
 def open_lcm(url: str) -> Any:
@@ -95,7 +118,7 @@ def open_lcm(url: str) -> Any:
     except (RuntimeError, OSError) as error:
         raise HardwareError(
             f"LCM cannot open {url} ({error}); without a network, multicast needs a route: "
-            f"`sudo ip route add {GROUP} dev lo`."
+            f"`sudo ip route add {MULTICAST_GROUP} dev lo`."
         ) from None
 
 
@@ -107,18 +130,20 @@ class Senders:
 
     def __init__(self, port: int, channels: tuple[str, ...]) -> None:
         """Join the multicast group."""
-        self._found = {name.encode(): set[object]() for name in channels}
+        self._senders_by_channel: dict[bytes, set[object]] = {}
+        for name in channels:
+            self._senders_by_channel[name.encode()] = set()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._socket.bind((GROUP, port))
-        group = socket.inet_aton(GROUP) + socket.inet_aton("0.0.0.0")
+        self._socket.bind((MULTICAST_GROUP, port))
+        group = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton("0.0.0.0")
         self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
         self._socket.setblocking(False)
 
     @property
-    def most(self) -> int:
+    def count(self) -> int:
         """Largest number of senders on one channel."""
-        return max(map(len, self._found.values()))
+        return max(len(senders) for senders in self._senders_by_channel.values())
 
     def look(self) -> None:
         """Note the senders of what has come."""
@@ -127,9 +152,10 @@ class Senders:
                 head, sender = self._socket.recvfrom(64)
             except BlockingIOError:
                 return
-            channel = self._found.get(head[8:].partition(b"\0")[0])
-            if channel is not None and head.startswith(b"LC02"):
-                channel.add(sender)
+            channel, _, _ = head[8:].partition(b"\0")
+            senders = self._senders_by_channel.get(channel)
+            if senders is not None and head.startswith(b"LC02"):
+                senders.add(sender)
 
     def close(self) -> None:
         """Leave the group."""
@@ -146,89 +172,107 @@ class LcmMachine(NetworkLink):
         layout: str = "cheetah",
         port: int | None = None,
         interface: str | None = None,
-        **common: Any,
+        settings: LinkSettings | None = None,
     ) -> None:
-        """Describe the link; see `LAYOUTS`, `url_of` and, for `common`, `NetworkLink`."""
-        super().__init__(robot, **common)
-        self._layout = known = find_layout(layout)
+        """Describe the link.
+
+        Args:
+            robot: The robot.
+            layout: Messages, a name of `LAYOUTS`.
+            port: UDP port; the robots' with an interface, else the virtual robot's if None.
+            interface: Network interface to a real robot, None for this computer only.
+            settings: Settings of every link; the usual if None.
+        """
+        super().__init__(robot, settings)
+        self._layout = find_layout(layout)
         if len(robot.joints) != 12:
             raise HardwareError(
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
                 "for twelve."
             )
-        self.torque_kind, self.state_rate_hz = known.torque_kind, known.state_rate_hz
-        self._command_topic = known.command.channel
+        self.torque_kind = self._layout.torque_kind
+        self.state_rate_hz = self._layout.state_rate_hz
+        self._command_topic = self._layout.command.channel
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
         self._port = int(self._url.partition("?")[0].rpartition(":")[2])
-        self._address = f"{known.joints.channel} and {known.attitude.channel} at {self._url}"
+        self._address = (
+            f"{self._layout.joints.channel} and {self._layout.attitude.channel} at {self._url}"
+        )
 
     def open_damper(self) -> Callable[[], None]:
         """Open a handle of its own, and return what writes damping."""
-        out = open_lcm(self._url)
+        sender = open_lcm(self._url)
         data = codec.encode_lcm_command(self._layout, self._sinking)
-        return lambda: out.publish(self._command_topic, data)
+        return lambda: sender.publish(self._command_topic, data)
 
     def _open(self) -> tuple[Encode, Publish]:
         layout = self._layout
         decoder = codec.LcmStateDecoder(layout, self.counts)
-        # Last request for clamps that the virtual robot received, and the joints it holds.
-        self._held: tuple[int, tuple[str, ...]] | None = None
+        # Last request for clamps that the virtual robot received, and the joints it clamps.
+        self._beacon: tuple[int, tuple[str, ...]] | None = None
         self._responses: list[bytes] = []
         # Newest first: a message that comes back is nearly always the last one.
-        self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._sent_commands: deque[bytes] = deque(maxlen=_REMEMBERED_COMMANDS)
         # A handle belongs to one thread at a time.
-        self._publishing, self._remembering = threading.Lock(), threading.Lock()
-        self._in, self._out = open_lcm(self._url), open_lcm(self._url)
+        self._publishing = threading.Lock()
+        self._remembering = threading.Lock()
+        self._receiver = open_lcm(self._url)
+        self._sender = open_lcm(self._url)
         self._senders = Senders(self._port, (layout.joints.channel, layout.attitude.channel))
-        for channel, handler in (
-            (layout.attitude.channel, lambda data: decoder.attitude(data, time.monotonic())),
-            (layout.joints.channel, lambda data: decoder.joints(data, time.monotonic())),
-            (layout.command.channel, self._met_command),
-            (BEACON_CHANNEL, self._met_beacon),
-            (RESPONSE_CHANNEL, self._responses.append),
-        ):
-            subscription = self._in.subscribe(
-                channel, lambda _, data, handler=handler: self._take(handler, data)
-            )
-            subscription.set_queue_capacity(_QUEUE)
-        return partial(codec.encode_lcm_command, layout), self._command
+        self._subscribe(layout.attitude.channel, decoder.attitude)
+        self._subscribe(layout.joints.channel, decoder.joints)
+        self._subscribe(layout.command.channel, self._receive_command)
+        self._subscribe(BEACON_CHANNEL, self._receive_beacon)
+        self._subscribe(RESPONSE_CHANNEL, self._receive_response)
+        return partial(codec.encode_lcm_command, layout), self._publish_command
+
+    def _subscribe(self, channel: str, decode: Callable[[bytes, float], State | None]) -> None:
+        """Have each message of a channel decoded when it arrives."""
+
+        def receive(_: str, data: bytes) -> None:
+            self._take(decode, data, time.monotonic())
+
+        self._receiver.subscribe(channel, receive).set_queue_capacity(_QUEUE)
 
     def _shut(self) -> None:
         self._senders.close()
-        del self._in, self._out
+        del self._receiver, self._sender
 
     def _receive(self) -> None:
-        self._in.handle_timeout(50)
+        self._receiver.handle_timeout(50)
         self._senders.look()
 
     @property
     def sources(self) -> int:
         """Senders of states."""
-        return self._senders.most
+        return self._senders.count
 
     def _publish(self, channel: str, data: bytes) -> None:
         with self._publishing:
-            self._out.publish(channel, data)
+            self._sender.publish(channel, data)
 
-    def _command(self, data: bytes) -> None:
+    def _publish_command(self, data: bytes) -> None:
         with self._remembering:
-            self._own.appendleft(data)
+            self._sent_commands.appendleft(data)
         self._publish(self._command_topic, data)
 
-    def _met_command(self, data: bytes) -> None:
+    def _receive_command(self, data: bytes, _arrived: float) -> None:
         """Count a command that was not written here; each of one's own comes back once."""
         with self._remembering:
             try:
-                self._own.remove(data)
+                self._sent_commands.remove(data)
             except ValueError:
                 self.counts["foreign"] += 1
 
-    def _met_beacon(self, data: bytes) -> None:
-        self._held = codec.decode_clamps(self._robot.joint_names, data)
+    def _receive_beacon(self, data: bytes, _arrived: float) -> None:
+        self._beacon = codec.decode_clamps(self._robot.joint_names, data)
+
+    def _receive_response(self, data: bytes, _arrived: float) -> None:
+        self._responses.append(data)
 
     def _prepare(self) -> None:
-        if not self._release:
+        if not self._settings.release:
             return
         data = codec.encode_mode_request(0, time.monotonic_ns())
         self._publish(CONTROL_PARAMETER.channel, data)
@@ -241,15 +285,16 @@ class LcmMachine(NetworkLink):
     def _confirm(self) -> None:
         if self._interface is None:
             # Its beacon comes ten times a second; no other simulator has one.
-            wait_for(lambda: self._held is not None)
-        self.virtual = self._held is not None
+            wait_for(lambda: self._beacon is not None)
+        self.virtual = self._beacon is not None
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
-        names, request = self._robot.joint_names, time.monotonic_ns()
+        names = self._robot.joint_names
+        request = time.monotonic_ns()
         data = codec.encode_clamps(names, joints, request)
-        held = (request, tuple(name for name in names if name in joints))
+        confirmation = codec.decode_clamps(names, data)
         for _ in range(4):  # for messages may be lost
             self._publish(VIRTUAL_ROBOT.channel, data)
-            if wait_for(lambda: self._held == held, RESPONSE_S / 4):
+            if wait_for(lambda: self._beacon == confirmation, RESPONSE_S / 4):
                 return True
         return False
