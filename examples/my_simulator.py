@@ -17,7 +17,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.identify.simulators.simulator import PARAMETERS, SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
+from pronk.identify.simulators.simulator import PARAMETERS
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]

@@ -11,10 +11,10 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.identify.simulators.engine import delayed
 from pronk.identify.simulators.factory import simulator_factory
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.mujoco import Chain
 from pronk.identify.simulators.probe import Probe
-from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.robots import load_robot
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec

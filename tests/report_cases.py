@@ -23,7 +23,7 @@ from pronk.identify.match.result import (
     joint_gains,
 )
 from pronk.identify.response.response import FrequencyResponse
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.jump.trial import walk
 from pronk.jump.trial.crossing import CROSSING, CrossingFigures
 from pronk.jump.trial.jumps import JumpRules, measure_jump

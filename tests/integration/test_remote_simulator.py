@@ -31,7 +31,6 @@ import os, time
 import numpy as np
 from pronk.errors import PronkError
 from pronk.identify.simulators.links import links_of
-from pronk.identify.simulators.simulator import SimulatorInfo
 
 class Resting:
     """Positions at rest of one chain."""

@@ -12,7 +12,7 @@ from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.gains import FittedValue, JointGains, MatchedGains
 from pronk.identify.match.predict import predict, r2, rmse
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -12,7 +12,7 @@ import pytest
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains, save_gains
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.robots import load_robot
 

@@ -16,7 +16,7 @@ import yaml
 
 from pronk.errors import ArtefactError
 from pronk.files import converted, read_yaml, write_text
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.names import check_names
 
 SCHEMA = "pronk/gains/2"

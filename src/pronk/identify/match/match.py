@@ -39,7 +39,8 @@ from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
-from pronk.identify.simulators.simulator import JointRigs, SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
+from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
 
 Method = Literal["time", "paper"]

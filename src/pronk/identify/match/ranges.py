@@ -28,7 +28,7 @@ from scipy import stats
 from pronk.arrays import Array
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 

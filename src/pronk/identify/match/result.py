@@ -26,7 +26,7 @@ from pronk.identify.match.gains import (
     MatchQuality,
     TorqueParameter,
 )
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

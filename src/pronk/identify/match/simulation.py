@@ -8,10 +8,10 @@ from pathlib import Path
 
 from pronk.errors import PronkError
 from pronk.identify.match.gains import JointGains
+from pronk.identify.simulators.info import SimulatorInfo, mujoco_info
 from pronk.identify.simulators.load import joint_rigs
-from pronk.identify.simulators.mujoco import mujoco_info
 from pronk.identify.simulators.profiles import Profile, load_profiles, profile
-from pronk.identify.simulators.simulator import JointRigs, SimulatorInfo
+from pronk.identify.simulators.simulator import JointRigs
 from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
 

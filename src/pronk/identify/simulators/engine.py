@@ -16,8 +16,8 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import PronkError
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.links import Links, links_of
-from pronk.identify.simulators.simulator import SimulatorInfo
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.motor import voltage_limits
 from pronk.robots.robot import RobotSpec

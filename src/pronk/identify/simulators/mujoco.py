@@ -18,14 +18,8 @@ from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.command_trace import CommandTrace
-from pronk.identify.simulators.simulator import (
-    CHUNK,
-    PARAMETERS,
-    Closing,
-    JointRigs,
-    SimulatorInfo,
-    Values,
-)
+from pronk.identify.simulators.info import mujoco_info
+from pronk.identify.simulators.simulator import CHUNK, PARAMETERS, Closing, JointRigs, Values
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import RobotSpec
 
@@ -33,16 +27,6 @@ _REST_ROUNDS = 4
 """Rounds of `q = target - gravity(q) / stiffness`; each gains two digits at 17 N m/rad."""
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """State of a simulation: time, positions, speeds and activations, in this order."""
-
-
-def mujoco_info(robot: RobotSpec) -> SimulatorInfo:
-    """Describe the training simulator of a robot."""
-    return SimulatorInfo(
-        profile="mjlab",
-        version=mujoco.__version__,
-        timestep_s=robot.timestep_s,
-        decimation=robot.decimation,
-    )
 
 
 class Chain(Closing):

@@ -15,7 +15,7 @@ from typing import Literal, cast, get_args
 
 from pronk.errors import PronkError
 from pronk.files import converted, read_yaml
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import Joint, RobotSpec
 

@@ -40,8 +40,9 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
 from pronk.identify.simulators.factory import ENTRY_POINTS, simulator_factory
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.links import Links, SentRobot, links_of
-from pronk.identify.simulators.simulator import Closing, Simulator, SimulatorInfo
+from pronk.identify.simulators.simulator import Closing, Simulator
 from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.limits import OperatingLimits

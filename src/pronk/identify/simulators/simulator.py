@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import PronkError
-from pronk.robots.drive_law import DriveLaw
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
@@ -30,36 +30,6 @@ PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "delay")
 """Parameters of a joint [N m/rad, N m s/rad, kg m^2, N m, s]; the gains must be settable."""
 CHUNK = 100
 """Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulatorInfo:
-    """The simulator that gains hold for. In another one the same numbers give another joint."""
-
-    profile: str = ""
-    """A name in `profiles.yaml`; empty for a simulator without one."""
-    engine: str = "mujoco"
-    """Name of the physics engine."""
-    version: str = ""
-    """Version of the engine."""
-    timestep_s: float = 0.005
-    """Physics step [s]."""
-    decimation: int = 4
-    """Physics steps for which a command of the policy is held."""
-    integrator: str = "implicitfast"
-    """Integrator of the engine, in its own words."""
-    actuator: str = "dc_motor_pd"
-    """The engine's drive. The default is an explicit PD on position and velocity at the start of
-    each physics step, clipped by the torque-speed curve (mjlab's DcMotorActuator)."""
-    law: str = "explicit"
-    """`DriveLaw.kind` of the drive."""
-    iterations: int = 1
-    """`DriveLaw.iterations` of the drive."""
-
-    @property
-    def drive_law(self) -> DriveLaw:
-        """How stiffness and damping act over a step."""
-        return DriveLaw(kind=self.law, iterations=self.iterations)  # type: ignore[arg-type]
 
 
 @runtime_checkable

@@ -16,8 +16,7 @@ from typing import Any, Literal
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
 from pronk.identify.match.gains import GroupGains, MatchedGains, load_gains
-from pronk.identify.simulators.mujoco import mujoco_info
-from pronk.identify.simulators.simulator import SimulatorInfo
+from pronk.identify.simulators.info import SimulatorInfo, mujoco_info
 from pronk.robots.robot import RobotSpec
 
 NAIVE = "naive"
