@@ -72,7 +72,7 @@ def main() -> None:
             axes.annotate("", (9.0, TOP[lower] + 0.62), (9.0, TOP[upper] - 0.62), arrowprops=ARROW)
             height = (TOP[upper] + TOP[lower]) / 2.0
             axes.text(8.85, height, name, ha="right", va="center", family="monospace")
-        style.save(figure, OUT)
+        style.save_figure(figure, OUT)
 
 
 if __name__ == "__main__":

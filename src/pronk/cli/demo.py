@@ -66,7 +66,7 @@ def demo(
         report("jumps and film", 0.0)
         trial, films = jumping.result()
         report("jumps and film", 1.0)
-        hero = style.save(figures.hero(result), out / "hero.svg")
+        hero = style.save_figure(figures.hero(result), out / "hero.svg")
         page, _ = write_report(out, report)
     seconds = time.perf_counter() - begun
     cells = show_match(result, replays)

@@ -150,5 +150,5 @@ def _save_figures(prediction: Prediction, log: JointLog, folder: Path) -> list[P
         joint_name = file_name(joint.joint)
         name = stem if stem == joint_name else f"{stem}.{joint_name}"
         figure = figures.prediction_figure(joint, virtual=log.virtual)
-        wrote.append(style.save(figure, folder / f"{name}.prediction.svg"))
+        wrote.append(style.save_figure(figure, folder / f"{name}.prediction.svg"))
     return wrote

@@ -98,7 +98,9 @@ def _write_plots(
         if len(by_joint) == 1 and stem == file_name(joint):
             name = stem
         written.append(
-            style.save(figures.measured_responses(responses), folder / f"{name}.response.svg")
+            style.save_figure(
+                figures.measured_responses(responses), folder / f"{name}.response.svg"
+            )
         )
     return written
 

@@ -229,7 +229,7 @@ def _trial_of_conditions(
             overwrite=output.overwrite,
             progress=report.bar("jumping"),
         )
-    figure = style.save(draw_conditions(results), output.out / "conditions.svg")
+    figure = style.save_figure(draw_conditions(results), output.out / "conditions.svg")
     table = tables.condition_table(results)
     console.show(table)
     console.say(

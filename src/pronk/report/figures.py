@@ -18,6 +18,7 @@ from scipy import stats
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.plot import decibel
 from pronk.identify.match.predict import JointPrediction
 from pronk.identify.match.result import JointResult, MatchResult
 from pronk.identify.response.response import FrequencyResponse
@@ -91,8 +92,8 @@ def _draw_measured(
         lower, upper = np.degrees(response.phase_interval())
         middle = np.degrees(response.phase)
     else:
-        lower, upper = style.decibel(np.array(response.gain_interval()))
-        middle = style.decibel(response.gain)
+        lower, upper = decibel(np.array(response.gain_interval()))
+        middle = decibel(response.gain)
     axes.fill_between(
         response.frequency_hz,
         np.where(drawn, lower, np.nan),
@@ -117,7 +118,7 @@ def _draw_panel(
         if phase:
             values = np.degrees(np.unwrap(np.angle(curve.response)))
         else:
-            values = style.decibel(curve.response)
+            values = decibel(curve.response)
         axes.plot(measured.frequency_hz, np.where(drawn, values, np.nan), **curve.look)
 
 
@@ -241,7 +242,7 @@ def zero_armature(joint: JointResult) -> Figure:
         axes = grid[0, 0]
         _draw_panel(axes, responses, curves)
         # An antiresonance would leave the rest of the curves no room.
-        lowest_db = style.decibel(responses.matched).min() - 20.0
+        lowest_db = decibel(responses.matched).min() - 20.0
         axes.set(xlabel="frequency [Hz]", ylabel="gain [dB]")
         axes.set_ylim(max(lowest_db, axes.get_ylim()[0]), None)
         axes.set_title(f"{style.joint_words(joint.joint)}: with and without rotor inertia")

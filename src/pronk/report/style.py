@@ -83,12 +83,7 @@ _RC = {
 }
 
 
-def decibel(gain: Any) -> Any:
-    """Return `20 log10(gain)` [dB], at least -200 dB, so that a zero can be drawn."""
-    return 20.0 * np.log10(np.maximum(np.abs(gain), 1e-10))
-
-
-def rms(values: Any, axis: int | None = None) -> Any:
+def rms_of_finite(values: Any, axis: int | None = None) -> Any:
     """Return the root mean square of the finite values; NaN without any."""
     numbers = np.asarray(values, dtype=float)
     finite = np.isfinite(numbers)
@@ -276,7 +271,7 @@ def picture(figure: Figure, *, dense: bool = False) -> str:
     return data_uri(render(figure), "svg+xml")
 
 
-def save(figure: Figure, path: Path) -> Path:
+def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG or PNG, by the suffix of the path, whole or not at all."""
     with written_whole(path) as temporary:
         temporary.write_bytes(render(figure, path.suffix.lstrip("."), dpi=150))

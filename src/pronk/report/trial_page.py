@@ -27,7 +27,7 @@ from pronk.jump.virtual import capture as capture_file
 from pronk.report import style
 from pronk.report.page import Part, page
 from pronk.report.paper import published_jumps
-from pronk.report.style import picture, rms
+from pronk.report.style import picture, rms_of_finite
 from pronk.report.trial_figures import JumpPanel, Values, draw_jumps, draw_traces
 from pronk.tables import Cell, Column, Table
 
@@ -126,7 +126,7 @@ def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
     rates = [np.array([np.nan])]
     for run in runs.get(RATES.name, ()):
         rates.append(run[1])
-    return float(rms(np.concatenate(rates)))
+    return float(rms_of_finite(np.concatenate(rates)))
 
 
 # ---- films ----
