@@ -106,7 +106,8 @@ def ramps(ticks: int, ramp_ticks: int) -> Array:
     window[:ramp_ticks] = rise
     window[ticks - ramp_ticks :] = rise[::-1]
     # Even an abrupt signal begins and ends at rest.
-    window[0] = window[-1] = 0.0
+    window[0] = 0.0
+    window[-1] = 0.0
     return window
 
 
@@ -266,8 +267,8 @@ class Multisine(Signal):
         spectrum[:, numbers] = numbers**-self.tilt * np.exp(1j * phases)
         waves = np.fft.irfft(spectrum, ticks, axis=1)
         crest = np.abs(waves).max(axis=1) / np.sqrt((waves**2).mean(axis=1))
-        best = waves[np.argmin(crest)]
-        return np.asarray(self.amplitude * best / np.abs(best).max())
+        smoothest_wave = waves[np.argmin(crest)]
+        return np.asarray(self.amplitude * smoothest_wave / np.abs(smoothest_wave).max())
 
     def _samples(self, rate_hz: float) -> Array:
         period = self.one_period(rate_hz)
@@ -310,8 +311,9 @@ class SineSteps(Signal):
         self._require_positive("measure_cycles", self.measure_cycles)
         self._require_not_negative("settle_s", self.settle_s)
         self._require_not_negative("measure_s", self.measure_s)
-        positive = all(np.isfinite(hz) and hz > 0.0 for hz in self.frequencies_hz)
-        if not positive or not self.frequencies_hz:
+        frequencies = np.array(self.frequencies_hz, dtype=np.float64)
+        are_positive = np.isfinite(frequencies) & (frequencies > 0.0)
+        if len(frequencies) == 0 or not are_positive.all():
             raise PlanError(
                 f"SineSteps.frequencies_hz are {self.frequencies_hz}; expected positive numbers."
             )
@@ -335,11 +337,13 @@ class SineSteps(Signal):
         tick = self._ramp(rate_hz)
         for stated_hz in self.frequencies_hz:
             cycles = max(self.measure_cycles, int(np.ceil(self.measure_s * stated_hz)))
-            measured = round(cycles * rate_hz / stated_hz)
-            exact = cycles * rate_hz / measured
-            settle = int(np.ceil(max(self.settle_cycles / exact, self.settle_s) * rate_hz))
-            windows.append((tick + settle, tick + settle + measured, exact))
-            tick += settle + measured
+            measured_ticks = round(cycles * rate_hz / stated_hz)
+            exact_hz = cycles * rate_hz / measured_ticks
+            settling_s = max(self.settle_cycles / exact_hz, self.settle_s)
+            first_tick = tick + int(np.ceil(settling_s * rate_hz))
+            end_tick = first_tick + measured_ticks
+            windows.append((first_tick, end_tick, exact_hz))
+            tick = end_tick
         return tuple(windows)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
@@ -347,9 +351,9 @@ class SineSteps(Signal):
         windows = self.windows(rate_hz)
         begin = self._ramp(rate_hz)
         frequency = np.full(windows[-1][1] + max(begin, 1), np.nan)
-        for _, end, exact in windows:
-            frequency[begin:end] = exact
-            begin = end
+        for _, end_tick, exact_hz in windows:
+            frequency[begin:end_tick] = exact_hz
+            begin = end_tick
         return frequency
 
     def _samples(self, rate_hz: float) -> Array:

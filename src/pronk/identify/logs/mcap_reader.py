@@ -117,7 +117,7 @@ def _command_topic(
     kinds = {}
     for message in messages:
         kinds[message.topic] = message.schema.name if message.schema else message.encoding
-    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items()))
+    listed = ", ".join(f"{topic} ({kinds[topic]})" for topic in sorted(kinds))
     if kinds.get(measured_topic) != JOINT_STATE:
         raise LogError(
             f"{path}: no {JOINT_STATE} on {measured_topic}; it holds {listed}; name the topic "
@@ -145,7 +145,7 @@ def _decode(path: Path, messages: Sequence[Record], topic: str) -> tuple[list[An
             continue
         try:
             decode = factory.decoder_for(message.encoding, message.schema)
-            decoded.append(None if decode is None else decode(message.data))
+            content = None if decode is None else decode(message.data)
         except Exception as error:
             # The decoder is generated from the file's own schema and may fail in any way.
             raise LogError(
@@ -157,6 +157,7 @@ def _decode(path: Path, messages: Sequence[Record], topic: str) -> tuple[list[An
                 f"{path}: messages on {topic} are encoded as {message.encoding!r} with schema "
                 f"{schema!r}; expected cdr with ros2msg."
             )
+        decoded.append(content)
         received.append(message.log_time * 1e-9)
     return decoded, np.array(received)
 
@@ -204,8 +205,7 @@ class _MessageTable:
         names = getattr(message, "name", None) or getattr(message, "joint_names", None) or ()
         joints = tuple(str(name) for name in names)
         values = f"{self._path}: the {len(numbers)} values of a message on {topic}"
-        single = len(numbers) == 1 and len(self._joints) == 1 and not joints
-        if single:
+        if len(numbers) == 1 and len(self._joints) == 1 and not joints:
             joints = self._joints
         else:
             joints = ordered_joints(values, len(numbers), self._robot, self._joint_order, joints)
@@ -222,16 +222,21 @@ class _MessageTable:
                 value = value[int(part)] if part.isdecimal() else getattr(value, part)
             except (AttributeError, IndexError, TypeError):
                 slots = getattr(value, "__slots__", ())
-                names = ", ".join(slot for slot in slots if not slot.startswith("_"))
-                there_are = f"; there are {names}" if names else ""
+                names = [slot for slot in slots if not slot.startswith("_")]
+                choices = ""
+                if names:
+                    choices = f"; there are {', '.join(names)}"
                 raise LogError(
                     f"{self._path}: messages on {topic} have no field {field!r} (at "
-                    f"{part!r}{there_are}); name it with --command-field."
+                    f"{part!r}{choices}); name it with --command-field."
                 ) from None
+        numbers = []
         try:
-            return [math.nan if math.isinf(number) else float(number) for number in value]
+            for number in value:
+                numbers.append(math.nan if math.isinf(number) else float(number))
         except TypeError:
             raise LogError(
                 f"{self._path}: field {field!r} of the messages on {topic} is not a list of "
                 "numbers; name another with --command-field."
             ) from None
+        return numbers

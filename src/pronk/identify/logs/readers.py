@@ -83,8 +83,8 @@ def readers() -> dict[str, Reader]:
                 f"entry point {point.value} of {GROUP} is no reader; expected a "
                 "pronk.identify.logs.readers.Reader."
             )
-        taken = _formats_by_suffix(by_format)
-        if reader.name in by_format or any(suffix in taken for suffix in reader.suffixes):
+        used_suffixes = _formats_by_suffix(by_format).keys() & set(reader.suffixes)
+        if reader.name in by_format or used_suffixes:
             raise LogError(
                 f"entry point {point.value} of {GROUP}: the format {reader.name!r} or one of its "
                 f"suffixes {', '.join(reader.suffixes)} is taken already."
@@ -119,20 +119,20 @@ def read_log(
     """
     path = Path(path)
     stated = ReadOptions() if options is None else options
-    known = readers()
-    format_name = stated.format or _format_of(path, known)
-    if format_name not in known:
-        raise LogError(f"{path}: format {format_name!r}; expected one of {', '.join(known)}.")
+    by_format = readers()
+    format_name = stated.format or _format_of(path, by_format)
+    if format_name not in by_format:
+        raise LogError(f"{path}: format {format_name!r}; expected one of {', '.join(by_format)}.")
     if format_name == "mcap" and path.is_dir():
         files = sorted(path.glob("*.mcap"))
         if len(files) != 1:
             raise LogError(f"{path}: {len(files)} MCAP files in it; name the one to read.")
         path = files[0]
-    reader = known[format_name]
-    foreign = [name for name in stated.stated() if name not in reader.options]
-    if foreign:
+    reader = by_format[format_name]
+    foreign_options = [name for name in stated.stated() if name not in reader.options]
+    if foreign_options:
         raise LogError(
-            f"{path}: {', '.join(foreign)} means nothing for the format {format_name}; it takes "
+            f"{path}: {', '.join(foreign_options)} means nothing for the format {format_name}; it takes "
             f"{', '.join(reader.options)}."
         )
     try:
@@ -195,8 +195,10 @@ def read_logs(
         LogError: As of `find_logs` and `read_log`.
     """
     files = find_logs(paths)
+    if len(files) < _WORTH_PROCESSES:
+        processes = 1
     read: Callable[[Path], JointLog] = partial(read_log, robot=robot, options=options)
-    return in_processes(read, files, processes=processes if len(files) >= _WORTH_PROCESSES else 1)
+    return in_processes(read, files, processes=processes)
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
@@ -211,31 +213,31 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
         if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
             logs.append(path)
             continue
-        inside = []
+        logs_inside = []
         for entry in sorted(path.iterdir()):
             is_artefact = f"/{entry.name}".endswith(_ARTEFACT_ENDINGS)
             if is_sage(entry) or (entry.suffix.lower() in suffixes and not is_artefact):
-                inside.append(entry)
-        if not inside:
+                logs_inside.append(entry)
+        if not logs_inside:
             raise LogError(
                 f"{path}: no logs in this folder; expected {', '.join(suffixes)} or SAGE folders."
             )
-        logs += inside
+        logs += logs_inside
     if not logs:
         raise LogError("no logs were named; give at least one file or folder.")
     return logs
 
 
-def _formats_by_suffix(known: Mapping[str, Reader]) -> dict[str, str]:
+def _formats_by_suffix(by_format: Mapping[str, Reader]) -> dict[str, str]:
     """Names of the formats by the endings of their files."""
     formats = {}
-    for reader in known.values():
+    for reader in by_format.values():
         for suffix in reader.suffixes:
             formats[suffix] = reader.name
     return formats
 
 
-def _format_of(path: Path, known: Mapping[str, Reader]) -> str:
+def _format_of(path: Path, by_format: Mapping[str, Reader]) -> str:
     """Format by the name of a file or the content of a folder."""
     if not path.exists():
         raise LogError(f"{path}: no such file or folder.")
@@ -248,11 +250,11 @@ def _format_of(path: Path, known: Mapping[str, Reader]) -> str:
             f"{path}: a folder, but no SAGE recording (control.csv, state_motor.csv, "
             "joint_list.txt) and no MCAP file in it."
         )
-    formats = _formats_by_suffix(known)
+    formats = _formats_by_suffix(by_format)
     suffix = path.suffix.lower()
     if suffix not in formats:
         raise LogError(
             f"{path}: the ending {path.suffix!r} names no known format; expected "
-            f"{', '.join(formats)} or a SAGE folder, or a format, one of {', '.join(known)}."
+            f"{', '.join(formats)} or a SAGE folder, or a format, one of {', '.join(by_format)}."
         )
     return formats[suffix]

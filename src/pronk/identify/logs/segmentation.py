@@ -61,14 +61,14 @@ class _Motion(NamedTuple):
 
     column: int
     """Column of the joint."""
-    first: int
+    begin: int
     """Last sample before the command moves."""
-    last: int
+    end: int
     """First sample after the command moved."""
 
     def values(self, command: Array) -> Array:
-        """Command of the joint during the motion [rad], shape (last - first + 1,)."""
-        return np.asarray(command[self.first : self.last + 1, self.column])
+        """Command of the joint during the motion [rad], shape (end - begin + 1,)."""
+        return np.asarray(command[self.begin : self.end + 1, self.column])
 
 
 def find_segments(time: Array, command: Array, joints: Sequence[str]) -> Segmentation:
@@ -89,29 +89,34 @@ def find_segments(time: Array, command: Array, joints: Sequence[str]) -> Segment
     excitations, pose_changes = _separate(time, command, motions)
     notes = []
     if pose_changes:
-        moved = dict.fromkeys(joints[motion.column] for motion in pose_changes)
-        notes.append(f"changes of pose of {', '.join(moved)} count as no excitation")
-    begin = min((motion.first for motion in excitations), default=0)
-    pose = command[begin].copy()
+        moved_joints = ", ".join(joints[column] for column in _by_column(pose_changes))
+        notes.append(f"changes of pose of {moved_joints} count as no excitation")
+    pose_sample = 0
+    if excitations:
+        pose_sample = min(motion.begin for motion in excitations)
+    pose = command[pose_sample].copy()
     segments: list[Segment] = []
-    for column in dict.fromkeys(motion.column for motion in excitations):
-        repeats = [motion for motion in excitations if motion.column == column]
+    for column, repeats in _by_column(excitations).items():
         amplitudes = _amplitudes(command, repeats)
         # Repeats begin alike, so that they have the same command from their first sample on.
-        lead = min(motion.first - _earliest_start(motion, motions) for motion in repeats)
+        lead = len(time)
+        for motion in repeats:
+            lead = min(lead, motion.begin - _earliest_start(motion, motions))
         for k, motion in enumerate(repeats):
             segments.append(
                 Segment(
                     kind="unknown",
                     joints=(joints[column],),
-                    start=float(time[motion.first - lead]),
+                    start=float(time[motion.begin - lead]),
                     stop=float(time[_latest_stop(motion, motions, len(time) - 1)]),
                     amplitude=amplitudes[k],
                     repeat=amplitudes[:k].count(amplitudes[k]),
                 )
             )
         if len(repeats) > 1:
-            counts = [f"{amplitudes.count(a)} at {a:.3g}" for a in dict.fromkeys(amplitudes)]
+            counts = []
+            for amplitude in dict.fromkeys(amplitudes):
+                counts.append(f"{amplitudes.count(amplitude)} at {amplitude:.3g}")
             notes.append(
                 f"{len(repeats)} excitations of {joints[column]} in its command: "
                 f"{', '.join(counts)}"
@@ -133,11 +138,19 @@ def _motions(time: Array, command: Array) -> list[_Motion]:
         if len(moves) == 0 or travel < MOVED_RAD:
             continue
         rests = np.flatnonzero(time[moves[1:]] - time[moves[:-1] + 1] >= REST_S)
-        firsts = moves[np.append(0, rests + 1)].tolist()
-        lasts = (moves[np.append(rests, -1)] + 1).tolist()
-        for first, last in zip(firsts, lasts, strict=True):
-            motions.append(_Motion(column, first, last))
+        begins = moves[np.append(0, rests + 1)].tolist()
+        ends = (moves[np.append(rests, -1)] + 1).tolist()
+        for begin, end in zip(begins, ends, strict=True):
+            motions.append(_Motion(column, begin, end))
     return motions
+
+
+def _by_column(motions: Sequence[_Motion]) -> dict[int, list[_Motion]]:
+    """Motions of each joint by its column, in the order of the motions."""
+    by_column: dict[int, list[_Motion]] = {}
+    for motion in motions:
+        by_column.setdefault(motion.column, []).append(motion)
+    return by_column
 
 
 def _separate(
@@ -150,18 +163,18 @@ def _separate(
     pose_changes = _pose_changes(command, motions)
     excitations = [motion for motion in motions if motion not in pose_changes]
     if pose_changes:
-        starts = command[[motion.first for motion in excitations]]
+        starts = command[[motion.begin for motion in excitations]]
         widest = max(np.ptp(motion.values(command)) for motion in excitations)
         if np.ptp(starts, axis=0).max() > _POSE_SLACK * widest:
             # The joints are excited in several poses, of which a log has one.
             excitations = list(motions)
             pose_changes = []
     separated = []
-    for column in dict.fromkeys(motion.column for motion in excitations):
-        repeats = [motion for motion in excitations if motion.column == column]
-        if not _are_repeats(time, command, repeats, motions):
-            repeats = [_Motion(column, repeats[0].first, repeats[-1].last)]
-        separated += repeats
+    for column, repeats in _by_column(excitations).items():
+        if _are_repeats(time, command, repeats, motions):
+            separated += repeats
+        else:
+            separated.append(_Motion(column, repeats[0].begin, repeats[-1].end))
     return separated, pose_changes
 
 
@@ -177,17 +190,21 @@ def _pose_changes(command: Array, motions: Sequence[_Motion]) -> list[_Motion]:
             signals.append(motion)
     if not signals:
         return []
+    ramps = [motion for motion in motions if motion not in signals]
     pose_changes: list[_Motion] = []
-    for column in range(command.shape[1]):
-        ramps = [motion for motion in motions if motion.column == column and motion not in signals]
-        alone = not any(
-            ramp.first < signal.last and signal.first < ramp.last
-            for ramp in ramps
-            for signal in signals
-        )
-        if alone and len(ramps) <= _MOST_POSE_CHANGES:
-            pose_changes += ramps
+    for joint_ramps in _by_column(ramps).values():
+        alone = not any(_overlaps(ramp, signals) for ramp in joint_ramps)
+        if alone and len(joint_ramps) <= _MOST_POSE_CHANGES:
+            pose_changes += joint_ramps
     return pose_changes
+
+
+def _overlaps(motion: _Motion, signals: Sequence[_Motion]) -> bool:
+    """Return True if a signal runs during a motion."""
+    for signal in signals:
+        if motion.begin < signal.end and signal.begin < motion.end:
+            return True
+    return False
 
 
 def _are_repeats(
@@ -195,12 +212,13 @@ def _are_repeats(
 ) -> bool:
     """Return True if motions of one joint are long enough and one signal, repeated or scaled."""
     for motion in repeats:
-        next_motion = min(
-            (later.first for later in motions if later.first >= motion.last), default=len(time) - 1
-        )
-        ends_at_rest = time[next_motion] - time[motion.last] >= _TAIL_S
+        next_motion = len(time) - 1
+        for later in motions:
+            if later.begin >= motion.end:
+                next_motion = min(next_motion, later.begin)
+        ends_at_rest = time[next_motion] - time[motion.end] >= _TAIL_S
         shortest = SHORTEST_S if ends_at_rest else _SHORTEST_IN_MOTION_S
-        if time[motion.last] - time[motion.first] < shortest:
+        if time[motion.end] - time[motion.begin] < shortest:
             return False
         if not _same_signal(time, command, repeats[0], motion):
             return False
@@ -225,7 +243,7 @@ def _same_signal(time: Array, command: Array, first: _Motion, second: _Motion) -
 
 def _normalized(time: Array, command: Array, motion: _Motion, rate_hz: float) -> Array:
     """Command during a motion on a uniform grid, from zero and with norm one, shape (samples,)."""
-    seconds = time[motion.first : motion.last + 1]
+    seconds = time[motion.begin : motion.end + 1]
     grid = np.arange(0.0, seconds[-1] - seconds[0], 1.0 / rate_hz)
     values = np.interp(grid, seconds - seconds[0], motion.values(command))
     moved = values - values[0]
@@ -247,13 +265,16 @@ def _amplitudes(command: Array, repeats: Sequence[_Motion]) -> list[float]:
 
 def _earliest_start(motion: _Motion, motions: Sequence[_Motion]) -> int:
     """Sample at which the segment of a motion may begin: in the middle of the rest before it."""
-    ends = [earlier.last for earlier in motions if earlier.last <= motion.first]
+    ends = [earlier.end for earlier in motions if earlier.end <= motion.begin]
     if not ends:
         return 0
-    return motion.first - (motion.first - max(ends)) // 2
+    return motion.begin - (motion.begin - max(ends)) // 2
 
 
-def _latest_stop(motion: _Motion, motions: Sequence[_Motion], last_sample: int) -> int:
+def _latest_stop(motion: _Motion, motions: Sequence[_Motion], end_of_log: int) -> int:
     """Sample at which the segment of a motion ends: where the next motion's segment may begin."""
-    starts = [_earliest_start(later, motions) for later in motions if later.first >= motion.last]
-    return min(starts, default=last_sample)
+    stop = end_of_log
+    for later in motions:
+        if later.begin >= motion.end:
+            stop = min(stop, _earliest_start(later, motions))
+    return stop

@@ -73,12 +73,12 @@ def _joint_log(path: Path, data: Mapping[str, Sequence[bytes]], damage: str) -> 
         )
     header = msgspec.json.decode(data[HEADER][-1], type=LogHeader)
     samples = _read_samples(data[SAMPLE])
-    last = float(samples.time[-1])
+    end_time = float(samples.time[-1])
     complete = False
     notes = []
     if damage or not data[END]:
         notes.append(
-            f"the file is cut short after {last:.3f} s ({damage or 'no end was written'}); "
+            f"the file is cut short after {end_time:.3f} s ({damage or 'no end was written'}); "
             "what was recorded before is whole"
         )
     else:
@@ -89,9 +89,11 @@ def _joint_log(path: Path, data: Mapping[str, Sequence[bytes]], damage: str) -> 
     segments = [_read_segment(message) for message in data[SEGMENT]]
     if len(set(segments)) < len(segments):
         raise LogError(f"{path}: damaged: it has the same segment twice; record again.")
-    # A segment that was cut ends with the last sample.
-    begun = [segment for segment in segments if segment.start < last]
-    recorded = [replace(segment, stop=min(segment.stop, last)) for segment in begun]
+    recorded = []
+    for segment in segments:
+        if segment.start < end_time:
+            # A segment that was cut ends with the last sample.
+            recorded.append(replace(segment, stop=min(segment.stop, end_time)))
     return JointLog(
         robot=header.robot,
         joints=header.joints,
@@ -152,20 +154,31 @@ class _Samples(NamedTuple):
 
 def _read_samples(messages: Sequence[bytes]) -> _Samples:
     """Parse samples block by block, so that their many lists live only for a moment."""
-    blocks = []
+    times = []
+    commands = []
+    positions = []
+    velocities = []
+    torques = []
+    frequencies = []
     for first in range(0, len(messages), _BLOCK):
-        block = messages[first : first + _BLOCK]
+        encoded = messages[first : first + _BLOCK]
         try:
-            blocks.append(_read_block(block))
+            block = _read_block(encoded)
         except (msgspec.MsgspecError, ValueError, TypeError) as error:
-            raise ValueError(f"samples {first} to {first + len(block) - 1}: {error}") from None
+            raise ValueError(f"samples {first} to {first + len(encoded) - 1}: {error}") from None
+        times.append(block.time)
+        commands.append(block.command)
+        positions.append(block.position)
+        velocities.append(block.velocity)
+        torques.append(block.torque)
+        frequencies.append(block.frequency)
     return _Samples(
-        time=np.concatenate([block.time for block in blocks]),
-        command=np.concatenate([block.command for block in blocks]),
-        position=np.concatenate([block.position for block in blocks]),
-        velocity=_joined([block.velocity for block in blocks]),
-        torque=_joined([block.torque for block in blocks]),
-        frequency=np.concatenate([block.frequency for block in blocks]),
+        time=np.concatenate(times),
+        command=np.concatenate(commands),
+        position=np.concatenate(positions),
+        velocity=_joined(velocities),
+        torque=_joined(torques),
+        frequency=np.concatenate(frequencies),
     )
 
 
@@ -173,14 +186,27 @@ def _read_block(messages: Sequence[bytes]) -> _Samples:
     samples = msgspec.json.decode(b"[" + b",".join(messages) + b"]", type=list[_Sample])
     if len(samples) != len(messages):
         raise ValueError(f"{len(samples)} samples in {len(messages)} messages")
+    times = []
+    commands = []
+    positions = []
+    velocities = []
+    torques = []
+    frequencies = []
+    for sample in samples:
+        times.append(sample.t)
+        commands.append(sample.command)
+        positions.append(sample.position)
+        velocities.append(sample.velocity)
+        torques.append(sample.torque)
+        frequencies.append(sample.frequency)
     return _Samples(
-        time=np.array([sample.t for sample in samples], dtype=np.float64),
-        command=np.array([sample.command for sample in samples], dtype=np.float64),
-        position=np.array([sample.position for sample in samples], dtype=np.float64),
-        velocity=_optional([sample.velocity for sample in samples]),
-        torque=_optional([sample.torque for sample in samples]),
+        time=np.array(times, dtype=np.float64),
+        command=np.array(commands, dtype=np.float64),
+        position=np.array(positions, dtype=np.float64),
+        velocity=_optional(velocities),
+        torque=_optional(torques),
         # A frequency of None becomes NaN.
-        frequency=np.array([sample.frequency for sample in samples], dtype=np.float64),
+        frequency=np.array(frequencies, dtype=np.float64),
     )
 
 
