@@ -201,10 +201,7 @@ def _pose_changes(command: Array, motions: Sequence[_Motion]) -> list[_Motion]:
 
 def _overlaps(motion: _Motion, signals: Sequence[_Motion]) -> bool:
     """Return True if a signal runs during a motion."""
-    for signal in signals:
-        if motion.begin < signal.end and signal.begin < motion.end:
-            return True
-    return False
+    return any(motion.begin < signal.end and signal.begin < motion.end for signal in signals)
 
 
 def _are_repeats(
