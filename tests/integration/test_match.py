@@ -260,7 +260,7 @@ def test_one_amplitude_does_not_tell_all_parameters_of_a_drive_apart() -> None:
     """Stiffness, damping, armature and friction trade against one another in one amplitude."""
     all_parameters = ("stiffness", "damping", "armature", "frictionloss", "delay")
     settings = MatchSettings(fitted=all_parameters)
-    with pytest.raises(IdentifiabilityError, match="FR_knee.*(stiffness|armature)"):
+    with pytest.raises(IdentifiabilityError, match=r"FR_knee.*(stiffness|armature)"):
         match([late_sweep(0.25)], ROBOT, mode="drive", settings=settings)
 
 
