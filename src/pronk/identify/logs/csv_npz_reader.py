@@ -91,7 +91,8 @@ def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
     if not joints:
         needed.append("position.JOINT")
     if has_command or not has_torque:
-        needed += [f"command.{joint}" for joint in joints]
+        for joint in joints:
+            needed.append(f"command.{joint}")
     missing = [name for name in needed if name not in names]
     if missing:
         raise LogError(
@@ -106,9 +107,9 @@ def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
             )
     arrays: dict[str, Array] = {}
     for quantity in QUANTITIES:
-        chosen = [f"{quantity}.{joint}" for joint in joints]
-        if all(name in names for name in chosen):
-            columns = [_column(path, header, rows, names[name]) for name in chosen]
+        column_names = [f"{quantity}.{joint}" for joint in joints]
+        if names.keys() >= set(column_names):
+            columns = [_column(path, header, rows, names[name]) for name in column_names]
             arrays[quantity] = np.stack(columns, axis=1)
     columns_of_file = Columns(
         origin=LogOrigin(source=str(path), sha256=sha256(path)),
@@ -185,7 +186,8 @@ def read_npz(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
         raise LogError(
             f"{path}: no array {', '.join(missing)}; it holds {', '.join(names_in_file) or 'none'}."
         )
-    check_size(path, sum(8 * array.size for array in arrays.values()), LogError)
+    numbers_in_file = sum(array.size for array in arrays.values())
+    check_size(path, 8 * numbers_in_file, LogError)
     joints = _text(path, arrays.pop("joints", np.empty(0, dtype=str)))
     numbers: dict[str, Array] = {}
     for name, array in arrays.items():

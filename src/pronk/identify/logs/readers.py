@@ -132,8 +132,8 @@ def read_log(
     foreign_options = [name for name in stated.stated() if name not in reader.options]
     if foreign_options:
         raise LogError(
-            f"{path}: {', '.join(foreign_options)} means nothing for the format {format_name}; it takes "
-            f"{', '.join(reader.options)}."
+            f"{path}: {', '.join(foreign_options)} means nothing for the format {format_name}; it "
+            f"takes {', '.join(reader.options)}."
         )
     try:
         log = reader.read(path, robot, stated)

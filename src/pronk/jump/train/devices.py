@@ -55,10 +55,13 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
     words = []
     if gpu_ids is not None:
         words = [word.strip() for word in gpu_ids.split(",")]
-    are_numbers = all(word.isdigit() for word in words)
-    are_different = len(set(words)) == len(words)
-    if words != ["all"] and not (are_numbers and are_different):
-        raise PronkError(f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all.")
+    if words != ["all"]:
+        are_numbers = all(word.isdigit() for word in words)
+        are_different = len(set(words)) == len(words)
+        if not (are_numbers and are_different):
+            raise PronkError(
+                f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all."
+            )
     if requested == "cpu":
         if words:
             raise PronkError(f"--gpu-ids {gpu_ids} goes with a GPU; leave it or --device cpu out.")
@@ -74,13 +77,17 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
         return ()
     if words == ["all"]:
         return gpus
-    numbers = [int(word) for word in words] or [0]
-    if max(numbers) >= len(gpus):
-        raise PronkError(
-            f"--gpu-ids {gpu_ids}: this host has {len(gpus)} visible GPU(s), numbered 0 to "
-            f"{len(gpus) - 1}."
-        )
-    return tuple(gpus[number] for number in numbers)
+    if not words:
+        return (gpus[0],)
+    chosen_gpus = []
+    for word in words:
+        if int(word) >= len(gpus):
+            raise PronkError(
+                f"--gpu-ids {gpu_ids}: this host has {len(gpus)} visible GPU(s), numbered 0 to "
+                f"{len(gpus) - 1}."
+            )
+        chosen_gpus.append(gpus[int(word)])
+    return tuple(chosen_gpus)
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -88,9 +95,10 @@ def visible_gpus() -> tuple[str, ...]:
     import torch
 
     count = torch.cuda.device_count()
-    all_numbers = ",".join(str(number) for number in range(count))
-    names = os.environ.get("CUDA_VISIBLE_DEVICES", all_numbers).split(",")
-    gpus = [name.strip() for name in names if name.strip()]
+    stated = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if stated is None:
+        return tuple(str(number) for number in range(count))
+    gpus = [name.strip() for name in stated.split(",") if name.strip()]
     # The variable may name more than there are.
     return tuple(gpus[:count])
 

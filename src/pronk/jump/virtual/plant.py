@@ -52,7 +52,9 @@ _STOP_S = 2e-3
 # Joints of a compliant stand, and their axes.
 _STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
 # Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
-_KP, _KD, _VMAX = 4, 6, 7
+_KP = 4
+_KD = 6
+_VMAX = 7
 _STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
 
 
@@ -98,10 +100,16 @@ class Plant:
                 "file written for that robot."
             )
         sim_params.check_joints(robot.joint_names)
-        joints = [joint for joint in robot.joints if limb_of(robot, joint.name) in legs]
-        names = [joint.name for joint in joints]
-        drives = [joint.drive for joint in joints]
-        params = [sim_params.joints[name] for name in names]
+        names: list[str] = []
+        drives: list[Drive] = []
+        params: list[JointParams] = []
+        columns: list[int] = []
+        for column, joint in enumerate(robot.joints):
+            if limb_of(robot, joint.name) in legs:
+                names.append(joint.name)
+                drives.append(joint.drive)
+                params.append(sim_params.joints[joint.name])
+                columns.append(column)
         model = _compiled_model(robot, sim_params, names, timestep_s, ground)
         self.model: Any = model  # mujoco.MjModel
         self.feet = _ids([])
@@ -113,17 +121,17 @@ class Plant:
         """Data to compute in, beside those of the run."""
         self.joints = tuple(names)
         """Joints in the plant, in file order."""
-        self.columns = _ids([robot.joint_names.index(name) for name in names])
+        self.columns = _ids(columns)
         """Places of the plant's joints among those of the robot."""
-        rotors = [model.joint(f"{name}/rotor") for name in names]
-        links = [model.joint(name) for name in names]
-        self.rotor = _ids([rotor.dofadr[0] for rotor in rotors])
+        rotors = [model.joint(f"{name}/rotor").id for name in names]
+        self.rotor = _ids(model.jnt_dofadr[rotors])
         """Places of the rotors in qvel."""
-        self.rotor_qpos = _ids([rotor.qposadr[0] for rotor in rotors])
+        self.rotor_qpos = _ids(model.jnt_qposadr[rotors])
         """Places of the rotors in qpos."""
-        self.link = _ids([link.dofadr[0] for link in links])
+        links = [model.joint(name).id for name in names]
+        self.link = _ids(model.jnt_dofadr[links])
         """Places of the links in qvel."""
-        self.link_qpos = _ids([link.qposadr[0] for link in links])
+        self.link_qpos = _ids(model.jnt_qposadr[links])
         """Places of the links in qpos."""
         self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])
         """Places of the motors in ctrl."""
@@ -136,22 +144,29 @@ class Plant:
         the ground."""
         if ground is None and math.isfinite(sim_params.fixture.stand_stiffness):
             self.stand = _ids([model.joint(name).dofadr[0] for name in _STAND_AXES])
-        torque_scale = np.array([joint_params.torque_scale for joint_params in params])
+        count = len(names)
         # Motor constants K0 that the drives assume [V s/rad].
-        self._believed = np.array([drive.motor[0] for drive in drives])
-        self.resistance = np.array([drive.motor[1] for drive in drives])
-        """Resistance of each motor [ohm]."""
-        self.constant = torque_scale * self._believed
+        self._believed = np.zeros(count)
+        self.constant = np.zeros(count)
         """Constant K of each motor [V s/rad]."""
-        self._effort_limit = torque_scale * np.array([drive.effort_limit for drive in drives])
-        self._lowest_torque = -self._effort_limit
-        gear_ratio = np.array([drive.gear_ratio for drive in drives])
-        rotor_inertia = np.array([joint_params.rotor_inertia for joint_params in params])
+        self.resistance = np.zeros(count)
+        """Resistance of each motor [ohm]."""
+        self._effort_limit = np.zeros(count)
         # Reflected through the gear [kg m^2], and viscous friction [N m s/rad].
-        self._rotor_inertia = rotor_inertia * gear_ratio**2
-        self._viscous = np.array([joint_params.viscous for joint_params in params])
-        self.encoder_offset = np.array([joint_params.encoder_offset for joint_params in params])
+        self._rotor_inertia = np.zeros(count)
+        self._viscous = np.zeros(count)
+        self.encoder_offset = np.zeros(count)
         """Reading of each encoder minus the true angle [rad]."""
+        for k, (drive, joint_params) in enumerate(zip(drives, params, strict=True)):
+            believed, resistance = drive.motor
+            self._believed[k] = believed
+            self.constant[k] = joint_params.torque_scale * believed
+            self.resistance[k] = resistance
+            self._effort_limit[k] = joint_params.torque_scale * drive.effort_limit
+            self._rotor_inertia[k] = joint_params.rotor_inertia * drive.gear_ratio**2
+            self._viscous[k] = joint_params.viscous
+            self.encoder_offset[k] = joint_params.encoder_offset
+        self._lowest_torque = -self._effort_limit
         self.inverters = model.actuator_gainprm[:, _VMAX]
         """Voltages at which the inverters clip, a view; every actuator of the plant is a motor
         [V]."""
@@ -263,10 +278,11 @@ def limb_of(robot: RobotSpec, name: str) -> str:
     joint = robot.joint(name)
     limb_joints = (name, *joint.chain, *joint.clamped)
     limb = [joint_name for joint_name in robot.joint_names if joint_name in limb_joints]
-    prefixes = {joint_name.split("_")[0] for joint_name in limb}
-    if len(prefixes) == 1:
-        return prefixes.pop()
-    return limb[0]
+    prefix = limb[0].split("_")[0]
+    for joint_name in limb:
+        if joint_name.split("_")[0] != prefix:
+            return limb[0]
+    return prefix
 
 
 def _compiled_model(

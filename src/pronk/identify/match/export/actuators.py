@@ -146,21 +146,37 @@ def _actuator(
     stiffness, damping = gain_pair
     drive = joints[0].drive
     group_gains = gains.groups[joints[0].group]
-    frictions = [source.frictionloss.value for source in sources]
-    stated_frictions = [friction for friction in frictions if not math.isnan(friction)]
+    names = []
+    maker_names = []
+    unmatched = []
+    for joint in joints:
+        names.append(joint.name)
+        maker_names.append(joint.own_name or joint.name)
+        if joint.name not in gains.joints:
+            unmatched.append(joint.name)
+    armatures = []
+    frictions = []
+    stribecks = []
+    delays_s = []
+    for source in sources:
+        armatures.append(source.armature.value)
+        stribecks.append(source.stribeck.value)
+        delays_s.append(source.delay_s.value)
+        if not math.isnan(source.frictionloss.value):
+            frictions.append(source.frictionloss.value)
     return Actuator(
         name=name,
-        joints=tuple(joint.name for joint in joints),
-        maker_joints=tuple(joint.own_name or joint.name for joint in joints),
-        unmatched=tuple(joint.name for joint in joints if joint.name not in gains.joints),
+        joints=tuple(names),
+        maker_joints=tuple(maker_names),
+        unmatched=tuple(unmatched),
         stiffness=stiffness,
         damping=damping,
         stiffness_range=_range_about(stiffness, group_gains.stiffness_range),
         damping_range=_range_about(damping, group_gains.damping_range),
-        armature=_mean([source.armature.value for source in sources], drive.armature),
-        frictionloss=_mean(stated_frictions, drive.frictionloss),
-        stribeck=_mean([source.stribeck.value for source in sources], 0.0),
-        delay_s=_mean([source.delay_s.value for source in sources], 0.0),
+        armature=_mean(armatures, drive.armature),
+        frictionloss=_mean(frictions, drive.frictionloss),
+        stribeck=_mean(stribecks, 0.0),
+        delay_s=_mean(delays_s, 0.0),
         drive=drive,
     )
 

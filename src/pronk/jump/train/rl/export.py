@@ -64,7 +64,14 @@ def contract_for(
     action = cfg.actions[actions.NAME]
     robot = load_robot(command.robot)
     gains = command.gains
-    joint_gains = [gains.groups[joint.group] for joint in robot.joints]
+    default_position = []
+    stiffness = []
+    damping = []
+    for joint in robot.joints:
+        group_gains = gains.groups[joint.group]
+        default_position.append(joint.default_position)
+        stiffness.append(group_gains.stiffness)
+        damping.append(group_gains.damping)
     shortest_delay, longest_delay = action.delay_steps
     command_ranges = {}
     for name, limit in zip(COMMANDS, command.limits, strict=True):
@@ -72,10 +79,10 @@ def contract_for(
     return Contract(
         robot=robot.name,
         joint_names=robot.joint_names,
-        default_position=tuple(joint.default_position for joint in robot.joints),
+        default_position=tuple(default_position),
         action_scale=(float(action.scale),) * len(robot.joints),
-        stiffness=tuple(group_gains.stiffness for group_gains in joint_gains),
-        damping=tuple(group_gains.damping for group_gains in joint_gains),
+        stiffness=tuple(stiffness),
+        damping=tuple(damping),
         gains=gains.name,
         # A contract has the hash of gains alone, not of the ranges about nominal ones.
         gains_sha256=gains.sha256 if gains.name == "matched" else "",
@@ -103,23 +110,24 @@ def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None
     """
     import onnx
 
-    input_sizes = {"measured": MEASURED_SIZE}
+    inputs = {"measured": torch.zeros(2, MEASURED_SIZE)}
     does = "walks"
     if contract.jump:
-        input_sizes["jump"] = 1
+        inputs["jump"] = torch.zeros(2, 1)
         does = "walks and jumps"
     outputs = ["action", *ESTIMATE]
+    batch_axes = {name: {0: "batch"} for name in (*inputs, *outputs)}
     with written_whole(path) as temporary_path:
         with warnings.catch_warnings():
             # mjlab uses the same exporter; newer versions of torch announce another.
             warnings.simplefilter("ignore", DeprecationWarning)
             torch.onnx.export(
                 _ExportedActor(actor),
-                tuple(torch.zeros(2, size) for size in input_sizes.values()),
+                tuple(inputs.values()),
                 temporary_path,
-                input_names=list(input_sizes),
+                input_names=list(inputs),
                 output_names=outputs,
-                dynamic_axes={name: {0: "batch"} for name in (*input_sizes, *outputs)},
+                dynamic_axes=batch_axes,
                 opset_version=OPSET,
                 dynamo=False,
             )
@@ -149,11 +157,16 @@ def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]
         Largest absolute difference of all outputs.
     """
     policy = load_policy(path)
-    names = ("measured", "jump") if policy.contract.jump else ("measured",)
-    inputs = [observations[name].detach().to("cpu", torch.float32) for name in names]
-    inference = policy.infer(*(value.numpy() for value in inputs))
+    measured = observations["measured"].detach().to("cpu", torch.float32)
+    exported = _ExportedActor(actor)
     with torch.no_grad():
-        expected = torch.cat(_ExportedActor(actor)(*inputs), dim=-1)
+        if policy.contract.jump:
+            jump = observations["jump"].detach().to("cpu", torch.float32)
+            inference = policy.infer(measured.numpy(), jump.numpy())
+            expected = torch.cat(exported(measured, jump), dim=-1)
+        else:
+            inference = policy.infer(measured.numpy())
+            expected = torch.cat(exported(measured), dim=-1)
     outputs = np.concatenate(
         [inference.action, inference.contact, inference.linear_velocity], axis=-1
     )
