@@ -10,6 +10,8 @@ Cell = str | int | float | tuple[float, float] | None
 
 NOT_MEASURED = "-"
 """Text of a cell without a finite number."""
+HELD = "held"
+"""Text of the interval of a value that was held and not fitted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,15 +30,18 @@ class Column:
         return f"{self.heading} [{self.unit}]" if self.unit else self.heading
 
     def text(self, cell: Cell) -> str:
-        """Return the text of a cell; an interval without width is a value that was held."""
+        """Return the text of a cell.
+
+        An interval of NaN, or without width, belongs to a value that was held and says so.
+        """
         if cell is None:
             return NOT_MEASURED
         if isinstance(cell, str | int):
             return str(cell)
         if isinstance(cell, tuple):
             lower, upper = cell
-            if lower == upper:
-                return "held"
+            if lower == upper or math.isnan(lower) or math.isnan(upper):
+                return HELD
             return f"{number(lower, self.digits)} to {number(upper, self.digits)}"
         return number(cell, self.digits)
 

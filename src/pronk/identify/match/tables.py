@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pronk.identify.match.gains import Interval
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.result import MatchResult
 from pronk.identify.match.torque_fit import UNITS
@@ -56,9 +55,9 @@ def gains_table(result: MatchResult) -> Table:
         row: list[Cell] = [f"{name} (flagged)" if gains.flags else name]
         for fitted in (gains.stiffness, gains.damping):
             row.append(fitted.value)
-            row.append(_interval(fitted.repeat95))
+            row.append(fitted.repeat95)
             if has_total:
-                row.append(_interval(fitted.total95))
+                row.append(fitted.total95)
         if has_friction:
             row.append(gains.frictionloss.value)
         if has_stribeck:
@@ -85,11 +84,6 @@ def gains_table(result: MatchResult) -> Table:
     return Table(
         title="Matched gains", columns=tuple(columns), rows=tuple(rows), notes=tuple(notes)
     )
-
-
-def _interval(interval: Interval) -> Cell:
-    """Return the cell of an interval; that of a value that was held says so."""
-    return interval if np.isfinite(interval).all() else "held"
 
 
 def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> Table:
