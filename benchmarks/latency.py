@@ -28,7 +28,7 @@ import tyro
 
 from benchmarks.runner import Progress, finish
 from pronk.cli import console
-from pronk.deploy.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
+from pronk.deploy.links.realtime import Histogram, Pace, RealTimeSettings, enter, sleep_until
 from pronk.deploy.runtime.policy_process import WARM_UP, standing, warm_up_until
 from pronk.errors import PronkError
 from pronk.jump.trial.criteria import Check
@@ -135,8 +135,8 @@ def _loop(case: Case, path: Path, seconds: float) -> Row:
         histograms[way]["decision"].add(time.monotonic() - begun)
         histograms[way]["network"].add(policy.network_s)
 
-    real_time = Wanted(priority=PRIORITY, core=0, lock=True)
-    granted = enter(real_time if case.real_time else Wanted(lock=False))
+    real_time = RealTimeSettings(priority=PRIORITY, core=0, lock=True)
+    granted = enter(real_time if case.real_time else RealTimeSettings(lock=False))
     once, ticked, warmed = WAYS
     for _ in range(WARM_UP):
         warm_up()

@@ -26,7 +26,7 @@ from typing import Any
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
 from pronk.deploy.bench.server import RobotServer, ServerTransport
 from pronk.deploy.links.address import Address
-from pronk.deploy.links.realtime import Wanted, enter
+from pronk.deploy.links.realtime import RealTimeSettings, enter
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.poses import RunTiming
@@ -89,7 +89,7 @@ def _serve(name: str, link: str, options: dict[str, int], end: Connection) -> No
     """Body of the robot's process; receives faults, and sends the time to damping."""
     die_with_parent()
     # A robot does not depend on how busy this computer is.
-    enter(Wanted(priority=_ROBOT_PRIORITY, lock=False))
+    enter(RealTimeSettings(priority=_ROBOT_PRIORITY, lock=False))
     robot = load_robot(name)
     machine = VirtualRobot(robot, load_sim_params(None, robot), base="ground", capture_rate_hz=None)
     machine.connect()

@@ -17,9 +17,13 @@ from pronk.errors import HardwareError
 if TYPE_CHECKING:
     from pronk.deploy.bench.server import ServerTransport
 
-_PRIORITY = 30  # of SCHED_FIFO; below that of the commanding process
+_PRIORITY = 30
+"""Priority of SCHED_FIFO, below that of the commanding process."""
 _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which the measured timing is not representative."""
+
+_CAPTURE_RATE_HZ = 1000.0
+"""Samples per second of a capture."""
 
 _SERVERS = {
     "lcm": "pronk.deploy.bench.lcm_server:LcmServerTransport",
@@ -71,7 +75,7 @@ def simulate(
     from pronk.deploy.bench.faults import parse_faults
     from pronk.deploy.bench.server import RobotServer, Watchdog
     from pronk.deploy.links.address import Address
-    from pronk.deploy.links.realtime import Interrupts, Wanted, enter
+    from pronk.deploy.links.realtime import Interrupts, RealTimeSettings, enter
     from pronk.jump.virtual.capture import save_capture
     from pronk.jump.virtual.robot import VirtualRobot, hold_of
     from pronk.jump.virtual.sim_params import load_sim_params
@@ -79,24 +83,36 @@ def simulate(
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
-    known, wrong = load_robot(robot), parse_faults(faults)
+    robot_spec = load_robot(robot)
+    link_faults = parse_faults(faults)
     watchdog = Watchdog(silence=silence, silence_after=silence_after)
-    of_lcm = layout if link == "lcm" else None
-    address = Address.parse(link, layout=of_lcm, port=port, domain=domain)
-    hidden, rate = load_sim_params(sim_params, known), 1000.0 if capture else None
-    machine = VirtualRobot(known, hidden, seed=seed, base=base, capture_rate_hz=rate)
+    lcm_layout = layout if link == "lcm" else None
+    address = Address.parse(link, layout=lcm_layout, port=port, domain=domain)
+    machine = VirtualRobot(
+        robot_spec,
+        load_sim_params(sim_params, robot_spec),
+        seed=seed,
+        base=base,
+        capture_rate_hz=None if capture is None else _CAPTURE_RATE_HZ,
+    )
     if realtime:
         # Before the wire is open, so that its threads are scheduled alike.
-        for granted in enter(Wanted(priority=_PRIORITY, lock=False)):
-            console.say(granted)
-    wire: ServerTransport = resolve_name(_SERVERS[link])(known, mode=mode, **address.options)
+        for line in enter(RealTimeSettings(priority=_PRIORITY, lock=False)):
+            console.say(line)
+    transport_class: Any = resolve_name(_SERVERS[link])
+    wire: ServerTransport = transport_class(robot_spec, mode=mode, **address.options)
     try:
         machine.connect()
         server = RobotServer(
-            machine, wire, hold=hold_of(known), faults=wrong, watchdog=watchdog, seed=seed
+            machine,
+            wire,
+            hold=hold_of(robot_spec),
+            faults=link_faults,
+            watchdog=watchdog,
+            seed=seed,
         )
         console.say(
-            f"ready: the virtual {known.name} on the {base}, seed {seed}, at {address}; "
+            f"ready: the virtual {robot_spec.name} on the {base}, seed {seed}, at {address}; "
             "Ctrl-C ends it"
         )
         end = time.monotonic() + (math.inf if duration is None else duration)
@@ -119,17 +135,20 @@ def simulate(
 def _report(figures: dict[str, Any]) -> None:
     """Print counts and punctuality."""
     wire: dict[str, int] = figures["wire"]
-    refused = sum(count for name, count in wire.items() if name.startswith("refused"))
-    late = figures["lateness"]
+    refused = 0
+    for name, count in wire.items():
+        if name.startswith("refused"):
+            refused += count
+    lateness = figures["lateness"]
     console.say(
         f"the virtual robot ran {figures['duration_s']:.1f} s: {wire.get('states', 0)} states, "
         f"{wire.get('commands', 0)} commands, {refused} messages refused; ticks late by "
-        f"{late['p50_ms']:.2f} ms (median), {late['p99_ms']:.2f} ms (p99); "
+        f"{lateness['p50_ms']:.2f} ms (median), {lateness['p99_ms']:.2f} ms (p99); "
         f"{100 * figures['cpu_share']:.0f} % of one core"
     )
-    if late["p99_ms"] > _LATE_MS:
+    if lateness["p99_ms"] > _LATE_MS:
         console.warn(
-            f"1 in 100 ticks was late by {late['p99_ms']:.0f} ms or more: this computer is too "
+            f"1 in 100 ticks was late by {lateness['p99_ms']:.0f} ms or more: this computer is too "
             "busy for timing measurements"
         )
     if figures["slipped_s"]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from pronk.deploy.bench.server import ServerTransport
@@ -23,8 +25,24 @@ from pronk.deploy.links.dds.link import (
 from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
-MODES = ("", "normal", "ai", "advanced", "mcf")  # that can hold the joints; the first is none
-_SERVICE_POLLS = 20  # polls of commands to one of requests: 10 ms at the virtual robot's rate
+MODES = ("", "normal", "ai", "advanced", "mcf")
+"""Controllers that can hold the joints; the first is none."""
+_SERVICE_POLLS = 20
+"""Polls of commands to one of requests: 10 ms at the virtual robot's rate."""
+
+Handler = Callable[[int, Any], tuple[int, Any]]
+"""Takes a function's number and its parameter, and returns a code and data."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Service:
+    """A service of the robot."""
+
+    requests: Any
+    """Reader of its requests."""
+    responses: Any
+    """Writer of its responses."""
+    handler: Handler
 
 
 class DdsServerTransport(ServerTransport):
@@ -40,16 +58,16 @@ class DdsServerTransport(ServerTransport):
         rival = link.Participant(network)
         self._commands = participant.reader(link.COMMANDS, messages.LowCmd)
         self._states = participant.writer(link.STATES, messages.LowState)
-        self._other = rival.writer(link.COMMANDS, messages.LowCmd)
-        # A handler takes a function's number and its parameter, and returns code and data.
-        self._services = [
-            (
-                participant.reader(f"rt/api/{name}/request", messages.Request),
-                participant.writer(f"rt/api/{name}/response", messages.Response),
-                handler,
+        self._rival = rival.writer(link.COMMANDS, messages.LowCmd)
+        self._services: list[_Service] = []
+        handlers = {link.SWITCHER: self._switch, link.BENCH: self._bench}
+        for name, handler in handlers.items():
+            service = _Service(
+                requests=participant.reader(f"rt/api/{name}/request", messages.Request),
+                responses=participant.writer(f"rt/api/{name}/response", messages.Response),
+                handler=handler,
             )
-            for name, handler in ((link.SWITCHER, self._switch), (link.BENCH, self._bench))
-        ]
+            self._services.append(service)
         self._polls = 0
 
     def poll(self) -> list[Command]:
@@ -73,50 +91,55 @@ class DdsServerTransport(ServerTransport):
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
-        write_bytes(self._other, encode_dds_command(self._joints, command), self.counts)
+        write_bytes(self._rival, encode_dds_command(self._joints, command), self.counts)
 
     def close(self) -> None:
         """Leave the wire."""
-        del self._commands, self._states, self._services, self._other
+        del self._commands, self._states, self._services, self._rival
 
     def _respond(self) -> None:
-        for requests, responses, handler in self._services:
-            for request in take_samples(requests, self.counts):
+        """Handle the requests that have come, of all services."""
+        for service in self._services:
+            for request in take_samples(service.requests, self.counts):
                 identity = request.header.identity
                 try:
                     parameter = json.loads(request.parameter or "null")
                 except (ValueError, RecursionError):
-                    code, data = BAD_PARAMETER, None
+                    code = BAD_PARAMETER
+                    data = None
                 else:
-                    code, data = handler(identity.api_id, parameter)
+                    code, data = service.handler(identity.api_id, parameter)
                 if code != DONE:
                     self.counts["refused: request"] += 1
                 status = messages.ResponseStatus(code=code)
                 header = messages.ResponseHeader(identity=identity, status=status)
                 text = "" if data is None else json.dumps(data)
-                responses.write(messages.Response(header=header, data=text, binary=[]))
+                service.responses.write(messages.Response(header=header, data=text, binary=[]))
 
     def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
-        """The service that reports and changes which controller holds the joints."""
+        """Report or change which controller holds the joints."""
         if api_id == link.CHECK_MODE:
             return DONE, {"form": "0", "name": self.mode}
-        if api_id not in (link.RELEASE_MODE, link.SELECT_MODE):
-            return UNKNOWN_API, None
-        name = ""
-        if api_id == link.SELECT_MODE:
-            name = parameter.get("name", "") if isinstance(parameter, dict) else ""
-            if name not in MODES[1:]:
+        if api_id == link.RELEASE_MODE:
+            mode = ""
+        elif api_id == link.SELECT_MODE:
+            mode = parameter.get("name", "") if isinstance(parameter, dict) else ""
+            if mode not in MODES[1:]:
                 return BAD_PARAMETER, None
-        self.mode = name
+        else:
+            return UNKNOWN_API, None
+        self.mode = mode
         self.counts["mode switches"] += 1
         return DONE, None
 
     def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
-        """The service that holds joints mechanically."""
+        """Hold joints mechanically."""
         if api_id != link.CLAMP:
             return UNKNOWN_API, None
         joints = parameter.get("joints") if isinstance(parameter, dict) else None
-        if not isinstance(joints, list) or not all(name in self._names for name in joints):
+        if not isinstance(joints, list):
             return BAD_PARAMETER, None
-        self.clamps = tuple(name for name in self._names if name in joints)
+        if not all(name in self._joint_names for name in joints):
+            return BAD_PARAMETER, None
+        self.clamps = tuple(name for name in self._joint_names if name in joints)
         return DONE, {"joints": list(self.clamps)}

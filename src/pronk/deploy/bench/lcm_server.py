@@ -19,8 +19,10 @@ from pronk.deploy.links.lcm.messages import (
 from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
-_BEACON_STATES = 50  # states between two beacons: 10 Hz
-_QUEUE = 1000  # messages read in one poll; a sender of more cannot stop the robot's time
+_BEACON_STATES = 50
+"""States between two beacons: 10 Hz."""
+_QUEUE = 1000
+"""Messages read in one poll; a sender of more cannot stop the robot's time."""
 
 
 class LcmServerTransport(ServerTransport):
@@ -35,17 +37,31 @@ class LcmServerTransport(ServerTransport):
         mode: str = "",
         url: str | None = None,
     ) -> None:
-        """Open the robot's end on a port of this computer, or at an LCM address of its own.
+        """Open the robot's end.
 
-        `mode` names the controller that holds the joints at first.
+        Args:
+            robot: The robot.
+            layout: Messages, a name of `LAYOUTS`.
+            port: UDP port on this computer; the virtual robot's if None.
+            mode: Controller that holds the joints at first, one of `CONTROL_MODES`.
+            url: An LCM address instead of the port.
         """
-        super().__init__(robot, mode, codec.CONTROL_MODES.values())
-        self._layout = known = find_layout(layout)
+        super().__init__(robot, mode, tuple(codec.CONTROL_MODES.values()))
+        self._layout = find_layout(layout)
+        if url is None:
+            url = url_of(port=port)
+        self._lcm = open_lcm(url)
         # Another writer is another sender.
-        self._lcm, self._other = (open_lcm(url or url_of(port=port)) for _ in range(2))
+        self._rival = open_lcm(url)
         self._arrived: list[Command] = []
-        self._bench_request, self._requested = 0, False
-        for channel in (known.command.channel, CONTROL_PARAMETER.channel, VIRTUAL_ROBOT.channel):
+        self._clamp_request = 0  # number of the last request for clamps
+        self._beacon_due = False
+        channels = (
+            self._layout.command.channel,
+            CONTROL_PARAMETER.channel,
+            VIRTUAL_ROBOT.channel,
+        )
+        for channel in channels:
             self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
 
     def poll(self) -> list[Command]:
@@ -53,8 +69,9 @@ class LcmServerTransport(ServerTransport):
         for _ in range(_QUEUE):
             if self._lcm.handle_timeout(0) == 0:
                 break
-        arrived, self._arrived = self._arrived, []
-        return arrived
+        commands = self._arrived
+        self._arrived = []
+        return commands
 
     def receive(self, channel: str, data: bytes) -> None:
         """Take one message, whatever it is. Never raises."""
@@ -67,27 +84,25 @@ class LcmServerTransport(ServerTransport):
                 self.counts["mode switches"] += 1
                 self._lcm.publish(RESPONSE_CHANNEL, data)
             elif channel == VIRTUAL_ROBOT.channel:
-                self._bench_request, self.clamps = codec.decode_clamps(self._names, data)
-                self._requested = True
+                self._clamp_request, self.clamps = codec.decode_clamps(self._joint_names, data)
+                self._beacon_due = True
 
     def publish(self, state: State) -> None:
         """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
-        messages = (self._layout.attitude, self._layout.joints)
-        for message, data in zip(
-            messages, codec.encode_lcm_state(self._layout, state), strict=True
-        ):
-            self._lcm.publish(message.channel, self.corrupt_out(data))
-        if self._requested or self.counts["states"] % _BEACON_STATES == 0:
-            self._requested = False
-            beacon = codec.encode_clamps(self._names, self.clamps, self._bench_request)
+        attitude, joints = codec.encode_lcm_state(self._layout, state)
+        self._lcm.publish(self._layout.attitude.channel, self.corrupt_out(attitude))
+        self._lcm.publish(self._layout.joints.channel, self.corrupt_out(joints))
+        if self._beacon_due or self.counts["states"] % _BEACON_STATES == 0:
+            self._beacon_due = False
+            beacon = codec.encode_clamps(self._joint_names, self.clamps, self._clamp_request)
             self._lcm.publish(BEACON_CHANNEL, beacon)
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
         data = codec.encode_lcm_command(self._layout, command)
-        self._other.publish(self._layout.command.channel, data)
+        self._rival.publish(self._layout.command.channel, data)
 
     def close(self) -> None:
         """Leave the wire."""
-        del self._lcm, self._other
+        del self._lcm, self._rival

@@ -10,7 +10,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,9 +27,12 @@ from pronk.robots.robot import RobotSpec
 
 Corrupt = Callable[[bytes], bytes]
 
-TICK_S = 0.5e-3  # period of polling the wire: commands act on the machine at a multiple of this
-_CONTEND_S = 0.01  # between two commands of the rival and of the robot's own controller
-_SLIP_S = 0.1  # lateness beyond which the machine's clock is put back instead of catching up
+TICK_S = 0.5e-3
+"""Period of polling the wire: commands act on the machine at a multiple of this [s]."""
+_CONTEND_S = 0.01
+"""Time between two commands of the rival, and of the robot's own controller [s]."""
+_SLIP_S = 0.1
+"""Lateness beyond which the machine's clock is put back instead of catching up [s]."""
 _BROKEN_FIELDS = ("position", "velocity", "gyro", "accelerometer", "orientation")
 
 
@@ -40,21 +43,22 @@ class ServerTransport(ABC):
     counted under its reason.
     """
 
-    def __init__(self, robot: RobotSpec, mode: str, modes: Iterable[str]) -> None:
+    def __init__(self, robot: RobotSpec, mode: str, modes: Sequence[str]) -> None:
         """Begin with a mode of the robot's own controller, one of `modes`."""
-        if mode not in (modes := tuple(modes)):
-            raise HardwareError(
-                f"mode {mode!r}; expected one of {', '.join(filter(None, modes))}, or none for "
-                "released."
-            )
-        # `commands`, `states`, and one `refused: REASON` for each reason to refuse.
+        if mode not in modes:
+            names = ", ".join(name for name in modes if name)
+            raise HardwareError(f"mode {mode!r}; expected one of {names}, or none for released.")
         self.counts: Counter[str] = Counter()
-        self.mode = mode  # the robot's own controller that holds the drives; "" when released
-        self.clamps: tuple[str, ...] = ()  # joints to hold mechanically, requested over the wire
-        # Applied to the bytes of commands before any check, and of states with their checksum.
+        """`commands`, `states`, and one `refused: REASON` for each reason to refuse."""
+        self.mode = mode
+        """Name of the robot's own controller that holds the drives; "" when released."""
+        self.clamps: tuple[str, ...] = ()
+        """Joints to hold mechanically, requested over the wire."""
         self.corrupt_in: Corrupt = bytes
+        """Applied to the bytes of commands before any check."""
         self.corrupt_out: Corrupt = bytes
-        self._names = robot.joint_names
+        """Applied to the bytes of states with their checksum."""
+        self._joint_names = robot.joint_names
 
     @abstractmethod
     def poll(self) -> list[Command]:
@@ -86,8 +90,8 @@ class Watchdog(Bounded):
     """What the drives do when commands stop."""
 
     silence: Literal["hold", "zero", "damp"] = "hold"
-    """Go on with the last command for ever (the bridge of walk-these-ways, spi_debug_cmd), no
-    torque (the motors' own time-out), or damping."""
+    """`hold`: go on with the last command for ever (the bridge of walk-these-ways, spi_debug_cmd);
+    `zero`: no torque (the motors' own time-out); `damp`: damping."""
     silence_after: Annotated[float, Meta(gt=0.0)] = 0.1
     """Time without a command after which they do it [s]."""
 
@@ -105,24 +109,38 @@ class RobotServer:
         watchdog: Watchdog | None = None,
         seed: int = 0,
     ) -> None:
-        """`hold` is commanded by a rival and the robot's own controller; `seed` is of faults."""
-        self.counts: Counter[str] = Counter()  # `commands applied`, `silences`, `slips` and others
-        self._machine, self._wire, self._hold = machine, wire, hold
-        self._faults = known = faults or Faults()
-        self._watchdog = watchdog or Watchdog()
-        self._commands = FaultChannel[Command](known.command, after=known.after, seed=2 * seed)
-        self._states = FaultChannel[State](known.state, after=known.after, seed=2 * seed + 1)
+        """Serve a machine on a wire.
+
+        Args:
+            machine: The virtual robot, connected.
+            wire: The robot's end of the wire.
+            hold: Command of a rival and of the robot's own controller.
+            faults: Faults; none if None.
+            watchdog: What the drives do when commands stop; the usual if None.
+            seed: Seed of the faults.
+        """
+        self.counts: Counter[str] = Counter()
+        """`commands applied`, `silences`, `slips`, `clamps refused`, `commands of others`."""
+        self._machine = machine
+        self._wire = wire
+        self._hold = hold
+        self._faults = Faults() if faults is None else faults
+        self._watchdog = Watchdog() if watchdog is None else watchdog
+        after = self._faults.after
+        self._commands = FaultChannel[Command](self._faults.command, after=after, seed=2 * seed)
+        self._states = FaultChannel[State](self._faults.state, after=after, seed=2 * seed + 1)
         self._now = machine.now()
         self._last_command = math.inf
         self._contended = -math.inf
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
         self._sound: State | None = None  # the last state before a sensor's fault
-        self._sensor = known.sensor
-        # From the begin of a sensor's fault to the first damping; None before that [s].
+        self._sensor = self._faults.sensor
         self.damped_s: float | None = None
-        self._slipped, self._worked = 0.0, time.process_time()
-        self._late = Histogram()
+        """Time from the beginning of a sensor's fault to the first damping, None before it [s]."""
+        self._slipped_s = 0.0
+        self._cpu_start_s = time.process_time()
+        self._lateness = Histogram()
         wire.corrupt_in = partial(self._flip, self._commands)
         wire.corrupt_out = partial(self._flip, self._states)
 
@@ -135,9 +153,11 @@ class RobotServer:
             self._last_command = until
             self._machine.send(command)
             self.counts["commands applied"] += 1
-            began = math.inf if self._sensor is None else self._sensor[1]
-            if self.damped_s is None and until >= began and not command.stiffness.any():
-                self.damped_s = until - began
+            fault_start = math.inf
+            if self._sensor is not None:
+                _, fault_start = self._sensor
+            if self.damped_s is None and until >= fault_start and not command.stiffness.any():
+                self.damped_s = until - fault_start
         silent = until - self._last_command > self._watchdog.silence_after
         if silent and self._watchdog.silence != "hold":
             self.counts["silences"] += 1
@@ -168,7 +188,7 @@ class RobotServer:
         # What was built until now lives as long as the server; the collector need not walk it.
         gc.freeze()
         start = time.monotonic() - self._machine.now()
-        self._worked = time.process_time()
+        self._cpu_start_s = time.process_time()
         ticks = round(self._machine.now() / TICK_S)
         while not stop():
             ticks += 1
@@ -176,13 +196,14 @@ class RobotServer:
             late = time.monotonic() - start - ticks * TICK_S
             if late > _SLIP_S:
                 self.counts["slips"] += 1
-                self._slipped += late
+                self._slipped_s += late
                 start += late
-            self._late.add(late)
+            self._lateness.add(late)
             self.step(ticks * TICK_S)
 
     def figures(self) -> dict[str, object]:
         """Counts of server, wire and faults, lateness of ticks, and share of one core."""
+        cpu_s = time.process_time() - self._cpu_start_s
         return {
             "virtual": True,
             "duration_s": self._now,
@@ -190,13 +211,14 @@ class RobotServer:
             "wire": dict(self._wire.counts),
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
-            "slipped_s": self._slipped,
+            "slipped_s": self._slipped_s,
             "damped_s": self.damped_s,
-            "cpu_share": (time.process_time() - self._worked) / max(self._now, TICK_S),
-            "lateness": self._late.figures(),
+            "cpu_share": cpu_s / max(self._now, TICK_S),
+            "lateness": self._lateness.figures(),
         }
 
     def _contend(self, now: float) -> None:
+        """Command the joints as a rival or the robot's own controller, when it is due."""
         rival = self._faults.rival is not None and now >= self._faults.rival
         if (rival or self._wire.mode) and now - self._contended >= _CONTEND_S:
             self._contended = now
@@ -204,27 +226,41 @@ class RobotServer:
             self._wire.contend(self._hold)
 
     def _reported(self, state: State) -> State:
-        """The state as it goes out: the measured one, unless a fault is due."""
-        now, faults = self._now, self._faults
-        stamp = state.time if state.robot_time is None else state.robot_time
-        if faults.clock is not None and now >= faults.clock[0]:
-            stamp += faults.clock[1]
-        if faults.freeze is not None and faults.freeze[0] <= now < sum(faults.freeze):
-            self._frozen = self._frozen or state
-            state = replace(self._frozen, time=state.time, sequence=state.sequence)
-        else:
+        """Make the state that goes out: the measured one, unless a fault is due."""
+        now = self._now
+        robot_time = state.time if state.robot_time is None else state.robot_time
+        if self._faults.clock is not None:
+            jump_time, jump = self._faults.clock
+            if now >= jump_time:
+                robot_time += jump
+        frozen = False
+        if self._faults.freeze is not None:
+            freeze_start, freeze_length = self._faults.freeze
+            frozen = freeze_start <= now < freeze_start + freeze_length
+        if not frozen:
             self._frozen = None
-        if self._sensor is None or not self._sensor[0] or now < self._sensor[1]:
+        elif self._frozen is None:
+            self._frozen = state
+        else:
+            state = replace(self._frozen, time=state.time, sequence=state.sequence)
+        fault = ""
+        if self._sensor is not None:
+            fault, fault_start = self._sensor
+            if now < fault_start:
+                fault = ""
+        if not fault:
             self._sound = state
         else:
-            state = spoiled(self._sensor[0], self._sound or state, state)
+            state = spoiled(fault, self._sound or state, state)
         if self._states.strikes("nan", now):
             name = _BROKEN_FIELDS[self._states.pick(len(_BROKEN_FIELDS))]
             values = getattr(state, name).copy()
             values[self._states.pick(len(values))] = math.nan
             state = replace(state, **{name: values})
-        return replace(state, robot_time=stamp)
+        return replace(state, robot_time=robot_time)
 
     def _flip(self, channel: FaultChannel[Command] | FaultChannel[State], data: bytes) -> bytes:
-        struck = bool(data) and channel.strikes("flip", self._now)
-        return flip_bit(data, channel.pick(8 * len(data))) if struck else data
+        """Invert one bit of a message of a channel, when such a fault strikes."""
+        if data and channel.strikes("flip", self._now):
+            return flip_bit(data, channel.pick(8 * len(data)))
+        return data

@@ -24,8 +24,10 @@ from typing import Any, Self
 
 import numpy as np
 
-_LOCK_NOW_AND_LATER = 3  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
-_LEAST_CORES = 4  # of which one can be reserved
+_LOCK_NOW_AND_LATER = 3
+"""MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
+_LEAST_CORES = 4
+"""Smallest number of cores of which one can be reserved."""
 
 TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
 r"""Ctrl-C, Ctrl-\, Ctrl-Z, and the terminal's end."""
@@ -34,15 +36,18 @@ ENDING = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """Settings that a process requests."""
+class RealTimeSettings:
+    """Settings that a process requests of the operating system."""
 
-    priority: int | None = None  # of SCHED_FIFO, 1 to 99; None for ordinary scheduling
-    core: int | None = None  # the only one to run on, counted from the last; None for any
-    lock: bool = True  # keep its memory from being paged out
+    priority: int | None = None
+    """Priority of SCHED_FIFO, 1 to 99; None for ordinary scheduling."""
+    core: int | None = None
+    """The only core to run on, counted from the last; None for any."""
+    lock: bool = True
+    """Whether its memory is kept from being paged out."""
 
 
-def enter(wanted: Wanted) -> tuple[str, ...]:
+def enter(settings: RealTimeSettings) -> tuple[str, ...]:
     """Request settings for this process; return one line for each, granted or refused.
 
     Garbage collection stops for good: a collection in a loop takes milliseconds.
@@ -51,16 +56,17 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
     gc.freeze()
     gc.disable()
     lines = []
-    if wanted.priority is not None:
-        lines.append(f"real-time scheduling: {_granted(_schedule, wanted.priority)}")
-    if wanted.core is not None:
-        lines.append(f"core of its own: {_granted(_pin, wanted.core)}")
-    if wanted.lock:
+    if settings.priority is not None:
+        lines.append(f"real-time scheduling: {_granted(_schedule, settings.priority)}")
+    if settings.core is not None:
+        lines.append(f"core of its own: {_granted(_pin, settings.core)}")
+    if settings.lock:
         lines.append(f"memory: {_granted(_lock)}")
     return tuple(lines)
 
 
 def _granted(request: Callable[..., str], *values: int) -> str:
+    """Make a request of the operating system; return what was granted, or why it was refused."""
     try:
         return request(*values)
     except (AttributeError, TypeError):
@@ -81,9 +87,9 @@ def _pin(core: int) -> str:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < _LEAST_CORES:
         return f"{len(cores)} cores are too few to reserve one"
-    mine = cores[-1 - core % len(cores)]
-    os.sched_setaffinity(0, {mine})
-    return f"number {mine}"
+    reserved = cores[-1 - core % len(cores)]
+    os.sched_setaffinity(0, {reserved})
+    return f"number {reserved}"
 
 
 def _lock() -> str:
@@ -96,8 +102,9 @@ def _lock() -> str:
 def sleep_until(deadline: float) -> None:
     """Sleep to a time of CLOCK_MONOTONIC [s]; return at once if it has passed."""
     # Even a sleep of 0 s gives the core away, and takes the timer slack of 50 us.
-    if (left := deadline - time.monotonic()) > 0.0:
-        time.sleep(left)
+    remaining = deadline - time.monotonic()
+    if remaining > 0.0:
+        time.sleep(remaining)
 
 
 class Pace:
@@ -107,12 +114,14 @@ class Pace:
         """Begin with tick 0 due at `start` on CLOCK_MONOTONIC [s], by default now."""
         self.rate_hz = rate_hz
         self.start = time.monotonic() if start is None else start
-        self.tick = 0  # the next one
-        self.missed = 0  # ticks that had passed before they could be run
+        self.tick = 0
+        """Number of the next tick."""
+        self.missed = 0
+        """Number of ticks that had passed before they could be run."""
 
     @property
     def deadline(self) -> float:
-        """Of the next tick [s]."""
+        """Time of the next tick [s]."""
         return self.start + self.tick / self.rate_hz
 
     def advance(self, now: float) -> None:
@@ -122,21 +131,22 @@ class Pace:
         self.tick = following
 
 
-_PER_DECADE = 50
-_LOWEST = 1e-7
+_BINS_PER_DECADE = 50
+_SHORTEST_S = 1e-7
 
 
 class Histogram:
     """Durations in bins of 4.7 % width from 0.1 us to 10 s."""
 
     def __init__(self) -> None:
-        self.counts = np.zeros(8 * _PER_DECADE + 1, dtype=np.int64)
+        self.counts = np.zeros(8 * _BINS_PER_DECADE + 1, dtype=np.int64)
         self.count = 0
-        self.largest = 0.0  # [s]
+        self.largest = 0.0
+        """Longest duration [s]."""
 
     def add(self, seconds: float) -> None:
         """Count a duration."""
-        place = math.log10(max(seconds, _LOWEST) / _LOWEST) * _PER_DECADE
+        place = math.log10(max(seconds, _SHORTEST_S) / _SHORTEST_S) * _BINS_PER_DECADE
         self.counts[min(int(place), len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, seconds)
@@ -147,13 +157,18 @@ class Histogram:
             return math.nan
         rank = max(1, math.ceil(share * self.count - 1e-9))
         i = int(np.searchsorted(np.cumsum(self.counts), rank))
-        return min(_LOWEST * math.pow(10.0, (i + 1) / _PER_DECADE), self.largest)
+        return min(_SHORTEST_S * math.pow(10.0, (i + 1) / _BINS_PER_DECADE), self.largest)
 
     def figures(self) -> dict[str, float | int]:
         """Count, quantiles and maximum [ms]."""
-        shares = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99, "p99_9_ms": 0.999}
-        quantiles = {name: 1e3 * self.quantile(share) for name, share in shares.items()}
-        return {"n": self.count, **quantiles, "max_ms": 1e3 * self.largest}
+        return {
+            "n": self.count,
+            "p50_ms": 1e3 * self.quantile(0.5),
+            "p95_ms": 1e3 * self.quantile(0.95),
+            "p99_ms": 1e3 * self.quantile(0.99),
+            "p99_9_ms": 1e3 * self.quantile(0.999),
+            "max_ms": 1e3 * self.largest,
+        }
 
 
 @contextmanager
@@ -180,7 +195,8 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.received = False  # since the last check
+        self.received = False
+        """Whether a signal has come since the last check."""
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:

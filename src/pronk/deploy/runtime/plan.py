@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.link import ClampOperator, Freshness, LinkSettings
-from pronk.deploy.links.realtime import Wanted
+from pronk.deploy.links.realtime import RealTimeSettings
 from pronk.deploy.runtime.limits import AgeLimits, Limits
 from pronk.deploy.runtime.poses import RunTiming
 from pronk.deploy.runtime.sweep import STALE_S, SweepTask
@@ -131,6 +131,10 @@ class RunPlan:
         """Silence of the servo that is a fault [s]; in a sweep that of the states, if longer."""
         return self.standby_s if self.sweep is None else max(self.standby_s, STALE_S)
 
-    def wanted(self, priority: int, core: int) -> Wanted:
+    def real_time_settings(self, priority: int, core: int) -> RealTimeSettings:
         """Return what a process requests of the operating system."""
-        return Wanted(priority=priority, core=core) if self.real_time else Wanted(lock=False)
+        return (
+            RealTimeSettings(priority=priority, core=core)
+            if self.real_time
+            else RealTimeSettings(lock=False)
+        )

@@ -91,7 +91,7 @@ def serve_policy(plan: RunPlan, name: str, end: Connection) -> None:
     assert plan.policy is not None
     shared = Shared(name, len(plan.robot.joints))
     process = PolicyProcess(plan, shared, load_policy(plan.policy))
-    for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
+    for line in enter(plan.real_time_settings(POLICY_PRIORITY, 1)):
         notice = event_record(time.monotonic(), "system", f"policy: {line}")
         shared.policy_events.put(notice)
     run_to_end(process, shared, end)

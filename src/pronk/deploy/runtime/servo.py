@@ -202,7 +202,7 @@ class Servo:
         """Connect the machine and begin the pre-flight checks."""
         # Before the link starts threads: they inherit the priority, and so never hold the
         # interpreter's lock while something less urgent runs.
-        for line in enter(self.plan.wanted(SERVO_PRIORITY, 0)):
+        for line in enter(self.plan.real_time_settings(SERVO_PRIORITY, 0)):
             self._report("system", line)
         sys.setswitchinterval(_SWITCH_S)
         machine.connect()

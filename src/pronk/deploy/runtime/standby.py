@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 
 from pronk.deploy.links.link import NetworkLink
-from pronk.deploy.links.realtime import Wanted, enter, leave, sleep_until
+from pronk.deploy.links.realtime import RealTimeSettings, enter, leave, sleep_until
 from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import DRIVEN, Mode
 from pronk.deploy.runtime.plan import STANDBY_PRIORITY, RunPlan
@@ -54,7 +54,11 @@ def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
     end.send_bytes(b"\1" if damp is not None else b"\0")
     if damp is None:
         return
-    enter(Wanted(priority=STANDBY_PRIORITY) if plan.real_time else Wanted(lock=False))
+    enter(
+        RealTimeSettings(priority=STANDBY_PRIORITY)
+        if plan.real_time
+        else RealTimeSettings(lock=False)
+    )
     shared = Shared(name, len(plan.robot.joints))
     parent = os.getppid()
     record = np.zeros((), STANDBY)
