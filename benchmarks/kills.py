@@ -37,7 +37,7 @@ from pronk.deploy.runtime.run import Deployment
 from pronk.errors import PronkError
 from pronk.files import read_yaml
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match import result as match_file
+from pronk.identify.match.result import load_match
 from pronk.jump.trial import results
 from pronk.jump.virtual import capture
 from tests.deploy_strikes import TIMING, WALKING_ROBOT, begin_to_walk, drive_until, motion_of
@@ -184,7 +184,7 @@ def _torn(folder: Path) -> list[str]:
                 if path.stat().st_size > _EMPTY:
                     (read_deploy_log if is_deploy_log(path) else read_log)(path)
             elif path.name == "match.npz":
-                match_file.load(path)
+                load_match(path)
             elif path.suffix == ".npz":
                 capture.load_capture(path)
             elif path.suffix == ".yaml":

@@ -13,7 +13,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.checks import check_motion, check_radians
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.checks import check_recordings
+from pronk.identify.match.checks import check_excitations
 from pronk.robots.robot import RobotSpec
 
 COLUMNS = ("command", "position", "velocity", "torque", "frequency")
@@ -41,10 +41,10 @@ def judge(case: Case) -> tuple[set[str], str]:
     """
     try:
         check_radians(case.log, case.joint)
-        recordings = case.log.excitations(case.joint)
-        for recording in recordings:
-            check_motion(recording)
-        flags = check_recordings(recordings, case.robot)
+        excitations = case.log.excitations(case.joint)
+        for excitation in excitations:
+            check_motion(excitation)
+        flags = check_excitations(excitations, case.robot)
     except LogError as error:
         return {REFUSED}, str(error)
     return {flag.split(":")[0] for flag in flags}, "; ".join(flags)

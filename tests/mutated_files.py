@@ -49,9 +49,9 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import records
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
-from pronk.identify.match import result as match_file
 from pronk.identify.match.export.targets import export
 from pronk.identify.match.predict import load_prediction
+from pronk.identify.match.result import load_match
 from pronk.identify.response import response as response_file
 from pronk.jump.trial import results
 from pronk.jump.trial.conditions import TOLERANCE_FILE, read_conditions
@@ -192,7 +192,7 @@ def _kinds() -> dict[str, _Kind]:
                 write_text(path.parent / "out" / "a.py", export(found, target))
 
     def match(path: Path) -> Any:
-        return match_file.load(path)
+        return load_match(path)
 
     def model(path: Path) -> None:
         read_model.cache_clear()

@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image
 
 from pronk.identify.match import gains as gains_file
-from pronk.identify.match import result as match_file
 from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import GroupGains
 from pronk.identify.match.predict import JointPrediction, Prediction, save_prediction
@@ -21,6 +20,7 @@ from pronk.identify.match.result import (
     MatchResult,
     ZeroArmature,
     joint_gains,
+    save_match,
 )
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.info import SimulatorInfo
@@ -202,7 +202,7 @@ def joint_prediction() -> JointPrediction:
 
 def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) -> Path:
     gains_file.save_gains(folder / "gains.yaml", result.gains)
-    match_file.save(folder / "match.npz", result)
+    save_match(folder / "match.npz", result)
     if prediction:
         fresh = Prediction(
             joints=(joint_prediction(),), virtual=result.gains.virtual, source="fresh.mcap"

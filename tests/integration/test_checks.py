@@ -12,7 +12,7 @@ from corrupted_logs import CORRUPTIONS, REFUSED, Case, judge, without_extra_colu
 from pronk.deploy.bench.virtual_sweep import sweep_virtual
 from pronk.identify.excitation.plan import make_plan
 from pronk.identify.logs.readers import read_logs
-from pronk.identify.match.checks import check_recordings, check_response, slow_response
+from pronk.identify.match.checks import check_excitations, check_response, slow_response
 from pronk.identify.response.estimate import estimate_response
 from pronk.robots import load_robot
 from virtual_robot import ROBOT, SIM_PARAMS
@@ -102,4 +102,4 @@ def test_recordings_of_an_arm_pass() -> None:
     folders = sorted(path for path in SO101.glob("*") if path.is_dir())
     for log in read_logs(folders, robot=robot):
         for joint in log.excited_joints:
-            assert check_recordings(log.excitations(joint), robot) == (), (log.source, joint)
+            assert check_excitations(log.excitations(joint), robot) == (), (log.source, joint)

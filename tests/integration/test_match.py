@@ -14,10 +14,9 @@ from pronk.errors import ArtefactError, IdentifiabilityError, LogError, PronkErr
 from pronk.identify.excitation.signals import Multisine
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match import gains as gains_file
-from pronk.identify.match import result as result_file
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
-from pronk.identify.match.result import MatchResult
+from pronk.identify.match.result import MatchResult, load_match, save_match
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.response import Estimator
 from pronk.robots import load_robot
@@ -128,9 +127,9 @@ def test_the_gains_name_their_simulator_logs_and_groups(matched: MatchResult) ->
 
 def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path) -> None:
     gains_file.save_gains(tmp_path / "gains.yaml", matched.gains)
-    result_file.save(tmp_path / "match.npz", matched)
+    save_match(tmp_path / "match.npz", matched)
     gains = gains_file.load_gains(tmp_path / "gains.yaml")
-    loaded = result_file.load(tmp_path / "match.npz")
+    loaded = load_match(tmp_path / "match.npz")
     assert set(gains.joints) == set(KNOWN)
     assert repr(loaded) == repr(matched)
     knee = loaded.joints["FR_knee"]

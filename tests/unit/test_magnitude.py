@@ -136,8 +136,12 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
         targets.append(known_target(joint, length_s=4.0, stop_hz=18.0, segment_s=2.0))
     stiffness, damping = grid_axes(ROBOT)
     shares: list[float] = []
+
+    def progress(stage: str, share: float) -> None:
+        shares.append(share)
+
     with MujocoSimulator(ROBOT) as simulator:
-        searches = search_grid(simulator, targets, stiffness, damping, progress=shares.append)
+        searches = search_grid(simulator, targets, stiffness, damping, progress=progress)
         assert simulator.steps == 2500 * max(target.steps for target in targets)
     for target, search in zip(targets, searches, strict=True):
         assert search.error.shape == (50, 50)

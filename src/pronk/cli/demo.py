@@ -152,9 +152,9 @@ def sweep_and_match(
     from pronk.identify.excitation.signals import Chirp, LogChirp, Signal
     from pronk.identify.logs.readers import read_logs
     from pronk.identify.match import gains as gains_file
-    from pronk.identify.match import result as result_file
     from pronk.identify.match.match import match
     from pronk.identify.match.predict import Prediction, predict, save_prediction
+    from pronk.identify.match.result import save_match
     from pronk.identify.response.response import save_responses
     from pronk.jump.virtual.sim_params import load_sim_params
 
@@ -179,7 +179,7 @@ def sweep_and_match(
     logs = read_logs(paths, processes=cpus, robot=robot)
     result = match(logs, robot, progress=report)
     gains_file.save_gains(out / "gains.yaml", result.gains)
-    result_file.save(out / "match.npz", result)
+    save_match(out / "match.npz", result)
     for name, joint in result.joints.items():
         if joint.responses is not None:
             path = out / "logs" / f"{file_name(name)}.response.npz"

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
     "response": ("pronk.cli.response:response", "Estimate frequency responses; Bode plots."),
-    "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
+    "match": (
+        "pronk.cli.match:match_command",
+        "Find the gains with which the simulator responds alike.",
+    ),
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.predict:predict_logs", "Replay logs that the fit has not used."),
     "export": ("pronk.cli.export:export_gains", "Write gains as configuration of a simulator."),

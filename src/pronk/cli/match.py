@@ -21,7 +21,7 @@ WARNING_STATUS = 3
 """Exit status of a match that is no better than less fitting on held-out recordings."""
 
 
-def match(
+def match_command(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str,
     out: Path = Path("gains.yaml"),
@@ -56,10 +56,9 @@ def match(
         reading: How logs are read.
     """
     from pronk.identify.match import gains as gains_file
-    from pronk.identify.match import result as result_file
     from pronk.identify.match import tables
     from pronk.identify.match.match import match as match_logs
-    from pronk.identify.match.result import NOT_BETTER
+    from pronk.identify.match.result import NOT_BETTER, save_match
     from pronk.identify.match.settings import MatchSettings
     from pronk.identify.simulators.profiles import profile
     from pronk.robots import load_robot
@@ -103,7 +102,7 @@ def match(
             results[name] = result
             folder = out.parent / name if name in frameworks else out.parent
             gains_file.save_gains(folder / out.name, result.gains)
-            result_file.save(folder / "match.npz", result)
+            save_match(folder / "match.npz", result)
             written.extend([folder / out.name, folder / "match.npz"])
             result_paths.append(folder / "match.npz")
 

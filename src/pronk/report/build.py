@@ -13,6 +13,7 @@ from pronk.deploy.runtime.deploy_log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
 from pronk.jump.trial.results import SUMMARY
+from pronk.progress import Progress, no_progress
 from pronk.report import deploy_page, match_page, trial_page
 from pronk.report.page import Part, page
 
@@ -24,10 +25,6 @@ PART_MAKERS: dict[str, Callable[[Path], Part]] = {
     "match.npz": match_page.match_part,
 }
 """How the part of each file is made, in the order of the page."""
-
-
-def no_progress(stage: str, share: float) -> None:
-    """Ignore the share of a stage that is done."""
 
 
 def artefacts(root: Path, pattern: str) -> list[Path]:
@@ -52,9 +49,7 @@ def write_artefact_page(artefact: Path) -> Path:
     return page_path
 
 
-def write_report(
-    root: Path, progress: Callable[[str, float], None] = no_progress
-) -> tuple[Path, list[Part]]:
+def write_report(root: Path, progress: Progress = no_progress) -> tuple[Path, list[Part]]:
     """Write the page of everything in a folder.
 
     Args:

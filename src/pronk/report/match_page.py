@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pronk.errors import ArtefactError, RobotError
-from pronk.identify.match import result as result_file
 from pronk.identify.match import tables
 from pronk.identify.match.predict import Prediction, load_prediction
-from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult
+from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult, load_match
 from pronk.report import figures
 from pronk.report.page import Part
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
@@ -33,7 +32,7 @@ def match_part(path: Path) -> Part:
         ArtefactError: A file is missing or damaged.
     """
     gains_path = find_gains(path.parent)
-    result = result_file.load(path)
+    result = load_match(path)
     matched = len(result.matched_joints)
     compared = {}
     for name, joint in result.joints.items():

@@ -1,4 +1,4 @@
-"""Checks of the recordings of a joint before the fit, and of the matched response after it.
+"""Checks of the excitations of a joint before the fit, and of the matched response after it.
 
 Each check is one function with its equation. Limits hold for any position-controlled joint: none of
 them was set by the logs of a particular robot. What would make every matched number meaningless is
@@ -23,6 +23,7 @@ from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.match.measured import DB
+from pronk.identify.match.result import NO_MATCH
 from pronk.identify.response.response import FrequencyResponse
 from pronk.robots.robot import Joint, RobotSpec
 
@@ -73,11 +74,11 @@ TORQUE_COMPUTED = "computed"
 """Value of a log's metadata `torque` where the column was computed from the command."""
 
 
-def check_recordings(recordings: Sequence[Excitation], robot: RobotSpec) -> tuple[str, ...]:
-    """Check the recordings of one joint before it is matched.
+def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tuple[str, ...]:
+    """Check the excitations of one joint before it is matched.
 
     Args:
-        recordings: Excitations of one joint, of one or several logs.
+        excitations: Excitations of one joint, of one or several logs.
         robot: The robot.
 
     Returns:
@@ -88,23 +89,23 @@ def check_recordings(recordings: Sequence[Excitation], robot: RobotSpec) -> tupl
         LogError: Another joint moved, a sign is flipped, or angles are in degrees.
     """
     flags: list[str] = []
-    for recording in recordings:
-        if recording.log.unit(recording.joint) != "rad":
+    for excitation in excitations:
+        if excitation.log.unit(excitation.joint) != "rad":
             continue
-        joint = robot.joint(recording.joint)
+        joint = robot.joint(excitation.joint)
         for problem in (
-            wrong_joint(recording),
-            wrong_unit(recording, joint),
-            wrong_sign(recording, joint),
+            wrong_joint(excitation),
+            wrong_unit(excitation, joint),
+            wrong_sign(excitation, joint),
         ):
             if problem:
-                source = recording.source or "log"
-                raise LogError(f"{source}: {recording.joint}: {problem}.")
+                source = excitation.source or "log"
+                raise LogError(f"{source}: {excitation.joint}: {problem}.")
         for flag in (
-            standstill(recording, joint),
-            too_few_samples(recording, joint),
-            wrong_clock(recording, robot.policy_rate_hz),
-            effort_limit_reached(recording, joint),
+            standstill(excitation, joint),
+            too_few_samples(excitation, joint),
+            wrong_clock(excitation, robot.policy_rate_hz),
+            effort_limit_reached(excitation, joint),
         ):
             if flag and not _is_repeated(flag, flags):
                 flags.append(flag)
@@ -120,7 +121,7 @@ def _is_repeated(flag: str, flags: Sequence[str]) -> bool:
 # ---- errors: what makes every number meaningless ----
 
 
-def wrong_joint(recording: Excitation) -> str:
+def wrong_joint(excitation: Excitation) -> str:
     """Say how the recorded joint is not the excited one.
 
     The log names another joint, or a joint whose command stands still travelled twice as far as
@@ -128,31 +129,34 @@ def wrong_joint(recording: Excitation) -> str:
     other joints less than the excited one.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
 
     Returns:
         What was seen and the way out; empty if nothing contradicts the joint.
     """
-    log = recording.log
-    remedy = "give the order of the file's joints (--joints), or check the wiring"
-    stated = log.origin.metadata.get("excited", recording.joint)
-    if stated != recording.joint:
+    log = excitation.log
+    remedy = (
+        "give the order or the names of the file's joints (--joint-order, --joint-names), or check "
+        "the wiring"
+    )
+    stated = log.origin.metadata.get("excited", excitation.joint)
+    if stated != excitation.joint:
         return f"the log says that {stated} was excited; {remedy}"
-    command_travel = np.ptp(log.command[recording.samples], axis=0)
-    travel = np.ptp(log.position[recording.samples], axis=0)
-    column = log.column(recording.joint)
+    command_travel = np.ptp(log.command[excitation.samples], axis=0)
+    travel = np.ptp(log.position[excitation.samples], axis=0)
+    column = log.column(excitation.joint)
     largest = max(0.5 * command_travel[column], 2.0 * travel[column])
     for other, name in enumerate(log.joints):
         commanded = other == column or command_travel[other] > 0.0
         if not commanded and log.unit(name) == "rad" and travel[other] > largest:
             return (
-                f"{name} moved by {travel[other]:.2g} rad while {recording.joint} was commanded; "
+                f"{name} moved by {travel[other]:.2g} rad while {excitation.joint} was commanded; "
                 f"the columns are another joint's: {remedy}"
             )
     return ""
 
 
-def wrong_unit(recording: Excitation, joint: Joint) -> str:
+def wrong_unit(excitation: Excitation, joint: Joint) -> str:
     """Say how angles are in degrees where radians are stated.
 
     The command leaves the range of the joint by more than a radian and is inside of it in degrees,
@@ -160,14 +164,14 @@ def wrong_unit(recording: Excitation, joint: Joint) -> str:
     slow commands with a gain near 1.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model.
 
     Returns:
         What was seen and the way out; empty if the unit fits.
     """
     remedy = "degrees are read as radians: read the log with unit deg"
-    command = recording.command
+    command = excitation.command
     lowest = float(command.min())
     highest = float(command.max())
     low, high = joint.range
@@ -178,23 +182,23 @@ def wrong_unit(recording: Excitation, joint: Joint) -> str:
             f"the command goes from {lowest:.3g} to {highest:.3g}, the joint from {low:.3g} to "
             f"{high:.3g} rad; {remedy}"
         )
-    gain = abs(slow_response(recording, joint))
+    gain = abs(slow_response(excitation, joint))
     if 0.5 < gain / DEGREES < 2.0 or 0.5 < gain * DEGREES < 2.0:
         return f"at low frequency the position is {gain:.3g} times the command; {remedy}"
     return ""
 
 
-def wrong_sign(recording: Excitation, joint: Joint) -> str:
+def wrong_sign(excitation: Excitation, joint: Joint) -> str:
     """Say how the position has the other sign than the command: `cos(phase) < OPPOSITE`.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model.
 
     Returns:
         What was seen and the way out; empty if the signs agree.
     """
-    response = slow_response(recording, joint)
+    response = slow_response(excitation, joint)
     if response.real < OPPOSITE * abs(response):
         return (
             "at low frequency the position moves against the command; a sign is flipped: negate "
@@ -203,23 +207,23 @@ def wrong_sign(recording: Excitation, joint: Joint) -> str:
     return ""
 
 
-def slow_response(recording: Excitation, joint: Joint) -> complex:
+def slow_response(excitation: Excitation, joint: Joint) -> complex:
     """Compute the response of a joint to the slow part of its command.
 
     `sum(conj(U) Y) / sum(conj(U) U)` over the excited frequencies from `LOWEST_HZ` to a fifth of
     the joint's band, for the spectra U of the command and Y of the position.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model.
 
     Returns:
         Complex gain; NaN where nothing slow is excited or the motion is not coherent with it.
     """
-    time = recording.time
+    time = excitation.time
     grid, step = np.linspace(time[0], time[-1], len(time), retstep=True)
-    command = np.interp(grid, time, recording.command)
-    position = np.interp(grid, time, recording.position)
+    command = np.interp(grid, time, excitation.command)
+    position = np.interp(grid, time, excitation.position)
     command_spectrum = np.fft.rfft(command - command.mean())
     position_spectrum = np.fft.rfft(position - position.mean())
     hz = np.fft.rfftfreq(len(grid), float(step))
@@ -241,59 +245,59 @@ def slow_response(recording: Excitation, joint: Joint) -> complex:
 # ---- flags: what weakens a match ----
 
 
-def standstill(recording: Excitation, joint: Joint) -> str:
+def standstill(excitation: Excitation, joint: Joint) -> str:
     """Say when a joint stands still for a second while its command moves.
 
     Inside the joint's band it stands where it moves by less than `STILL_SHARE` of its command;
     above the band, where the reading does not change at all.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model.
 
     Returns:
         What was seen and the way out; empty if the joint moves.
     """
-    time = recording.time
-    least_travel = max(0.5 * float(np.ptp(recording.command)), STILL_COMMAND_RAD)
+    time = excitation.time
+    least_travel = max(0.5 * float(np.ptp(excitation.command)), STILL_COMMAND_RAD)
     edges = np.searchsorted(time, np.arange(time[0], time[-1], 1.0))
     for first, stop in pairwise(edges):
-        command = recording.command[first:stop]
+        command = excitation.command[first:stop]
         if stop - first < 4 or np.ptp(command) < least_travel:
             continue
         crossings = np.count_nonzero(np.diff(np.sign(command - command.mean())))
         inside_band = crossings <= 2.0 * joint.band_hz[1]
-        travel = float(np.ptp(recording.position[first:stop]))
+        travel = float(np.ptp(excitation.position[first:stop]))
         slow_standstill = inside_band and travel < STILL_SHARE * float(np.ptp(command))
         if travel == 0.0 or slow_standstill:
             return (
-                f"standstill: {recording.joint} does not move at {time[first]:.1f} s while its "
+                f"standstill: {excitation.joint} does not move at {time[first]:.1f} s while its "
                 "command does; the drive was off or the encoder stuck: repair it and record again"
             )
     return ""
 
 
-def too_few_samples(recording: Excitation, joint: Joint) -> str:
+def too_few_samples(excitation: Excitation, joint: Joint) -> str:
     """Say when a log is too slow for the band: `rate / top of the band < SAMPLES_A_PERIOD`.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model.
 
     Returns:
         What was seen and the way out; empty if the rate suffices.
     """
     top_hz = joint.band_hz[1]
-    samples = recording.log.rate_hz / top_hz
+    samples = excitation.log.rate_hz / top_hz
     if samples >= SAMPLES_A_PERIOD:
         return ""
     return (
-        f"sample rate: {recording.log.rate_hz:.3g} samples a second are {samples:.2g} a period at "
+        f"sample rate: {excitation.log.rate_hz:.3g} samples a second are {samples:.2g} a period at "
         f"{top_hz:g} Hz, fewer than {SAMPLES_A_PERIOD:g}; log faster, or lower the joint's band"
     )
 
 
-def wrong_clock(recording: Excitation, policy_rate_hz: float) -> str:
+def wrong_clock(excitation: Excitation, policy_rate_hz: float) -> str:
     """Say when commands that are held between ticks change at another rate than stated.
 
     The period T of the ticks is where `|sum(|change| exp(2 pi i t / T))|` is largest near the
@@ -301,21 +305,21 @@ def wrong_clock(recording: Excitation, policy_rate_hz: float) -> str:
     ticks alone. The stated rate is the log's, or else the robot's policy rate.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         policy_rate_hz: Rate at which the robot's commands are sent [Hz].
 
     Returns:
         What was seen and the way out; empty if the rates agree or nothing can be said.
     """
-    log = recording.log
+    log = excitation.log
     stated_hz = log.origin.metadata.get("command_rate_hz")
     tick_s = 1.0 / (float(stated_hz) if stated_hz else policy_rate_hz)
     if log.rate_hz * tick_s < 3.0:
         return ""  # too few samples in a tick to see when the command changes
-    changes = np.abs(np.diff(recording.command))
+    changes = np.abs(np.diff(excitation.command))
     if not changes.any():
         return ""
-    period_s, sharpness = _period_of_changes(recording.time[1:], changes, tick_s)
+    period_s, sharpness = _period_of_changes(excitation.time[1:], changes, tick_s)
     if sharpness < SMOOTHED and not stated_hz:
         return ""  # commands that are computed for every sample have no ticks
     difference = abs(period_s / tick_s - 1.0)
@@ -347,27 +351,27 @@ def _period_of_changes(times: Array, changes: Array, tick_s: float) -> tuple[flo
     hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
     near = np.flatnonzero((hz > 0.75 / tick_s) & (hz < 1.33 / tick_s))
     peak_hz = hz[near[np.argmax(spectrum[near])]]
-    # The timestamps themselves, about the peak, at a tenth of the resolution of the recording.
+    # The timestamps themselves, about the peak, at a tenth of the resolution of the excitation.
     fine_hz = peak_hz + np.linspace(-0.5, 0.5, 21) / span
     lengths = np.abs(np.exp(2j * np.pi * np.outer(fine_hz, times)) @ changes)
     best = int(np.argmax(lengths))
     return 1.0 / float(fine_hz[best]), float(lengths[best] / changes.sum())
 
 
-def effort_limit_reached(recording: Excitation, joint: Joint) -> str:
+def effort_limit_reached(excitation: Excitation, joint: Joint) -> str:
     """Say for how much of the time a drive is at its effort limit.
 
     The torque is the measured one where the log has it, or else the one that the drive's law asks
     for with the gains of the log: `stiffness (command - position) - damping velocity`.
 
     Args:
-        recording: Excitation of a joint.
+        excitation: Excitation of a joint.
         joint: Its model, which has the effort limit.
 
     Returns:
         What was seen and the way out; empty if the torque stays below the limit.
     """
-    torque = _drive_torque(recording)
+    torque = _drive_torque(excitation)
     limit = joint.drive.effort_limit
     if torque is None or not math.isfinite(limit):
         return ""
@@ -382,19 +386,19 @@ def effort_limit_reached(recording: Excitation, joint: Joint) -> str:
     )
 
 
-def _drive_torque(recording: Excitation) -> Array | None:
+def _drive_torque(excitation: Excitation) -> Array | None:
     """Return the torque of the drive during an excitation [N m], (n,); None if it is not known."""
-    log = recording.log
+    log = excitation.log
     measured = log.origin.metadata.get("torque") != TORQUE_COMPUTED
-    if recording.torque is not None and measured and np.ptp(recording.torque) > 0.0:
-        return recording.torque
+    if excitation.torque is not None and measured and np.ptp(excitation.torque) > 0.0:
+        return excitation.torque
     if log.stiffness is None or log.damping is None:
         return None
-    column = log.column(recording.joint)
-    velocity = recording.velocity
+    column = log.column(excitation.joint)
+    velocity = excitation.velocity
     if velocity is None:
-        velocity = np.gradient(recording.position, recording.time)
-    error = recording.command - recording.position
+        velocity = np.gradient(excitation.position, excitation.time)
+    error = excitation.command - excitation.position
     return np.asarray(log.stiffness[column] * error - log.damping[column] * velocity)
 
 
@@ -416,8 +420,8 @@ def check_response(
         limit_db: Error above which the gains are no match [dB].
 
     Returns:
-        A flag that says how large the error is, at which frequencies, and what would look so; none
-        if the gains are a match.
+        A flag that begins with `NO_MATCH` and says how large the error is, at which frequencies,
+        and what would look so; none if the gains are a match.
     """
     error_db = DB * np.log(np.abs(simulated[used] / measured.response[used]))
     size_db = float(np.sqrt(np.mean(error_db**2)))
@@ -435,7 +439,7 @@ def check_response(
         "a position or command that was filtered, a compliant gear, or a wrong rotor inertia",
     )
     return (
-        f"no match: the best gains miss the measured response by {size_db:.2g} dB RMS, more than "
+        f"{NO_MATCH}the best gains miss the measured response by {size_db:.2g} dB RMS, more than "
         f"{limit_db:.2g} dB; from {hz[third[0]]:.2g} to {hz[third[-1]]:.2g} Hz, where the error is "
         f"largest, the real joint moves {direction} than the simulated one. So would look: "
         f"{causes[largest]}",

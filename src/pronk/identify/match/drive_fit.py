@@ -77,7 +77,6 @@ and 0.1 to 0.3 where one of them is known."""
 BLIND_SHARE = 0.3
 """Component of such a direction from which on a parameter takes part in it."""
 
-Progress = Callable[[float], None]
 Unidentified = Literal["flag", "hold", "refuse"]
 
 
@@ -87,7 +86,7 @@ def fit_drives(
     parameters: Sequence[str],
     nominal: DriveValues,
     unidentified: Unidentified = "flag",
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> dict[str, DriveFit]:
     """Fit parameters of the drives of all joints of some recordings.
 
@@ -154,7 +153,7 @@ def nominal_drives(
 class CountedReplay(Replay):
     """A replay that reports the share of its simulations that is done."""
 
-    def __init__(self, replay: Replay, expected: int, progress: Progress) -> None:
+    def __init__(self, replay: Replay, expected: int, progress: Callable[[float], None]) -> None:
         self.joints = replay.joints
         self.recordings = replay.recordings
         self.delay_step_s = replay.delay_step_s

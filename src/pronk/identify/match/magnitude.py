@@ -12,7 +12,7 @@ data sheet has it (S6). The least squares weights frequencies by their coherence
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -34,9 +34,8 @@ from pronk.identify.match.result import DriveFit, GridSearch, ZeroArmature, ampl
 from pronk.identify.match.uncertainty import jackknife
 from pronk.identify.response.response import FrequencyResponse
 from pronk.identify.simulators.simulator import JointRigs
+from pronk.progress import Progress, no_progress
 from pronk.robots.robot import RobotSpec
-
-Progress = Callable[[float], None]
 
 DIVERGED_DB = 100.0
 """Error of a simulation that diverged or did not move [dB]: beyond any response."""
@@ -56,10 +55,6 @@ _NOISE_BANDWIDTH = 1.5
 neighbouring frequencies share their noise."""
 _COHERENCE_OF_DELAY = 0.8
 """Least coherence of a frequency whose phase counts for the delay."""
-
-
-def no_progress(share: float) -> None:
-    """Ignore the share of a search that is done."""
 
 
 def grid_axes(robot: RobotSpec, points: int = 50) -> tuple[Array, Array]:
@@ -111,7 +106,7 @@ def search_grid(
         stiffness: Axis [N m/rad], shape (a,).
         damping: Axis [N m s/rad], shape (b,).
         armature: Rotor inertia [kg m^2]; that of the drives if None.
-        progress: Called with the share of the search that is done, 0 to 1.
+        progress: Called with the stage `grid` and the share of it that is done, 0 to 1.
 
     Returns:
         Error over the grid of each target, in the order of the targets.
@@ -136,7 +131,7 @@ def search_grid(
             for target in group:
                 error_db = target.error_db(target.fit_response(position))
                 errors[target.joint][part] = mean_square(error_db)
-            progress((number + part.stop / len(pairs)) / len(groups))
+            progress("grid", (number + part.stop / len(pairs)) / len(groups))
     shape = (len(stiffness), len(damping))
     searches = []
     for target in targets:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.match.checks import check_recordings, check_response
+from pronk.identify.match.checks import check_excitations, check_response
 from pronk.identify.match.compared import ComparedResponses, compare, compare_recordings
 from pronk.identify.match.drive_fit import fit_drives, nominal_drives
 from pronk.identify.match.magnitude import (
@@ -41,11 +41,11 @@ from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
+from pronk.progress import Progress, no_progress
 from pronk.robots.robot import RobotSpec
 
 Method = Literal["time", "paper"]
 Mode = Literal["gains", "drive"]
-Progress = Callable[[str, float], None]
 
 WITHOUT_FRICTION = ("stiffness", "damping", "delay")
 """Parameters that are fitted for frameworks whose joints have no dry friction as a torque."""
@@ -54,10 +54,6 @@ NO_MATCH_DB = 1.0
 of a good log stays below."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
-
-
-def no_progress(stage: str, share: float) -> None:
-    """Ignore the share of a stage that is done."""
 
 
 def match(
@@ -123,11 +119,11 @@ def match(
 
     with simulation.open_rigs(settings.threads, settings.simulator_python) as rigs:
         sources = logs_by_joint(excited_logs or logs, robot)
-        recording_flags = {}
+        excitation_flags = {}
         measured = {}
         nominal: dict[str, dict[str, float]] = {}
         for name, joint_logs in sources.items():
-            recording_flags[name] = check_recordings(recordings_of(joint_logs, name), robot)
+            excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
             measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
             nominal |= nominal_drives(joint_logs, [name], rigs.robot)
             progress("estimate", len(measured) / len(sources))
@@ -142,7 +138,7 @@ def match(
                 fits[name] = fit_magnitude(rigs, responses, grids[name])
             else:
                 fits |= fit_drives(
-                    JointReplay(rigs, recordings_of(sources[name], name)),
+                    JointReplay(rigs, excitations_of(sources[name], name)),
                     parameters=parameters,
                     nominal={name: nominal[name]},
                     unidentified="refuse" if mode == "drive" else "flag",
@@ -166,7 +162,7 @@ def match(
                 zero_armature = search_without_armature(
                     rigs, target, compared.error_db, no_match_db(target)
                 )
-            flags = (*response_flags(target, compared, robot), *recording_flags[name])
+            flags = (*response_flags(target, compared, robot), *excitation_flags[name])
             joints[name] = JointResult(
                 joint=name,
                 gains=joint_gains(fit, compared, flags),
@@ -221,12 +217,12 @@ def fitted_parameters(
     return GAINS_MODE
 
 
-def recordings_of(logs: Sequence[JointLog], joint: str) -> list[Excitation]:
+def excitations_of(logs: Sequence[JointLog], joint: str) -> list[Excitation]:
     """Return every excitation of a joint in some logs."""
-    recordings: list[Excitation] = []
+    excitations: list[Excitation] = []
     for log in logs:
-        recordings.extend(log.excitations(joint))
-    return recordings
+        excitations.extend(log.excitations(joint))
+    return excitations
 
 
 def search_grids(
@@ -246,15 +242,11 @@ def search_grids(
     Returns:
         Error over the grid by joint.
     """
-
-    def report(share: float) -> None:
-        progress("grid", share)
-
     stiffness, damping = grid_axes(rigs.robot, points)
     targets = []
     for amplitudes in measured.values():
         targets.append(amplitudes[0])
-    searches = search_grid(rigs, targets, stiffness, damping, progress=report)
+    searches = search_grid(rigs, targets, stiffness, damping, progress=progress)
     return dict(zip(measured, searches, strict=True))
 
 
@@ -286,9 +278,9 @@ def match_chains(
     simulation.require_mujoco()
     robot = simulation.robot
     logs_in_motion = [log for log in logs if log.excited_joints]
-    recording_flags = {}
+    excitation_flags = {}
     for name, joint_logs in logs_by_joint(logs_in_motion, robot).items():
-        recording_flags[name] = check_recordings(recordings_of(joint_logs, name), robot)
+        excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
     fits: dict[str, DriveFit] = {}
     responses: dict[str, ComparedResponses] = {}
     excluded: dict[str, str] = {}
@@ -327,7 +319,7 @@ def match_chains(
             excluded.update(chain.excluded)
     joints = {}
     for name, fit in with_torque(fits, torque_fits, robot).items():
-        gains = joint_gains(fit, responses.get(name), recording_flags.get(name, ()))
+        gains = joint_gains(fit, responses.get(name), excitation_flags.get(name, ()))
         joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
     return match_result(simulation, simulation.info(), joints, logs, excluded)
 

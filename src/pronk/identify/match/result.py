@@ -324,13 +324,13 @@ def rms_of_finite(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(finite)))) if finite else NAN
 
 
-def save(path: Path, result: MatchResult) -> None:
+def save_match(path: Path, result: MatchResult) -> None:
     """Write `match.npz`, whole or not at all."""
     save_artefact(path, result, SCHEMA)
 
 
-def load(path: Path) -> MatchResult:
-    """Read what `save` wrote.
+def load_match(path: Path) -> MatchResult:
+    """Read what `save_match` wrote.
 
     Raises:
         ArtefactError: Another file, or one of another schema.
