@@ -32,8 +32,8 @@ def env() -> Any:
     return training_env.fresh(training_env.randomized(), scripted=True)
 
 
-def index(env: Any, kind: str, name: str) -> int:
-    return int(getattr(env.sim.mj_model, kind)(f"robot/{name}").id)
+def index(env: Any, element: str, name: str) -> int:
+    return int(getattr(env.sim.mj_model, element)(f"robot/{name}").id)
 
 
 def assert_uniform(values: Any, low: float, high: float) -> None:
@@ -51,7 +51,9 @@ def test_draws_are_uniform_and_independent(env: Any) -> None:
     for _ in range(10):
         env.event_manager.apply(mode="startup")
         rounds.append(drawn(env))
-    found = {name: torch.cat([r[name] for r in rounds]) for name in rounds[0]}
+    draws = {}
+    for name in rounds[0]:
+        draws[name] = torch.cat([values[name] for values in rounds])
     ranges = {
         "friction": (0.05, 3.0),
         "base_mass": (BODY.base_mass - 0.4, BODY.base_mass + 1.6),
@@ -60,15 +62,20 @@ def test_draws_are_uniform_and_independent(env: Any) -> None:
         "drop": (1e3 * 4 * 0.03 / 24.0**2, 1e3 * 4 * 0.1 / 24.0**2),
     }
     for name, (low, high) in ranges.items():
-        assert_uniform(found[name], low, high)
-    joints = np.hstack([found["stiffness"], found["damping"]])
+        assert_uniform(draws[name], low, high)
+    joints = np.hstack([draws["stiffness"], draws["damping"]])
     for i, joint in enumerate(ROBOT.joints):
-        g = MATCHED.groups[joint.group]
-        pairs = (g.stiffness, g.stiffness_range), (g.damping, g.damping_range)
-        for column, (middle, half) in zip((i, 12 + i), pairs, strict=True):
-            assert_uniform(joints[:, column], middle - half, middle + half)
-    everything = np.hstack([joints, *(found[name] for name in ranges)])
-    correlation = np.corrcoef(everything, rowvar=False)
+        gains = MATCHED.groups[joint.group]
+        softest = gains.stiffness - gains.stiffness_range
+        stiffest = gains.stiffness + gains.stiffness_range
+        assert_uniform(joints[:, i], softest, stiffest)
+        least_damped = gains.damping - gains.damping_range
+        most_damped = gains.damping + gains.damping_range
+        assert_uniform(joints[:, 12 + i], least_damped, most_damped)
+    columns = [joints]
+    for name in ranges:
+        columns.append(draws[name])
+    correlation = np.corrcoef(np.hstack(columns), rowvar=False)
     upper = np.triu_indices(len(correlation), 1)
     assert np.abs(correlation[upper]).max() < 5.0 / math.sqrt(10 * MANY)
 
@@ -86,25 +93,28 @@ def test_a_robot_keeps_its_parameters(env: Any) -> None:
 def test_contacts_have_the_friction_of_the_foot(env: Any) -> None:
     for _ in range(20):
         env.step(torch.zeros(MANY, 12))
-    contact, n = env.sim.wp_data.contact, int(env.sim.wp_data.nacon.numpy()[0])
+    contact = env.sim.wp_data.contact
+    n = int(env.sim.wp_data.nacon.numpy()[0])
     feet = [index(env, "geom", f"{leg}_foot_collision") for leg in BODY.legs]
     touching = np.isin(contact.geom.numpy()[:n], feet).any(axis=1)
     assert touching.sum() > MANY
     friction = drawn(env)["friction"][contact.worldid.numpy()[:n][touching]].numpy()
     expected = np.hstack([friction, friction, np.full_like(friction, 0.02)])
-    found = contact.friction.numpy()[:n][touching][:, :3]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    contact_friction = contact.friction.numpy()[:n][touching][:, :3]
+    np.testing.assert_allclose(contact_friction, expected, rtol=1e-6)
 
 
 def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
-    trunk, model = index(env, "body", "trunk"), env.sim.mj_model
+    trunk = index(env, "body", "trunk")
+    model = env.sim.mj_model
     mass = drawn(env)["base_mass"].numpy()
     inertia = env.sim.model.body_inertia[:, trunk].numpy()
     expected = mass / BODY.base_mass * model.body_inertia[trunk]
     np.testing.assert_allclose(inertia, expected, rtol=1e-5)
     # Derived constants follow, and no other body changes.
-    whole = env.sim.model.body_subtreemass[:, trunk].numpy()
-    np.testing.assert_allclose(whole, mass[:, 0] + BODY.total_mass - BODY.base_mass, rtol=1e-5)
+    total_mass = env.sim.model.body_subtreemass[:, trunk].numpy()
+    expected = mass[:, 0] + BODY.total_mass - BODY.base_mass
+    np.testing.assert_allclose(total_mass, expected, rtol=1e-5)
     masses = np.delete(env.sim.model.body_mass.numpy(), trunk, axis=1)
     expected = np.delete(np.float32(model.body_mass), trunk)
     np.testing.assert_array_equal(masses, np.tile(expected, (MANY, 1)))
@@ -114,13 +124,16 @@ def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
 
 
 def test_shank_length_moves_foot_and_capsule(env: Any) -> None:
-    data, model = env.sim.data, env.sim.model
+    data = env.sim.data
+    model = env.sim.model
     data.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     data.qpos[:, 7:] = env.scene["robot"].data.default_joint_pos[0]
     env.sim.forward()
     for leg, length in zip(BODY.legs, drawn(env)["shank_length"].T, strict=True):
-        thigh, shank = (index(env, "body", f"{leg}_{part}") for part in ("thigh", "shank"))
-        foot, capsule = (index(env, "geom", f"{leg}_{p}_collision") for p in ("foot", "shank"))
+        thigh = index(env, "body", f"{leg}_thigh")
+        shank = index(env, "body", f"{leg}_shank")
+        foot = index(env, "geom", f"{leg}_foot_collision")
+        capsule = index(env, "geom", f"{leg}_shank_collision")
         site = data.site_xpos[:, index(env, "site", f"{leg}_foot")]
         torch.testing.assert_close(site, data.geom_xpos[:, foot], atol=1e-6, rtol=0.0)
         # Default pose: thigh .8 rad back, shank .8 rad forward, both from the vertical.
@@ -129,20 +142,25 @@ def test_shank_length_moves_foot_and_capsule(env: Any) -> None:
         # The capsule begins 2 cm below the knee and ends 3 cm above the foot; its bounds follow.
         centre = (data.geom_xpos[:, capsule] - data.xpos[:, shank]).norm(dim=-1)
         half = model.geom_size[:, capsule, 1]
-        bounds = model.geom_rbound[:, capsule], model.geom_aabb[:, capsule, 1, 2]
-        ends = centre - half, centre + half - length
-        found = torch.stack([drop - legs, *ends, *(b - half for b in bounds)])
+        distances = [
+            drop - legs,
+            centre - half,
+            centre + half - length,
+            model.geom_rbound[:, capsule] - half,
+            model.geom_aabb[:, capsule, 1, 2] - half,
+        ]
         expected = torch.tensor([0.0, 0.02, -0.03, 0.01, 0.01])[:, None].expand(5, MANY)
-        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(torch.stack(distances), expected, atol=1e-5, rtol=0.0)
 
 
 def test_episodes_begin_about_the_initial_state(env: Any) -> None:
-    robot, data = env.scene["robot"].data, env.sim.data
-    how = {"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1}
-    assert dict(env.event_manager.get_term_cfg("reset").params) == how
+    robot = env.scene["robot"].data
+    data = env.sim.data
+    spread = {"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1}
+    assert dict(env.event_manager.get_term_cfg("reset").params) == spread
     states = []
     for _ in range(10):
-        reset_state(env, ALL, **how)
+        reset_state(env, ALL, **spread)
         states.append(torch.cat([data.qpos.clone(), data.qvel.clone()], dim=1))
         states[-1][:, :3] -= env.scene.env_origins
     start = np.float64(torch.cat(states).numpy())
@@ -154,16 +172,18 @@ def test_episodes_begin_about_the_initial_state(env: Any) -> None:
         assert_uniform(start[:, axis], -half, half)
     assert_uniform(start[:, 7:19] - robot.default_joint_pos[0].numpy(), -0.1, 0.1)
     before = data.qpos.clone()
-    reset_state(env, ALL[::2], **how)
+    reset_state(env, ALL[::2], **spread)
     assert (data.qpos == before).all(dim=1).tolist() == [False, True] * (MANY // 2)
 
 
 def test_length_of_the_policy_step_is_drawn_each_step(env: Any) -> None:
     """A resumed run restores the counter and has the same draw."""
     for _ in range(6):
-        planned, before = env.cfg.decimation, env.sim.data.time.clone()
+        planned = env.cfg.decimation
+        before = env.sim.data.time.clone()
         env.step(torch.zeros(MANY, 12))
-        passed = env.sim.data.time[env.episode_length_buf > 0] - before[env.episode_length_buf > 0]
+        running = env.episode_length_buf > 0
+        passed = env.sim.data.time[running] - before[running]
         torch.testing.assert_close(passed, torch.full_like(passed, 0.005 * planned))
     planned = env.cfg.decimation
     randomize_decimation(env, None, **env.event_manager.get_term_cfg("decimation").params)
@@ -204,10 +224,12 @@ def test_delays_are_drawn_per_episode_and_torques_follow_the_drawn_gains(env: An
     counts = Counter(first["delay"][:, 0].tolist())
     assert counts.keys() == {0, 1, 2}
     assert chisquare(list(counts.values())).pvalue > 1e-3
-    robot, action = env.scene["robot"].data, torch.rand(MANY, 12) - 0.5
+    robot = env.scene["robot"].data
+    action = torch.rand(MANY, 12) - 0.5
     for step in range(4):
         env.cfg.decimation = 1
-        position, velocity = robot.joint_pos.clone(), robot.joint_vel.clone()
+        position = robot.joint_pos.clone()
+        velocity = robot.joint_vel.clone()
         env.step(action)
         target = robot.default_joint_pos + 0.35 * action * (first["delay"] <= step)
         torque = first["stiffness"] * (target - position) - first["damping"] * velocity
@@ -231,9 +253,11 @@ def batteries() -> Any:
 
 
 def give(battery: Any, volts: float, ohms: float) -> None:
-    """The first robot has an ideal battery, the others that."""
-    voltage, resistance = torch.full((N, 1), volts), torch.full((N, 1), ohms)
-    voltage[0], resistance[0] = 24.0, 0.0
+    """Give the first robot an ideal battery and all others a battery with a resistance."""
+    voltage = torch.full((N, 1), volts)
+    resistance = torch.full((N, 1), ohms)
+    voltage[0] = 24.0
+    resistance[0] = 0.0
     battery.set(voltage, resistance, rated=24.0)
 
 
@@ -245,18 +269,21 @@ def test_voltage_is_the_fixed_point_of_the_power(
     env, battery = batteries
     give(battery, 25.0, 0.08)
     for _ in range(100):
-        env.sim.data.qfrc_actuator[:, 6:], env.sim.data.qvel[:, 6:] = torque, speed
+        env.sim.data.qfrc_actuator[:, 6:] = torque
+        env.sim.data.qvel[:, 6:] = speed
         battery.advance()
     power = 0.0
     for joint in ROBOT.joints:
-        constant, winding = 2.0 * joint.drive.gear_ratio * 0.05, 0.173 * 2.0 / 1.5
+        constant = 2.0 * joint.drive.gear_ratio * 0.05
+        winding = 0.173 * 2.0 / 1.5
         power += torque * speed + winding * (torque / constant) ** 2
     volts = 12.5 + math.sqrt(12.5**2 - 0.08 * power)
     assert float(battery.voltage[1]) * 24.0 == pytest.approx(volts, rel=1e-4)
     assert float(battery.voltage[0]) == pytest.approx(1.0, rel=1e-6)
     # Beyond the greatest power half of the voltage is left.
     for _ in range(100):
-        env.sim.data.qfrc_actuator[:, 6:], env.sim.data.qvel[:, 6:] = 26.0, 20.0
+        env.sim.data.qfrc_actuator[:, 6:] = 26.0
+        env.sim.data.qvel[:, 6:] = 20.0
         battery.advance()
     assert float(battery.voltage[1]) * 24.0 == pytest.approx(12.5, rel=1e-4)
 
@@ -275,12 +302,14 @@ def test_stall_torque_is_in_proportion_to_the_voltage(batteries: Any) -> None:
 
 def test_physics_gone_wrong_leaves_a_battery(env: Any) -> None:
     """A power that is not finite must not stay in the voltage, nor in the drives' limits."""
-    battery, still = joint_position_action(env).battery, torch.zeros(MANY, 12)
+    battery = joint_position_action(env).battery
+    still = torch.zeros(MANY, 12)
     env.step(still)
     env.sim.data.qvel[3, 7] = float("nan")
     env.step(still)
     assert env.termination_manager.get_term("non_finite")[3]
     assert float(battery.voltage[3]) == pytest.approx(float(battery.no_load[3]))
     env.step(still)
-    assert all(torch.isfinite(d.saturation_effort).all() for d in env.scene["robot"].actuators)
+    for drive in env.scene["robot"].actuators:
+        assert torch.isfinite(drive.saturation_effort).all()
     assert 0.7 < float(battery.voltage[3]) < 1.1

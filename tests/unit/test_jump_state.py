@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -103,23 +104,31 @@ def script(jump: str, air: str, vertical: dict[int, float] | None = None) -> lis
 
 def with_values(steps: list[Step], name: str, values: Sequence[float]) -> list[Step]:
     """Give every step a value of its own."""
-    return [replace(step, **{name: value}) for step, value in zip(steps, values, strict=True)]
+    changed = []
+    for step, value in zip(steps, values, strict=True):
+        changed.append(replace(step, **{name: value}))
+    return changed
+
+
+def tensor_of(steps: list[Step], name: str) -> Any:
+    """Put a quantity of the steps of several robots together."""
+    return torch.tensor([getattr(step, name) for step in steps])
 
 
 def inputs_of(steps: list[Step]) -> JumpInputs:
     """Put the steps of several robots together."""
     return JumpInputs(
-        command=torch.tensor([step.jump for step in steps]),
-        contact=torch.tensor([step.contact for step in steps]),
-        height=torch.tensor([step.height for step in steps]),
-        vertical=torch.tensor([step.vertical for step in steps]),
-        velocity_error=torch.tensor([step.velocity_error for step in steps]),
-        turn=torch.tensor([step.turn for step in steps]),
-        along=torch.tensor([step.along for step in steps]),
-        excess=torch.tensor([step.excess for step in steps]),
-        feet=torch.tensor([step.feet for step in steps]),
-        direction=torch.tensor([step.direction for step in steps]),
-        extension=torch.tensor([step.extension for step in steps]),
+        command=tensor_of(steps, "jump"),
+        contact=tensor_of(steps, "contact"),
+        height=tensor_of(steps, "height"),
+        vertical=tensor_of(steps, "vertical"),
+        velocity_error=tensor_of(steps, "velocity_error"),
+        turn=tensor_of(steps, "turn"),
+        along=tensor_of(steps, "along"),
+        excess=tensor_of(steps, "excess"),
+        feet=tensor_of(steps, "feet"),
+        direction=tensor_of(steps, "direction"),
+        extension=tensor_of(steps, "extension"),
     )
 
 
@@ -148,7 +157,7 @@ def alone(
 
 def at(trace: Trace) -> list[int]:
     """Return the steps in which a trace is not zero."""
-    return [i for i, value in enumerate(trace) if value]
+    return np.flatnonzero(trace).tolist()
 
 
 # --- Mode and time -------------------------------------------------------------------------------
@@ -169,7 +178,9 @@ def test_jump_mode_ends_after_settling_on_the_ground(jump: str, air: str, mode: 
     traces = alone(script(jump, air))
     before = jump.find("1") - 1
     assert traces["mode"] == mode
-    since = [DT * (i - before) if mode[i] else 0.0 for i in range(len(mode))]
+    since = []
+    for i, in_mode in enumerate(mode):
+        since.append(DT * (i - before) if in_mode else 0.0)
     assert traces["since"] == since
 
 
@@ -333,15 +344,18 @@ def test_flight_gain(jump: str, air: str, along: str, excess: float, gains: list
     speeds = [float(sign) for sign in along]
     steps = with_values(script(jump, air), "excess", [excess] * len(along))
     traces = alone(with_values(steps, "along", speeds))
-    assert traces["flight_gain"] == pytest.approx([DT * gain for gain in gains])
+    assert traces["flight_gain"] == pytest.approx((DT * np.array(gains)).tolist())
     if excess == 0.0:
-        backwards = [-speed for speed in speeds]
+        backwards = np.negative(speeds).tolist()
         assert alone(with_values(steps, "along", backwards))["flight_gain"] == [0.0] * len(along)
 
 
 def moved(x: float, y: float) -> Feet:
     """Move all feet of a standing robot."""
-    return tuple((foot_x + x, foot_y + y) for foot_x, foot_y in STANCE)
+    feet = []
+    for foot_x, foot_y in STANCE:
+        feet.append((foot_x + x, foot_y + y))
+    return tuple(feet)
 
 
 def jumps(*places: Feet, direction: tuple[float, float] = (1.0, 0.0)) -> list[Step]:
@@ -399,7 +413,7 @@ def test_gap_of_several_flights_and_commands() -> None:
     expected[8] = 0.125
     expected[12] = 0.25
     assert alone(commanded_twice)["gap_gain"] == pytest.approx(expected)
-    uncommanded = [replace(step, jump=False) for step in steps]
+    uncommanded = with_values(steps, "jump", [False] * len(steps))
     assert not any(alone(uncommanded)["gap_gain"])
     # Two steps in the air, half a metre a second too fast at the command.
     fast = [replace(steps[0], excess=0.5), *steps[1:6]]
@@ -450,7 +464,7 @@ def test_a_countermovement_falls_brakes_and_pushes() -> None:
 
 def test_similarity_from_the_command_to_the_first_jump() -> None:
     """Commanded in step 2. A stride (in the air at 4, 5) goes on, the jump at 7 ends it."""
-    way = [-4 * (DT * i) ** 2 for i in range(1, 7)]
+    way = (-4 * (DT * np.arange(1, 7)) ** 2).tolist()
     steps = script("0011111111", "0000110110", {6: 2.0, 7: 2.0})
     for i, length in enumerate(way):
         steps[i + 2] = replace(steps[i + 2], extension=(length,) * 4)
@@ -462,7 +476,7 @@ def test_similarity_from_the_command_to_the_first_jump() -> None:
     assert alone(steps)["similarity"] == pytest.approx(expected, abs=1e-6)
     # Without a jump it lasts until prompt_s, and begins again with the next command.
     waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["similarity"]
-    assert all(value > 0.0 for value in waits[:16])
+    assert np.all(np.array(waits[:16]) > 0.0)
     assert waits[16:29] == [0] * 13
     assert waits[29] == waits[0]
 
@@ -486,6 +500,13 @@ def any_steps(seed: int) -> list[Step]:
         x += distance * direction[0]
         y += distance * direction[1]
         contact = random.randrange(1, 16)
+        ground = []
+        feet = []
+        extension = []
+        for foot in range(4):
+            ground.append(bool(contact >> foot & 1))
+            feet.append((x + random.uniform(-0.25, 0.25), y + 0.1 * foot))
+            extension.append(random.uniform(-0.125, 0.0625))
         steps.append(
             Step(
                 jump=jump,
@@ -496,10 +517,10 @@ def any_steps(seed: int) -> list[Step]:
                 turn=random.uniform(0.0, 2.0),
                 along=random.uniform(-1.0, 4.0),
                 excess=random.uniform(-0.5, 1.0),
-                ground=tuple(bool(contact >> i & 1) for i in range(4)),
-                feet=tuple((x + random.uniform(-0.25, 0.25), y + 0.1 * i) for i in range(4)),
+                ground=tuple(ground),
+                feet=tuple(feet),
                 direction=direction,
-                extension=tuple(random.uniform(-0.125, 0.0625) for _ in range(4)),
+                extension=tuple(extension),
             )
         )
     return steps
@@ -538,9 +559,14 @@ def test_robots_are_independent_and_reset_alone(seed: int) -> None:
     """The second one begins anew half way."""
     robots = [any_steps(seed + i) for i in range(3)]
     state = JumpState(3, "cpu", SETTINGS)
-    first_halves = play([steps[:30] for steps in robots], state)
+    first_steps = []
+    later_steps = []
+    for steps in robots:
+        first_steps.append(steps[:30])
+        later_steps.append(steps[30:])
+    first_halves = play(first_steps, state)
     state.reset(torch.tensor([1]))
-    second_halves = play([steps[30:] for steps in robots], state)
+    second_halves = play(later_steps, state)
     for i, steps in enumerate(robots):
         if i == 1:
             first_half = alone(steps[:30])

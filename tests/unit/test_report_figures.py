@@ -31,11 +31,16 @@ def result():
 
 
 def curve(axes, colour):
-    return next(line for line in axes.lines if line.get_color() == colour)
+    for line in axes.lines:
+        if line.get_color() == colour:
+            return line
+    raise AssertionError(f"no line of colour {colour}")
 
 
 def test_axes_have_units_and_legends_fit(result) -> None:
-    groups = {name: [j for j in result.joints if j.endswith(name)] for name in GROUPS}
+    groups = {}
+    for name in GROUPS:
+        groups[name] = [joint for joint in result.joints if joint.endswith(name)]
     knee = result.joints["FR_knee"]
     for figure in (
         figures.bode(knee),
@@ -47,10 +52,13 @@ def test_axes_have_units_and_legends_fit(result) -> None:
         figures.prediction_figure(joint_prediction(), virtual=True),
         figures.measured_responses(knee.responses.measured),
     ):
-        labels = [text for a in figure.axes for text in (a.get_xlabel(), a.get_ylabel())]
-        named = [label for label in labels if label and label != "coherence"]
-        assert named
-        assert all(re.search(r"\[.+\]$", label) for label in named), named
+        labels = set()
+        for axes in figure.axes:
+            labels |= {axes.get_xlabel(), axes.get_ylabel()}
+        with_unit = labels - {"", "coherence"}
+        assert with_unit
+        for label in with_unit:
+            assert re.search(r"\[.+\]$", label), label
         FigureCanvasAgg(figure).draw()
         box = figure.legends[0].get_window_extent()
         assert box.x0 >= 0.0
@@ -74,14 +82,16 @@ def test_bode_has_gain_in_decibel_and_phase_in_degrees(result) -> None:
 def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> None:
     axes = figures.error_maps(result, dict.fromkeys(result.joints, NOMINAL_GAINS)).axes[0]
     joint = result.joints["FR_hip_roll"]
-    marked = {line.get_marker(): line.get_xydata()[0] for line in axes.lines}
+    marked = {}
+    for line in axes.lines:
+        marked[line.get_marker()] = line.get_xydata()[0]
     assert np.allclose(marked["s"], joint.grid.gains)
     assert np.allclose(marked["o"], (joint.gains.stiffness.value, joint.gains.damping.value))
     assert np.allclose(marked["x"], NOMINAL_GAINS)
     assert np.allclose(marked["+"], (20.6, 0.492))
     # The map shows RMS dB: the square root of what the artefact holds.
-    shown = np.asarray(axes.collections[0].get_array()).reshape(joint.grid.error.T.shape)
-    assert np.allclose(shown, np.sqrt(joint.grid.error.T))
+    mapped = np.asarray(axes.collections[0].get_array()).reshape(joint.grid.error.T.shape)
+    assert np.allclose(mapped, np.sqrt(joint.grid.error.T))
 
 
 def test_ellipse_passes_through_the_points_of_its_equation() -> None:
@@ -94,16 +104,16 @@ def test_ellipse_passes_through_the_points_of_its_equation() -> None:
 
 def test_figures_are_reproducible_and_leave_matplotlib_settings_alone(result) -> None:
     before = dict(mpl.rcParams)
-    one, other = (style.render(figures.bode(result.joints["FL_knee"])) for _ in range(2))
-    assert one == other
+    picture = style.render(figures.bode(result.joints["FL_knee"]))
+    assert style.render(figures.bode(result.joints["FL_knee"])) == picture
     assert dict(mpl.rcParams) == before
 
 
 def test_prediction_shows_where_the_nominal_simulation_is_worst() -> None:
-    one = joint_prediction()
-    window = figures.busiest_window(one, 1.0)
-    assert one.time[window][[0, -1]] == pytest.approx([4.0, 5.0], abs=0.1)
-    assert figures.busiest_window(one, 100.0) == slice(0, len(one.time))
+    prediction = joint_prediction()
+    window = figures.busiest_window(prediction, 1.0)
+    assert prediction.time[window][[0, -1]] == pytest.approx([4.0, 5.0], abs=0.1)
+    assert figures.busiest_window(prediction, 100.0) == slice(0, len(prediction.time))
 
 
 def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
@@ -113,12 +123,13 @@ def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
     assert list(distance) == ["naive", "matched"]  # as in the paper
     panel = trial_figures.JumpPanel(label="distance [m]", values=distance, published=paper)
     axes = trial_figures.draw_jumps([panel]).axes[0]
-    points = {
-        (round(float(y), 6), round(float(np.ptp(bar.get_segments()[0][:, 1])) / 2.0, 6))
-        for line, _, bars in (one.lines for one in axes.containers)
-        for y in line.get_ydata()
-        for bar in bars
-    }
+    points = set()
+    for container in axes.containers:
+        line, _, bars = container.lines
+        for mean in line.get_ydata():
+            for bar in bars:
+                spread = float(np.ptp(bar.get_segments()[0][:, 1])) / 2.0
+                points.add((round(float(mean), 6), round(spread, 6)))
     # At 1 m/s the trunk flies its time in the air; a sample deviates by ten milliseconds.
     assert {(0.41, 0.01), (0.40, 0.02)} <= points
     for gains in ("naive", "matched"):
