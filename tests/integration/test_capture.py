@@ -104,17 +104,21 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
         model.body_ipos[body] = plant.body(name).ipos
     airborne = np.flatnonzero(~seen.contact.any(axis=1))
     flight = airborne[airborne < airborne[0] + 40]
-    centre = [data.subtree_com[1].copy() for data in posed(model, seen, flight)]
+    centre = []
+    for data in posed(model, seen, flight):
+        centre.append(data.subtree_com[1].copy())
     fit = np.polyfit(seen.time[flight], np.array(centre), 2)
     np.testing.assert_allclose(2.0 * fit[0], [0.0, 0.0, -9.81], atol=0.05)
 
 
 def test_power_is_what_the_battery_gives(seen: Capture) -> None:
     # Before any command, current squared times resistance.
-    constant, resistance = np.array([joint.drive.motor for joint in ROBOT.joints]).T
-    scale = np.array([SIM_PARAMS.joints[name].torque_scale for name in ROBOT.joint_names])
-    current = seen.torque[0] / (scale * constant)
-    heat = float(current**2 @ resistance)
+    heat = 0.0
+    for joint, torque in zip(ROBOT.joints, seen.torque[0], strict=True):
+        constant, resistance = joint.drive.motor
+        scale = SIM_PARAMS.joints[joint.name].torque_scale
+        current = float(torque) / (scale * constant)
+        heat += current**2 * resistance
     assert seen.electrical_power[0] == pytest.approx(heat, rel=0.02)
     assert heat > 1.0
     # The open-circuit voltage less what its resistance takes, a state later.
@@ -181,8 +185,11 @@ def test_capture_outlives_the_connection_and_is_stored(seen: Capture, tmp_path: 
 
 def test_files_that_are_no_capture(seen: Capture, tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
-    arrays = {part.name: getattr(seen, part.name) for part in fields(Capture)}
-    missing = {name: value for name, value in arrays.items() if name != "contact"}
+    arrays = {}
+    for part in fields(Capture):
+        arrays[part.name] = getattr(seen, part.name)
+    missing = dict(arrays)
+    del missing["contact"]
     for schema, stored, named in (
         ("pronk/capture/9", arrays, "pronk/capture/9"),
         (SCHEMA, {**arrays, "torque": seen.torque[:, :3]}, "torque"),

@@ -37,9 +37,9 @@ def env() -> Any:
     return built
 
 
-def ids(env: Any, kind: str, pattern: str) -> list[int]:
+def ids(env: Any, element: str, pattern: str) -> list[int]:
     """Return the ids of a part of every leg in the model."""
-    named = getattr(env.sim.mj_model, kind)
+    named = getattr(env.sim.mj_model, element)
     return [named(f"robot/{leg}_{pattern}").id for leg in BODY.legs]
 
 
@@ -107,7 +107,7 @@ def contacts(data: mujoco.MjData, geoms: list[int]) -> list[float]:
     """Return 1 for each geom that touches something, 0 for the others."""
     touching: set[int] = set()
     for contact in data.contact:
-        touching.update(int(geom) for geom in contact.geom)
+        touching.update(contact.geom.tolist())
     return [float(geom in touching) for geom in geoms]
 
 
@@ -211,7 +211,7 @@ def test_non_foot_contacts_are_counted(env: Any) -> None:
     parts = [env.sim.mj_model.geom("robot/trunk_collision").id]
     parts += ids(env, "geom", "thigh_collision") + ids(env, "geom", "shank_collision")
     states = references(env, state(env)[0][:3], np.zeros((3, 18)))
-    expected = [sum(contacts(s, parts)) for s in states]
+    expected = [sum(contacts(data, parts)) for data in states]
     env.step(torch.zeros(N, 12))
     assert expected[::2] == [1.0, 0.0]
     assert expected[1] >= 5.0
@@ -246,9 +246,9 @@ def test_layout_of_the_measured_vector(env: Any) -> None:
     anew = env.reset(env_ids=torch.tensor([4]))[0]
     close(measured(anew, "joint_position")[4], np.tile(state(env)[0][4, 7:] - DEFAULT, 3))
     close(measured(anew, "action")[4], 0.0)
-    others = torch.arange(N) != 4
+    running = torch.arange(N) != 4
     for name in ("joint_position", "joint_velocity", "action"):
-        assert torch.equal(measured(anew, name)[others], measured(groups, name)[others])
+        assert torch.equal(measured(anew, name)[running], measured(groups, name)[running])
 
 
 def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:
@@ -302,6 +302,9 @@ def test_layout_of_the_critic_vector(env: Any) -> None:
     trunk = rotations(qpos)
     feet = ids(env, "site", "foot")
     force = env.scene["feet"].data.force.norm(dim=-1)
+    foot_height = []
+    for reference in references(env, qpos, qvel):
+        foot_height.append(reference.site_xpos[feet, 2])
     expected = {
         "angular_velocity": qvel[:, 3:6],
         "projected_gravity": trunk.inv().apply([0.0, 0.0, -1.0]),
@@ -314,7 +317,7 @@ def test_layout_of_the_critic_vector(env: Any) -> None:
         "height": qpos[:, 2:3],
         "foot_contact": seen["estimator_target"][:, :4],
         "foot_force": force / (12.0 * 9.81),
-        "foot_height": [d.site_xpos[feet, 2] for d in references(env, qpos, qvel)],
+        "foot_height": foot_height,
         # Nominal.
         "voltage": 1.0,
         "no_load": 1.0,
@@ -345,7 +348,10 @@ def test_contacts_are_those_of_the_present_state(env: Any, resets: bool) -> None
         assert torch.equal(groups["critic"][1:, where(CRITIC, "foot_contact")], seen[-1])
         qpos, qvel = state(env)
         feet = ids(env, "geom", "foot_collision")
-        expected.append([contacts(s, feet) for s in references(env, qpos[1:], qvel[1:])])
+        robots = []
+        for reference in references(env, qpos[1:], qvel[1:]):
+            robots.append(contacts(reference, feet))
+        expected.append(robots)
     close(torch.stack(seen), expected)
     assert 0.1 < np.mean(expected) < 0.9
 

@@ -48,6 +48,9 @@ def matched(
     robot_name: str = "mini_cheetah", simulator: str = "mjlab", only: str = "", **extra: float
 ) -> MatchedGains:
     robot = load_robot(robot_name)
+    extra_values = {}
+    for name, value in extra.items():
+        extra_values[name] = FittedValue(value=value)
     joints = {}
     for i, joint in enumerate(robot.joints):
         if joint.name.endswith(only):
@@ -55,7 +58,7 @@ def matched(
                 stiffness=FittedValue(value=joint.stiffness + 0.3 * i),
                 damping=FittedValue(value=joint.damping + 0.004 * i),
                 armature=FittedValue(value=joint.drive.armature),
-                **{name: FittedValue(value=value) for name, value in extra.items()},
+                **extra_values,
             )
     return MatchedGains(
         robot=robot.name,
@@ -104,9 +107,10 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
     for index, (name, group) in enumerate(gains.groups.items()):
         cfg = space["ACTUATORS"][index]
         event = space["EVENTS"][f"{name}_gains"]
-        drive = ROBOT.group(name)[0].drive
+        joints = ROBOT.group(name)
+        drive = joints[0].drive
         assert type(cfg).__name__ == TARGETS[target].config_class
-        assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
+        assert cfg.target_names_expr == tuple(joint.name for joint in joints)
         assert (cfg.stiffness, cfg.damping) == (group.stiffness, group.damping)
         assert cfg.armature == pytest.approx(drive.armature)
         assert cfg.frictionloss == 0.15
@@ -117,8 +121,9 @@ def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
         assert (cfg.delay_min_lag, cfg.delay_max_lag) == (2, 2)
         assert event.params["asset_cfg"].actuator_ids == [index]
         assert event.params["operation"] == "abs"
-        ends = group.stiffness - group.stiffness_range, group.stiffness + group.stiffness_range
-        assert event.params["kp_range"] == pytest.approx(ends)
+        softest = group.stiffness - group.stiffness_range
+        stiffest = group.stiffness + group.stiffness_range
+        assert event.params["kp_range"] == pytest.approx((softest, stiffest))
 
 
 @pytest.mark.parametrize("target", [name for name in TARGETS if name.startswith("isaaclab")])
@@ -131,9 +136,11 @@ def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
             calls.append(node)
     assert len(calls) == len(gains.groups)
     for call, group in zip(calls, gains.groups.values(), strict=True):
-        values = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        values = {}
+        for keyword in call.keywords:
+            values[keyword.arg] = ast.literal_eval(keyword.value)
         assert set(values) <= ISAACLAB["2.3" if target.endswith("2.3") else "3.0"]
-        assert any("effort_limit" in str(name) for name in values)
+        assert "effort_limit" in " ".join(map(str, values))
         assert values["stiffness"] == group.stiffness
         assert values["friction"] == 0.15
         assert values.get("dynamic_friction", 0.15) == 0.15
@@ -162,12 +169,17 @@ def test_genesis_text_sets_every_parameter_of_every_joint() -> None:
     robot = load_robot("go2")
     assert list(space["JOINTS"])[:3] == ["FR_hip_joint", "FL_hip_joint", "RR_hip_joint"]
     assert called["set_dofs_kp"][1] == list(range(6, 18))
-    names = [f"{leg}_{part}" for part in robot.groups for leg in robot.legs]
-    for argument, field in (("kp", "stiffness"), ("armature", "armature")):
-        expected = [getattr(gains.joints[name], field).value for name in names]
-        assert called[f"set_dofs_{argument}"][0] == pytest.approx(expected)
+    stiffness = []
+    armature = []
+    for part in robot.groups:
+        for leg in robot.legs:
+            joint_gains = gains.joints[f"{leg}_{part}"]
+            stiffness.append(joint_gains.stiffness.value)
+            armature.append(joint_gains.armature.value)
+    assert called["set_dofs_kp"][0] == pytest.approx(stiffness)
+    assert called["set_dofs_armature"][0] == pytest.approx(armature)
     low, high, _ = called["set_dofs_force_range"]
-    assert high == [-value for value in low]
+    assert high == np.negative(low).tolist()
     assert {*called} == {f"set_dofs_{name}" for name in TARGETS["genesis"].arguments}
 
 
@@ -274,7 +286,8 @@ def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     gains = matched("so101", name, delay_s=delay)
     model = mujoco.MjModel.from_xml_string(export(gains, "mjcf", arm, per="joint"))
     snippet = export(gains, "mjcf-snippet", arm, per="joint")
-    assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
+    for joint in arm.joint_names:
+        assert f'joint="{joint}"' in snippet
     simulated_arm = framework.robot(arm)
     command, expected = motion(simulated_arm, drives_of(simulated_arm, gains))
     assert_moves(model, command, expected, steps=framework.iterations)
@@ -375,16 +388,15 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
             high = scale
         else:
             low = scale
-    rest = {joint.name: joint.default_position for joint in joints}
     with Chain(robot, "gripper", threads=1) as chain:
-        pose = np.array([rest[joint] for joint in chain.joints])
+        pose = np.array([robot.joint(name).default_position for name in chain.joints])
         values = {name: np.empty((2, len(pose))) for name in GAINS}
         start = []
         for run, share in enumerate((0.97, 1.03)):
-            by_name = {one.name: one for one in scaled(share * low)}
-            for column, joint in enumerate(chain.joints):
-                values["stiffness"][run, column] = by_name[joint].stiffness
-                values["damping"][run, column] = by_name[joint].damping
+            for actuator in scaled(share * low):
+                column = chain.joints.index(actuator.name)
+                values["stiffness"][run, column] = actuator.stiffness
+                values["damping"][run, column] = actuator.damping
             start.append(chain.rest_position(pose, values["stiffness"][run]))
         command = np.broadcast_to(pose, (2, 400, len(pose)))
         moved = chain.rollout(command, values, np.array(start) + 1e-7) - np.array(start)[:, None]
@@ -394,9 +406,9 @@ def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
 
 def test_unstable_gains_are_refused() -> None:
     gains = matched("go2")
-    joints = {
-        name: replace(one, damping=FittedValue(value=25.0)) for name, one in gains.joints.items()
-    }
+    joints = {}
+    for name, joint_gains in gains.joints.items():
+        joints[name] = replace(joint_gains, damping=FittedValue(value=25.0))
     groups = group_gains(load_robot("go2"), joints)
     with pytest.raises(PronkError, match="times the limit of drive law E"):
         export(replace(gains, joints=joints, groups=groups), "mjlab")
@@ -408,8 +420,8 @@ def test_unknown_target_and_foreign_robot_are_refused() -> None:
         export(matched(), "gazebo")
     with pytest.raises(PronkError, match="so101"):
         exported_actuators(matched(), load_robot("so101"))
-    own = replace(matched().simulator, profile="", engine="bullet")
+    bullet = replace(matched().simulator, profile="", engine="bullet")
     with pytest.raises(PronkError, match="simulator bullet, whose drive law"):
-        export(replace(matched(), simulator=own), "mjlab")
+        export(replace(matched(), simulator=bullet), "mjlab")
     with pytest.raises(PronkError, match="--robot PATH"):
         export(replace(matched(), robot="mine"), "mjlab")
