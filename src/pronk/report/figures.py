@@ -159,7 +159,9 @@ def bode(joint: JointResult, *, title: str | None = None, coherence: bool = True
     curves = _simulated_curves(responses)
     ratios = [3.0, 2.0, 0.8] if coherence else [3.0, 2.0]
     height = 1.0 + sum(ratios)
-    with drawing(len(ratios), height=height, sharex=True, height_ratios=ratios) as (figure, grid):
+    with drawing(
+        len(ratios), height=height, sharex=True, height_ratios=ratios, fixed_margins=True
+    ) as (figure, grid):
         gain_axes = grid[0, 0]
         phase_axes = grid[1, 0]
         gain_axes.set_ylabel("gain [dB]")

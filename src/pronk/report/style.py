@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pronk.files import written_whole
@@ -35,6 +35,9 @@ BAND = "#f3efe2"
 
 PAGE_WIDTH_IN = 10.0
 """Width of a figure: 10 in at 96 px/in is the 960 px column of the page."""
+_MARGINS_IN = {"left": 0.8, "right": 0.1, "bottom": 0.95, "top": 0.3}
+"""Room about the axes of a figure with fixed margins, for labels of up to five characters, a title,
+and a legend of two rows below [in]."""
 LEG_MARKERS = {"FR": "o", "FL": "s", "HR": "^", "HL": "D"}
 """Marker of each leg, in file order; joints of other robots take the first."""
 Sharing = bool | Literal["row", "col"]
@@ -112,6 +115,7 @@ def drawing(
     sharex: Sharing = False,
     sharey: Sharing = False,
     height_ratios: Sequence[float] | None = None,
+    fixed_margins: bool = False,
 ) -> Iterator[tuple[Figure, NDArray[Any]]]:
     """Make a figure of page width, with a grid of axes in pronk's look.
 
@@ -122,12 +126,15 @@ def drawing(
         sharex: Axes that share the horizontal axis: none, all, or those of a row or column.
         sharey: Axes that share the vertical axis.
         height_ratios: Relative heights of the rows; equal if None.
+        fixed_margins: Whether the margins are `_MARGINS_IN`. Otherwise they are fitted to the
+            labels, which takes as long as the drawing itself.
 
     Yields:
         The figure, and its axes, shape (rows, columns).
     """
     with mpl.rc_context(_RC):  # type: ignore[arg-type]
-        figure = Figure(figsize=(PAGE_WIDTH_IN, height), layout="constrained")
+        layout = "none" if fixed_margins else "constrained"
+        figure = Figure(figsize=(PAGE_WIDTH_IN, height), layout=layout)  # type: ignore[arg-type]
         axes = figure.subplots(
             rows,
             columns,
@@ -136,6 +143,14 @@ def drawing(
             sharey=sharey,
             height_ratios=height_ratios,
         )
+        if fixed_margins:
+            figure.subplots_adjust(
+                left=_MARGINS_IN["left"] / PAGE_WIDTH_IN,
+                right=1.0 - _MARGINS_IN["right"] / PAGE_WIDTH_IN,
+                bottom=_MARGINS_IN["bottom"] / height,
+                top=1.0 - _MARGINS_IN["top"] / height,
+                hspace=0.1,
+            )
         yield figure, axes
 
 
@@ -223,7 +238,7 @@ def legend(
     """
     figure.legend(
         handles=keys,
-        loc="outside lower center",
+        loc="outside lower center" if figure.get_layout_engine() else "lower center",
         ncols=columns or min(len(keys), 6),
         facecolor=facecolor,
         frameon=facecolor is not None,
@@ -244,7 +259,7 @@ def frequency_axis(axes: Axes, low_hz: float, high_hz: float) -> None:
     axes.set_xlim(low_hz, high_hz)
     axes.xaxis.set_major_locator(FixedLocator(ticks_hz))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def render(figure: Figure, kind: str = "svg", *, dpi: float = 130.0) -> bytes:
