@@ -40,6 +40,7 @@ from pronk.identify.logs.readers import read_log
 from pronk.identify.match.result import load_match
 from pronk.jump.trial import results
 from pronk.jump.virtual import capture
+from pronk.tables import Cell, Column, Table
 from tests.deploy_strikes import TIMING, WALKING_ROBOT, begin_to_walk, drive_until, motion_of
 
 Program = Literal["sweep", "sweep-lcm", "match", "trial", "deploy"]
@@ -53,6 +54,17 @@ ENDS_S = 10.0
 """Longest time until the other processes have ended [s]."""
 DAMPED_S = 0.5
 """Longest time until damping [s]."""
+COLUMNS = {
+    "program": Column(heading="program"),
+    "process": Column(heading="process"),
+    "n": Column(heading="n"),
+    "faults": Column(heading="faults"),
+    "aside": Column(heading="aside"),
+    "traceback": Column(heading="traceback"),
+    "damped_s": Column(heading="damped after at most", unit="s"),
+    "ends_s": Column(heading="all ended after at most", unit="s", digits=2),
+}
+"""Columns of the table by the names of the counts."""
 _JOINTS = ("FR_hip_pitch", "FR_knee", "FL_hip_pitch", "FL_knee")
 _EMPTY = 2**16
 """A log of at most so many bytes may hold no sample yet."""
@@ -366,25 +378,25 @@ def kills(
     by = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
     for row in rows:
         by[row["program"], row["target"]].append(row)
-    table = []
+    counts = []
+    cells: list[tuple[Cell, ...]] = []
     for (program_name, target), of_target in sorted(by.items()):
-        table.append(
-            {
-                "program": program_name,
-                "process": target,
-                "n": len(of_target),
-                "faults": len([row for row in of_target if row["faults"]]),
-                "damped_s": max(row.get("damped_s") or 0.0 for row in of_target),
-                "ends_s": max(row["ends_s"] for row in of_target),
-                "aside": sum(row["aside"] for row in of_target),
-                "traceback": len([row for row in of_target if "printed" in row]),
-            }
-        )
-    columns = {name: name for name in ("program", "process", "n", "faults", "aside", "traceback")}
-    columns |= {"damped after at most [s];3": "damped_s", "all ended after at most [s];2": "ends_s"}
-    console.show_rows(f"{len(rows)} kills, seed {seed}", columns, table)
+        count_row = {
+            "program": program_name,
+            "process": target,
+            "n": len(of_target),
+            "faults": len([row for row in of_target if row["faults"]]),
+            "damped_s": max(row.get("damped_s") or 0.0 for row in of_target),
+            "ends_s": max(row["ends_s"] for row in of_target),
+            "aside": sum(row["aside"] for row in of_target),
+            "traceback": len([row for row in of_target if "printed" in row]),
+        }
+        counts.append(count_row)
+        cells.append(tuple(count_row[column] for column in COLUMNS))
+    title = f"{len(rows)} kills, seed {seed}"
+    console.show(Table(title=title, columns=tuple(COLUMNS.values()), rows=tuple(cells)))
     for row in rows:
         if row["faults"]:
             console.say(json.dumps(row))
     failed = sum(bool(row["faults"]) for row in rows)
-    return console.Outcome(figures={"rows": table, "faults": failed}, status=1 if failed else 0)
+    return console.Outcome(figures={"rows": counts, "faults": failed}, status=1 if failed else 0)

@@ -20,6 +20,7 @@ from benchmarks.runner import finish, in_parallel
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.identify.simulators.probe import probe_joint
+from pronk.tables import Cell, Column, Table
 from tests.drawn_simulator import ENGINES, FAULTS, DrawnSimulator, draw_truth, score
 
 
@@ -68,7 +69,7 @@ def probe(
                     file.write(json.dumps(case_score) + "\n")
             report("probe", len(scores) / count)
     faulty = sum(bool(case_score["fault"]) for case_score in scores)
-    cells = []
+    cells: list[tuple[Cell, ...]] = []
     for title, key in (
         ("law", "law_right"),
         ("hold", "hold_right"),
@@ -87,5 +88,10 @@ def probe(
         values = factor * np.array([float(case_score[key]) for case_score in scores])
         cells.append((title, f"{np.median(values):.2g} (largest {values.max():.2g})"))
     title = f"Random simulators, seed {seed}: {', '.join(kinds)}"
+    table = Table(
+        title=title,
+        columns=(Column(heading="of the joint"), Column(heading="probe")),
+        rows=tuple(cells),
+    )
     figures = {str(case_score["number"]): case_score for case_score in scores}
-    return finish(figures, console.table(title, ["of the joint", "probe"], cells))
+    return finish(figures, table)

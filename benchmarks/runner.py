@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from rich.table import Table as RichTable
 
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -78,7 +77,7 @@ def machine(*packages: str) -> dict[str, str]:
     }
 
 
-def finish(figures: dict[str, Any], *tables: Table | RichTable) -> console.Outcome:
+def finish(figures: dict[str, Any], *tables: Table) -> console.Outcome:
     """Print the tables of a benchmark."""
     for each in tables:
         console.show(each)

@@ -43,6 +43,7 @@ from pronk.policy.runtime import load_policy
 from pronk.policy.script import STILL, Velocity
 from pronk.robots import load_robot
 from pronk.robots.machine import State
+from pronk.tables import Cell, Column, Table
 
 SERVO_HZ = 500
 STEP_TICKS = 10
@@ -396,11 +397,11 @@ def supervision(
                 flown_s = sum(flight.get("seconds", 0.0) for flight in rows)
                 report("walking and jumping", min(flown_s / (3600.0 * hours), 1.0))
     flights = [row for row in rows if "flight" in row]
-    largest = []
+    largest_rows: list[tuple[Cell, ...]] = []
     for name, (limit, _) in QUANTITIES.items():
         values = [row["largest"][name] for row in flights if name in row["largest"]]
         value = (min if name.startswith("least") else max)(values, default=math.nan)
-        largest.append((name, f"{value:.4f}", f"{limit:g}"))
+        largest_rows.append((name, value, f"{limit:g}"))
     for row in flights:
         if row["alarm"]:
             console.say(f"flight {row['flight']}, {row['alarm']}")
@@ -410,8 +411,18 @@ def supervision(
         f"{sets} parameter sets, {sum(row['jumps'] for row in flights)} jumps: "
         f"{sum(bool(row['alarm']) for row in flights)} false alarms"
     )
-    caption = ", ".join(f"{name} {number}" for name, number in ends.items())
-    cells = []
+    end_counts = ", ".join(f"{name} {number}" for name, number in ends.items())
+    largest_table = Table(
+        title=title,
+        columns=(
+            Column(heading="quantity"),
+            Column(heading="largest", digits=4),
+            Column(heading="limit"),
+        ),
+        rows=tuple(largest_rows),
+        notes=(f"Ends of the flights: {end_counts}.",),
+    )
+    fault_rows: list[tuple[Cell, ...]] = []
     for name in FAULTS:
         of_fault = [row for row in rows if row.get("fault") == name]
         times = 1e3 * np.array([row["time_s"] for row in of_fault])
@@ -424,11 +435,12 @@ def supervision(
             worst = f"{np.nanmax(times):.0f}"
         reasons = Counter(row["reason"] for row in of_fault)
         texts = ", ".join(f"{reason} {number}" for reason, number in reasons.items())
-        cells.append((name, median, worst, f"{len(of_fault) - missed}/{len(of_fault)}", texts))
-    return finish(
-        {"rows": rows},
-        console.table(title, ["quantity", "largest", "limit"], largest, caption),
-        console.table(
-            "From a fault to damping [ms]", ["fault", "median", "worst", "found", "reasons"], cells
-        ),
+        found = f"{len(of_fault) - missed}/{len(of_fault)}"
+        fault_rows.append((name, median, worst, found, texts))
+    headings = ("fault", "median", "worst", "found", "reasons")
+    fault_table = Table(
+        title="From a fault to damping [ms]",
+        columns=tuple(Column(heading=heading) for heading in headings),
+        rows=tuple(fault_rows),
     )
+    return finish({"rows": rows}, largest_table, fault_table)

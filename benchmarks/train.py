@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from benchmarks.runner import finish, in_turn, machine, paired_ratio, spread
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.tables import Cell, Column, Table
 
 TASKS = ("Pronk-Jump-MiniCheetah", "Mjlab-Velocity-Flat-Unitree-Go1")
 ACTION_STD = 0.1
@@ -253,11 +253,14 @@ def rate_table(found: dict[str, Any]) -> Table:
     """Rates of both tasks and their ratios."""
     version, blocks = found["machine"], found["blocks"]
     captured = all(one["cuda_graphs"] for pair in found["pairs"] for one in pair)
-    caption = (
+    blocks_note = (
         f"{blocks['repeats']} blocks of {blocks['steps']} steps and of {blocks['iterations']} "
         "iterations for each task, in turn; the ratio is of neighbouring blocks. Stepping: small "
         "random actions, nothing but the environment. Training: the task's own networks and PPO, "
-        f"with logging, without checkpoints.\n{version['device']}, "
+        "with logging, without checkpoints."
+    )
+    machine_note = (
+        f"{version['device']}, "
         f"{'with' if captured else 'WITHOUT'} CUDA graphs, mjlab {version['mjlab']}, MuJoCo Warp "
         f"{version['mujoco-warp']}, rsl_rl {version['rsl-rl-lib']}, PyTorch {version['torch']}; "
         f"{found['seconds']:.0f} s in all."
@@ -268,19 +271,24 @@ def rate_table(found: dict[str, Any]) -> Table:
         return spread((float(np.median(thousands)), thousands.min(), thousands.max()), 1)
 
     title = "Environment steps per second, in thousands: median (slowest to fastest block)"
-    columns = ["environments", "what", *(one["task"] for one in found["pairs"][0]), "ratio"]
-    made = console.table(title, columns, caption=caption)
+    columns = [Column(heading="environments"), Column(heading="what")]
+    for task_rates in found["pairs"][0]:
+        columns.append(Column(heading=task_rates["task"]))
+    columns.append(Column(heading="ratio"))
+    rows: list[tuple[Cell, ...]] = []
     for pair, ratios in zip(found["pairs"], found["ratios"], strict=True):
-        made.add_section()
         for what, ratio in ratios.items():
-            rates = (rate(one[what]) for one in pair)
-            made.add_row(f"{pair[0]['envs']:,}", what, *rates, spread(ratio))
-        made.add_row("", "physics steps a step", *(f"{s['physics_per_step']:.2f}" for s in pair))
+            task_cells = [rate(task_rates[what]) for task_rates in pair]
+            rows.append((f"{pair[0]['envs']:,}", what, *task_cells, spread(ratio)))
+        physics_cells = [f"{task_rates['physics_per_step']:.2f}" for task_rates in pair]
+        rows.append(("", "physics steps a step", *physics_cells, ""))
     for count, rates in found["scaling"].items():
         times = f"x{np.median(rates) / np.median(found['scaling'][1]):.2f}"
         envs = f"{found['pairs'][0][0]['envs']:,} each"
-        made.add_row(envs, f"training, GPUs: {count}", rate(rates), "", times)
-    return made
+        rows.append((envs, f"training, GPUs: {count}", rate(rates), "", times))
+    return Table(
+        title=title, columns=tuple(columns), rows=tuple(rows), notes=(blocks_note, machine_note)
+    )
 
 
 def train(

@@ -36,6 +36,7 @@ from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from pronk.tables import Cell, Column, Table
 from tests.corrupted_logs import CORRUPTIONS, REFUSED, Case, judge, without_extra_columns
 
 ROBOT = "mini_cheetah"
@@ -165,16 +166,16 @@ def run(
     return rows
 
 
-def table_rows(cases: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+def table_rows(cases: Sequence[dict[str, Any]]) -> list[tuple[Cell, ...]]:
     """Count the outcomes of each corruption and kind of log."""
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for name in (RIGHT, *CORRUPTIONS):
         for kind in KINDS:
             of_row = [case for case in cases if (case["corruption"], case["log"]) == (name, kind)]
             outcomes = [case["outcome"] for case in of_row]
-            counts = [str(outcomes.count(outcome)) for outcome in OUTCOMES]
+            counts = [outcomes.count(outcome) for outcome in OUTCOMES]
             wrong = sum(1 for case in of_row if case["wrong"])
-            rows.append((name, kind, *counts, str(wrong)))
+            rows.append((name, kind, *counts, wrong))
     return rows
 
 
@@ -192,7 +193,13 @@ def wrong_inputs(
     begin = time.perf_counter()
     with console.progress() as report:
         judged = run(cases, seed, cache, report, jobs=jobs)
-    columns = ("corruption", "log", *OUTCOMES, "wrong number, silent")
-    caption = f"{cases} cases a row, seed {seed}; {time.perf_counter() - begin:.0f} s"
+    headings = ("corruption", "log", *OUTCOMES, "wrong number, silent")
+    note = f"{cases} cases a row, seed {seed}; {time.perf_counter() - begin:.0f} s"
+    table = Table(
+        title="Wrong inputs",
+        columns=tuple(Column(heading=heading) for heading in headings),
+        rows=tuple(table_rows(judged)),
+        notes=(note,),
+    )
     figures = {"schema": "pronk/bench-wrong-inputs/2", "cases": judged}
-    return finish(figures, console.table("Wrong inputs", columns, table_rows(judged), caption))
+    return finish(figures, table)

@@ -68,6 +68,7 @@ from pronk.report import deploy_run
 from pronk.robots import load_robot
 from pronk.robots.bare import yaml_of_model
 from pronk.robots.load import read_model, read_robot
+from pronk.tables import Cell, Column, Table
 
 _TORCH = importlib.util.find_spec("torch") is not None
 ROOT = Path(__file__).parents[1]
@@ -491,18 +492,34 @@ def _outcome(found: list[dict[str, Any]], seed: int) -> console.Outcome:
     by_kind = collections.defaultdict[str, list[dict[str, Any]]](list)
     for row in found:
         by_kind[row["kind"]].append(row)
-    table = [
-        {"kind": kind, "n": len(rows)}
-        | {what: sum(row["outcome"] == what for row in rows) for what in ("read", "refused")}
-        | {"faults": sum(row["outcome"] == "fault" for row in rows)}
-        | {"longest_s": max(row["s"] for row in rows), "most_mb": max(row["mb"] for row in rows)}
-        for kind, rows in sorted(by_kind.items())
-    ]
-    columns = {name: name for name in ("kind", "n", "read", "refused", "faults")}
-    columns = {**columns, "longest [s];2": "longest_s", "most memory [MB];0": "most_mb"}
-    console.show_rows(f"{len(found)} mutated files, seed {seed}", columns, table)
+    counts = []
+    cells: list[tuple[Cell, ...]] = []
+    for kind, rows in sorted(by_kind.items()):
+        outcomes = [row["outcome"] for row in rows]
+        count_row = {
+            "kind": kind,
+            "n": len(rows),
+            "read": outcomes.count("read"),
+            "refused": outcomes.count("refused"),
+            "faults": outcomes.count("fault"),
+            "longest_s": max(row["s"] for row in rows),
+            "most_mb": max(row["mb"] for row in rows),
+        }
+        counts.append(count_row)
+        cells.append(tuple(count_row.values()))
+    columns = (
+        Column(heading="kind"),
+        Column(heading="n"),
+        Column(heading="read"),
+        Column(heading="refused"),
+        Column(heading="faults"),
+        Column(heading="longest", unit="s", digits=2),
+        Column(heading="most memory", unit="MB", digits=0),
+    )
+    title = f"{len(found)} mutated files, seed {seed}"
+    console.show(Table(title=title, columns=columns, rows=tuple(cells)))
     faults = [row for row in found if row["outcome"] == "fault"]
     for row in faults[:60]:
         console.say(f"{row['i']} {row['kind']}: {row['why']}")
-    figures = {"count": len(found), "faults": len(faults), "kinds": table}
+    figures = {"count": len(found), "faults": len(faults), "kinds": counts}
     return console.Outcome(figures=figures, status=1 if faults else 0)

@@ -10,7 +10,7 @@ import json
 import os
 import select
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from rich.text import Text
 
 from pronk.errors import HardwareError
 from pronk.files import write_text
-from pronk.tables import Column, Table
+from pronk.tables import Table
 
 _PIPED_WIDTH = 200
 """Characters of a line where standard output is not a terminal."""
@@ -98,17 +98,11 @@ def _json_value(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
 
 
-def show(table: Table | RichTable) -> None:
+def show(table: Table) -> None:
     """Print a table and its notes.
 
     A stream that is not a terminal gets the width that the table needs.
     """
-    if isinstance(table, RichTable):  # Until the last caller of `table` below is converted.
-        console = Console(highlight=False)
-        if not console.is_terminal:
-            console = Console(highlight=False, width=_PIPED_WIDTH)
-        console.print(table)
-        return
     rich_table = RichTable(
         title=Text(table.title), title_style="bold", header_style="bold", title_justify="left"
     )
@@ -126,44 +120,6 @@ def show(table: Table | RichTable) -> None:
     console.print(rich_table)
     for sentence in table.notes:
         say(f"  {sentence}")
-
-
-def table(
-    title: str, columns: Iterable[str], rows: Iterable[Sequence[str]] = (), caption: str = ""
-) -> RichTable:
-    """Make a table of text; to be replaced by `pronk.tables.Table`."""
-    made = RichTable(title=Text(title), title_style="bold", header_style="bold")
-    made.caption = Text(caption) if caption else None
-    made.title_justify = made.caption_justify = "left"
-    for i, column in enumerate(columns):
-        made.add_column(Text(column), justify="right" if i else "left", no_wrap=not i)
-    for cells in rows:
-        made.add_row(*map(Text, cells))
-    return made
-
-
-def show_sheet(sheet: Any, title: str = "") -> None:
-    """Print a sheet of text; to be replaced by `show`."""
-    if sheet is not None:
-        show(table(sheet.title or title, sheet.columns, sheet.rows))
-        for sentence in sheet.notes:
-            say(f"  {sentence}")
-
-
-def show_table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str) -> None:
-    """Print a table; to be replaced by `show`."""
-    parsed = []
-    for head in columns.split(" | "):
-        heading, _, digits = head.partition(";")
-        parsed.append(Column(heading=heading, digits=int(digits or 3)))
-    cells = tuple(tuple(row) for row in rows)
-    show(Table(title=title, columns=tuple(parsed), rows=cells, notes=notes))
-
-
-def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Print some fields of rows; to be replaced by `show`."""
-    cells = [[row[name] for name in columns.values()] for row in rows]
-    show_table(" | ".join(columns), cells, title=title)
 
 
 class Reporter(Progress):

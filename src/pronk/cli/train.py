@@ -8,6 +8,7 @@ from typing import Any
 
 from pronk.cli import console
 from pronk.jump.train.settings import TrainSettings
+from pronk.tables import Column, Table
 
 
 def train_command(settings: TrainSettings) -> console.Outcome:
@@ -54,8 +55,14 @@ def _show_phases(phases: Mapping[str, Mapping[str, Any]]) -> None:
                 figures["seconds"],
             )
         )
-    columns = "phase | iterations | environment steps | steps/s;0 | wall clock [s];1"
-    console.show_table(columns, rows, title="Training")
+    columns = (
+        Column(heading="phase"),
+        Column(heading="iterations"),
+        Column(heading="environment steps"),
+        Column(heading="steps/s", digits=0),
+        Column(heading="wall clock", unit="s", digits=1),
+    )
+    console.show(Table(title="Training", columns=columns, rows=tuple(rows)))
 
 
 def _next_steps(settings: TrainSettings, record: Mapping[str, Any]) -> list[str]:
