@@ -219,7 +219,7 @@ class Flight:
         jump = False
         change = math.inf
         jump_at = math.inf
-        entry = -1
+        mode_count = -1
         under_way: list[tuple[int, Any]] = []
         waiting: list[State] = []
         action = None
@@ -277,16 +277,16 @@ class Flight:
                 self.jumps += jump_at < math.inf
             jump = jump_at <= t < jump_at + 0.5
             if tick % STEP_TICKS == 0:
-                if entry != modes.entry:
+                if mode_count != modes.mode_count:
                     policy.reset()
-                    entry = modes.entry
+                    mode_count = modes.mode_count
                 live = modes.mode is Mode.POLICY
                 velocity = command if live else STILL
                 target = policy.step(measurement(newest), velocity, live and jump)
                 record = np.zeros((), ACTIONS)
                 record["sequence"] = tick
                 record["state_sequence"] = newest.sequence
-                record["entry"] = entry
+                record["mode_count"] = mode_count
                 record["made"] = t
                 record["valid_for"] = 0.05
                 record["position"] = target

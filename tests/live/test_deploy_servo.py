@@ -218,7 +218,7 @@ def test_a_pause_of_the_servo_is_no_clock_that_disagrees(link: FaultyLink) -> No
             record["state_time"] = now
             record["made"] = now
             record["valid_for"] = 2.0
-            record["entry"] = run.servo.modes.entry
+            record["mode_count"] = run.servo.modes.mode_count
             record["position"] = POSE
             return record
 

@@ -263,12 +263,12 @@ class Run:
             self.machine.faulted(self.t)
         return desired
 
-    def give(self, target: np.ndarray, entry: int | None = None) -> None:
+    def give(self, target: np.ndarray, mode_count: int | None = None) -> None:
         action = np.zeros((), dtype=ACTIONS)
         if self.action is not None:
             action["sequence"] = self.action["sequence"] + 1
         action["state_sequence"] = 3
-        action["entry"] = self.machine.entry if entry is None else entry
+        action["mode_count"] = self.machine.mode_count if mode_count is None else mode_count
         action["position"] = target
         action["state_time"] = self.t
         action["made"] = self.t
@@ -333,7 +333,7 @@ def test_the_whole_course() -> None:
     assert run.mode is Mode.POLICY
     np.testing.assert_allclose(desired.command.position, POSE)
     # An action for another mode is not followed; the first for this one is blended in.
-    run.give(POSE + 0.4, entry=run.machine.entry - 1)
+    run.give(POSE + 0.4, mode_count=run.machine.mode_count - 1)
     np.testing.assert_allclose(run.tick(0.02).command.position, POSE)
     run.give(POSE + 0.4)
     assert run.tick(0.02).blend == 0.0
@@ -376,15 +376,15 @@ def test_a_policy_without_a_first_action_is_a_fault() -> None:
 def test_commanded_to_sit_at_once_the_policy_still_acts(later: int) -> None:
     run = Run(halt_s=1.0).standing()
     run.tick(0.0, OperatorRequest.WALK)
-    walking = run.machine.entry
-    run.give(POSE + 0.4, entry=walking - 1)
+    walking = run.machine.mode_count
+    run.give(POSE + 0.4, mode_count=walking - 1)
     run.tick(0.002, OperatorRequest.SIT)
-    assert (run.mode, run.machine.entry) == (Mode.HALT, walking + 1)
+    assert (run.mode, run.machine.mode_count) == (Mode.HALT, walking + 1)
     # Its actions are for the halt, or still for the walk before it.
-    run.give(POSE + 0.4, entry=walking + later)
+    run.give(POSE + 0.4, mode_count=walking + later)
     assert run.tick(0.02).blend == 0.0
     for _ in range(20):
-        run.give(POSE + 0.4, entry=walking + later)
+        run.give(POSE + 0.4, mode_count=walking + later)
         desired = run.tick(0.02)
         assert desired.command is not None
     assert desired.blend == pytest.approx(1.0)

@@ -58,12 +58,12 @@ def states(count: int) -> list[State]:
     return made_states
 
 
-def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
+def publish(process: PolicyProcess, state: State, mode: Mode, mode_count: int) -> None:
     """What servo and operator write before a step."""
     record = np.zeros((), dtype=state_dtype(12))
     put_state(record, state)
     record["mode"] = mode
-    record["entry"] = entry
+    record["mode_count"] = mode_count
     process.shared.state.write(record)
     operator = np.zeros((), dtype=OPERATOR)
     operator["command"] = (1.0, -0.3, 99.0)
@@ -74,12 +74,12 @@ def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> Non
 def decided(process: PolicyProcess, warm_ups: int, states_seen: list[State]) -> list[bytes]:
     """Every bit that the steps of `WAY` wrote, with so many warm-ups before each."""
     pace = Pace(50.0)
-    entry = 0
+    mode_count = 0
     decisions = []
     for k, (state, mode) in enumerate(zip(states_seen, WAY, strict=True)):
         if k > 0 and mode is not WAY[k - 1]:
-            entry += 1
-        publish(process, state, mode, entry)
+            mode_count += 1
+        publish(process, state, mode, mode_count)
         if warm_ups:
             for _ in range(warm_ups + k):
                 process.warm_up()

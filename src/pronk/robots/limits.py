@@ -21,11 +21,15 @@ class OperatingLimits:
     damping: float = 5.0
     """Largest damping of a command [N m s/rad]."""
     margin: float = 0.05
-    """Distance between targets and the mechanical limits [rad]."""
+    """Distance that targets keep inwards from both mechanical limits [rad], positive:
+    `low + margin <= target <= high - margin`."""
     horizon_s: float = 0.02
-    """Time ahead [s]: a joint that would leave its limits in it is not driven further out."""
+    """Time for which the motion of a joint is extrapolated [s], positive. A joint with
+    `position + velocity horizon_s > high - margin` is not driven further up: its target is at most
+    its position; below `low + margin`, the target is at least its position."""
     change: float = 1.0
-    """Largest change of a target from one tick of the servo to the next [rad]."""
+    """Largest change of a target from one tick of the servo to the next, in either direction [rad],
+    positive: `|target - target sent a tick ago| <= change`."""
     power_w: float = 5000.0
     """Largest bus power of a command [W], computed from the torques that the drives can give at
     their speeds, with winding losses and without recovery."""

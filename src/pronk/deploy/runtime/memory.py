@@ -250,7 +250,10 @@ class Shared:
         return None if record is None else Mode(int(record["mode"]))
 
     def dropped(self) -> dict[str, int]:
-        """Return the number of records that did not fit into each queue to the logger."""
+        """Return the number of records that did not fit into a queue to the logger, by queue.
+
+        `policy_events` is not counted: its events are few.
+        """
         return {
             "ticks": self.ticks.dropped,
             "steps": self.steps.dropped,

@@ -25,7 +25,11 @@ POLICY_PRIORITY = 50
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """A robot at an address. It is pickled and sent to the servo's process."""
+    """A robot at an address.
+
+    It is pickled with the plan and sent to each process. The servo connects the machine; over a
+    network the standby process makes one too, to open a transport of its own.
+    """
 
     robot: str
     """Name or path of the robot."""
@@ -86,7 +90,9 @@ class RunPlan:
     action_valid_s: float = 0.05
     """Time for which an action of the policy is repeated: two and a half steps [s]."""
     operator_timeout_s: float = 0.3
-    """Time for which the operator's program may be silent [s]."""
+    """Time for which the heartbeat of the operator's program may be missing [s]. A program that was
+    killed or stopped is noticed after it. The heartbeat of one that hangs goes on for
+    `run._STALL_S`, 0.7 s, so it is noticed after the sum, by default 1.0 s."""
     standby_s: float = 0.04
     """Silence of the servo after which the standby process damps the joints [s]."""
     ignore_latency: bool = False

@@ -1,8 +1,9 @@
 """The policy's process: at 50 Hz from the newest state to an action for the servo.
 
 It steps from the moment the robot is damped, whether its actions are used or not: so the network is
-warm, and the latency is known, before the policy starts. Every change of mode resets the policy's
-history, except from `POLICY` to `HALT`.
+warm, and the latency is known, before the policy starts. At the first step after a change of mode
+the policy's history is reset, except from `POLICY` to `HALT`: there it is reset at the second step,
+20 ms later.
 
 Just before each step a second instance of the policy runs for warm-up: between two steps, 20 ms
 apart, the network's weights (2.8 MB) leave the caches, and a step takes five times as long as it
@@ -142,8 +143,10 @@ class PolicyProcess:
         self._highest_command = [high for _, high in ranges]
         self._pace: Pace | None = None
         """Pace of the steps, once the servo has written a state."""
-        self._entry = -1
+        self._mode_count = -1
+        """Number of mode changes (`state_dtype`) for which the history was last reset."""
         self._mode = Mode.IDLE
+        """Mode of the servo at the last step."""
         self._stopping = False
         self._parent = os.getppid()
         self._last_error = ""
@@ -198,12 +201,12 @@ class PolicyProcess:
         record = self.shared.state.read()
         if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
             mode = Mode(int(record["mode"]))
-            entry = int(record["entry"])
-            keeps_history = mode is Mode.HALT and self._mode is Mode.POLICY
-            if entry != self._entry and not keeps_history:
+            mode_count = int(record["mode_count"])
+            is_first_of_halt = mode is Mode.HALT and self._mode is Mode.POLICY
+            if mode_count != self._mode_count and not is_first_of_halt:
                 self.policy.reset()
                 self._history.reset()
-                self._entry = entry
+                self._mode_count = mode_count
             self._mode = mode
             try:
                 self._act(record, deadline, begun)
@@ -230,7 +233,7 @@ class PolicyProcess:
         action["sequence"] = self._count
         action["state_sequence"] = state.sequence
         action["state_time"] = state.time
-        action["entry"] = self._entry
+        action["mode_count"] = self._mode_count
         action["position"] = target
         action["made"] = begun
         action["valid_for"] = self.plan.action_valid_s

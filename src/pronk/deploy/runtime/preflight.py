@@ -1,4 +1,7 @@
-"""Checks of the states before anything moves. Every refusal is one sentence with its remedy.
+"""Checks before a run. Every refusal is one sentence with its remedy.
+
+`refusals` checks the states before anything moves. `delay_objection` checks the latency of the
+policy later, when the robot stands and the policy is requested.
 
 The link checks when it connects that no other program writes to the robot;
 `pronk.policy.contract.check` checks the policy against the robot.

@@ -49,7 +49,7 @@ def state_dtype(joints: int) -> np.dtype[Any]:
     """Return the record of the servo to all, written at every tick.
 
     The newest state; `now`, the time of this tick, and `start`, that of tick 0; `progress`, the
-    share of a sweep that is done; the mode, and `entry`, the number of mode changes.
+    share of a sweep that is done; the mode, and `mode_count`, the number of mode changes so far.
     """
     return np.dtype(
         [
@@ -58,7 +58,7 @@ def state_dtype(joints: int) -> np.dtype[Any]:
             ("start", _FLOAT),
             ("progress", _FLOAT),
             ("mode", _INT),
-            ("entry", _INT),
+            ("mode_count", _INT),
         ]
     )
 
@@ -67,18 +67,18 @@ ACTIONS = np.dtype(
     [
         ("sequence", _INT),
         ("state_sequence", _INT),
-        ("entry", _INT),
+        ("mode_count", _INT),
         ("state_time", _FLOAT),
         ("made", _FLOAT),
         ("valid_for", _FLOAT),
         ("position", _FLOAT, (JOINTS,)),
     ]
 )
-"""Record of the policy to the servo: joint targets, and the `entry` of the state record that they
-were computed from."""
+"""Record of the policy to the servo: joint targets, and the `mode_count` for which the policy's
+history was last reset, which is that of the state record except in the first step of HALT."""
 
 STANDBY = np.dtype([("time", _FLOAT)])
-"""Record of the standby process to the operator: when it began to damp [s]."""
+"""Record of the standby process to servo and operator: when it began to damp [s]."""
 
 OPERATOR = np.dtype(
     [

@@ -60,7 +60,7 @@ class SafetyInput:
     gyro: Array
     """Angular velocities of the trunk [rad/s], (..., 3)."""
     state_age: Array | float
-    """Age of the newest state [s]."""
+    """Age of the newest state, positive for one in the past [s]."""
     target: Array
     """Joint targets of the command [rad], (..., n)."""
     stiffness: Array
@@ -191,11 +191,22 @@ def limit_targets(
 ) -> tuple[Array, NDArray[np.int64], Mask]:
     """Move targets into all limits at once.
 
-    Each limit gives an interval for each joint's target: within the mechanical limits by a margin
-    (and no further out than the joint is, if it would leave them within the horizon), near the last
-    target, and where `stiffness (target - position) - damping velocity` stays within the torque.
-    The result is the point nearest to the wanted target in their intersection. If the bus power
-    there is too large, all torques are scaled by one factor, the solution of a quadratic equation.
+    Each limit gives an interval for each joint's target. With `margin`, `horizon_s` and `change` of
+    `OperatingLimits`, all positive, `low`, `high` and `torque` of `JointLimits`, and
+    `ahead = position + velocity horizon_s`:
+
+    - position: `floor <= target <= ceiling`, where `floor = low + margin`, or, if `ahead` is below
+      that, `max(low + margin, position)`; and `ceiling = high - margin`, or, if `ahead` is above
+      that, `min(high - margin, position)`. So a joint that leaves this range within the horizon is
+      not driven further out.
+    - change: `previous - change <= target <= previous + change`.
+    - torque: `|stiffness (target - position) - damping velocity| <= torque`, which is
+      `|target - (position + damping velocity / stiffness)| <= torque / stiffness`; a joint without
+      stiffness has no such interval, and its damping alone must stay within the torque.
+
+    The result is the point nearest to the target of the command in the intersection of the three.
+    If the bus power there is larger than `OperatingLimits.power_w`, all torques are scaled by one
+    factor, the solution of a quadratic equation.
 
     Args:
         position: Measured positions [rad], (..., n).

@@ -38,7 +38,9 @@ _BEAT_S = 0.01
 """Time between two heartbeats of the operator's program [s]."""
 _STALL_S = 0.7
 """Longest time that the operator's program may be late, on a busy computer or at a slow terminal,
-before its heartbeat ends; `RunPlan.operator_timeout_s` follows [s]."""
+before its heartbeat ends [s]. The servo damps when the heartbeat has been missing for
+`RunPlan.operator_timeout_s`, so a program that hangs has the sum of both, by default 1.0 s; one
+that was killed or stopped, whose heartbeat ends with it, has `operator_timeout_s` alone."""
 _START_S = 30.0
 """Time in which the servo must have opened the link [s]."""
 _END_S = 10.0
@@ -243,7 +245,11 @@ class Deployment:
         self._written.set()
 
     def _beat(self) -> None:
-        """Write the newest command with the time, as promptly as the servo; runs in a thread."""
+        """Write the newest command with the time, as promptly as the servo; runs in a thread.
+
+        It stamps a command anew until the command is `_STALL_S` old; the servo waits for another
+        `RunPlan.operator_timeout_s` before it damps (`Servo._operator`).
+        """
         if self.plan.real_time:
             with suppress(AttributeError, OSError):  # of this thread alone
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVO_PRIORITY))

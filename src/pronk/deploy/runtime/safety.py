@@ -31,7 +31,12 @@ LEAST_DAMPING_S = 1.0
 
 
 class SafetyFilter:
-    """The limits, and what lasts from one tick to the next. Times are on the machine's clock."""
+    """The limits, and what lasts from one tick to the next.
+
+    Times are on the clock of the states and commands that it is given: CLOCK_MONOTONIC in the
+    servo, which converts those of the machine; the machine's own clock in a sweep that is simulated
+    without a servo.
+    """
 
     def __init__(self, *, limits: Limits, state_rate_hz: float = LAG_RATE_HZ) -> None:
         """Begin without a fault.

@@ -1,8 +1,13 @@
-"""The servo: the one process that owns the machine and the only writer to it.
+"""The servo: the process that owns the machine, and the only writer to it while it runs.
 
 At 500 Hz, on absolute deadlines: collect states, take the desired command from the state machine,
-pass it through the safety filter, send. It runs no network and writes no files; what it measured
-and sent goes into a queue that never makes it wait. Whatever ends it, the joints are damped first.
+pass it through the safety filter, send. It runs no network. While it ticks it writes no file: what
+it measured and sent goes into a queue that never makes it wait. After the last tick it writes the
+trajectory of a virtual robot, if the plan asks for one.
+
+If a request, an error, SIGTERM or the end of the operator's program ends it, it damps the joints
+first. SIGKILL, or a stop of the whole process, leaves it no time for that: then the standby process
+(`pronk.deploy.runtime.standby`) writes to the robot over a transport of its own, and damps.
 """
 
 from __future__ import annotations
@@ -68,7 +73,28 @@ def serve_robot(
 
 
 class Servo:
-    """The loop and its figures."""
+    """The loop and its figures.
+
+    A tick (`_tick`) has this order; `decision_time` is read anew after step 4, because an action
+    may be younger than the begin of a tick that was interrupted:
+
+    1. Wait for the deadline and collect the states of the link. The tick begins: `tick_begun`.
+    2. Note the states that are new. In PREFLIGHT, check them and perhaps leave that mode.
+    3. Read the operator's mailbox: dead-man button, request, silence. Without any state so far,
+       publish and end the tick.
+    4. Read the policy's mailbox.
+    5. Add the faults that are known before a command exists: the standby process damps, the link
+       failed in step 1, the operator's program has ended.
+    6. Let the state machine grant the request, which may change the mode, and give the desired
+       command of the mode, which may change it again (HALT to SIT, SIT to DAMP) or add a fault
+       (swapped encoders, no first action).
+    7. Publish the state and the mode for the other processes.
+    8. Judge the desired command by the safety filter; damp where there is none.
+    9. Send the command, or damping; nothing in a mode of `SILENT`. It is on the wire: `sent_at`.
+    10. Add the fault of the link, if it failed in step 1 or 9 and the standby process is silent.
+    11. If any fault lasts, enter FAULT, and report a fault that is worse than before the tick.
+    12. Count, measure the latency and log.
+    """
 
     def __init__(self, plan: RunPlan, shared: Shared, trained_delay_s: tuple[float, float]) -> None:
         """Read the plan; nothing is opened yet."""
@@ -156,14 +182,22 @@ class Servo:
             "finished": self._finished,
             "faults": self.faults,
             "refusals": list(self.refusals),
-            # Without a log no process empties the queues to it, and nothing is lost.
+            # Without a log no process empties its queues: they fill up, and what they drop was not
+            # asked for. A sweep has no `plan.log` either; a dropped sample ends it.
             "dropped": {} if self.plan.log is None else self.shared.dropped(),
         }
 
     # --- the other processes ----------------------------------------------------------------------
 
     def _operator(self, now: float) -> tuple[bool, bool]:
-        """Read the operator's mailbox: dead-man button held, operator's program gone."""
+        """Read the operator's mailbox and take a new request.
+
+        Returns:
+            Whether the dead-man button is held, and whether the operator's program is gone: its
+            heartbeat has been missing for `RunPlan.operator_timeout_s`, or for ten times that since
+            the last change of mode if there never was one. The heartbeat of a program that hangs
+            goes on for `run._STALL_S`.
+        """
         record = self.shared.operator.read()
         timeout = self.plan.operator_timeout_s
         if record is None:
@@ -193,7 +227,7 @@ class Servo:
         record["start"] = self.pace.start
         record["progress"] = 0.0 if self._sweep is None else self._sweep.progress
         record["mode"] = self.modes.mode
-        record["entry"] = self.modes.entry
+        record["mode_count"] = self.modes.mode_count
         self.shared.state.write(record)
 
     # --- the loop ---------------------------------------------------------------------------------
@@ -229,7 +263,7 @@ class Servo:
         return self.modes.quitting and (self.modes.silent or (damped and long_enough))
 
     def _tick(self, machine: Machine) -> None:
-        """Wait for the tick's deadline; then take states, decide and send."""
+        """Wait for the tick's deadline; then take states, decide and send (order: `Servo`)."""
         deadline = self.pace.deadline
         link_error = ""
         try:
@@ -238,17 +272,17 @@ class Servo:
             states = []
             link_error = str(error)
             sleep_until(deadline)
-        begun = time.monotonic()
-        self.lateness.add(begun - deadline)
+        tick_begun = time.monotonic()
+        self.lateness.add(tick_begun - deadline)
         self._take(states)
         if self.modes.mode is Mode.PREFLIGHT:
-            self._preflight(machine, begun)
+            self._preflight(machine, tick_begun)
         if self._state is not None:
-            self._decide(machine, self._state, begun, link_error)
+            self._decide(machine, self._state, tick_begun, link_error)
         else:
             # Without a state nothing is decided, but requests are read.
-            self._operator(begun)
-            self._publish(begun)
+            self._operator(tick_begun)
+            self._publish(tick_begun)
         self.pace.advance(time.monotonic())
 
     def _take(self, states: list[State]) -> None:
@@ -299,47 +333,51 @@ class Servo:
         self.modes.preflighted(self.refusals, now)
         self._report("mode", self.modes.mode.name)
 
-    def _decide(self, machine: Machine, state: State, begun: float, link_error: str) -> None:
+    def _decide(self, machine: Machine, state: State, tick_begun: float, link_error: str) -> None:
         """Decide from the newest state what is written to the machine, and write it.
+
+        These are the steps 3 to 12 of a tick, in the order that `Servo` gives.
 
         Args:
             machine: The machine.
             state: Newest state.
-            begun: Time at which the tick began [s].
-            link_error: Error of the link in this tick; empty if there was none.
+            tick_begun: Time at which the tick began [s].
+            link_error: Error of the link while it waited for states; empty if there was none.
         """
-        self.age.add(max(0.0, begun - state.time))
-        mode = self.modes.mode
-        level = self.safety.level
-        dead_man, gone = self._operator(begun)
-        fresh = self._read_action()
+        self.age.add(max(0.0, tick_begun - state.time))
+        mode_before = self.modes.mode
+        level_before = self.safety.level
+        dead_man_held, operator_is_gone = self._operator(tick_begun)
+        action_is_new = self._read_action()
         # An action may be younger than the begin of a tick that was interrupted.
-        now = time.monotonic()
+        decision_time = time.monotonic()
 
         standby_damps = self.shared.standby.written > 0
         if standby_damps:
             # Its commands are another program's to the link.
-            self.safety.fault(Reason.STANDBY, begun)
+            self.safety.fault(Reason.STANDBY, tick_begun)
         elif link_error:
-            self.safety.fault(Reason.LINK, begun)
-        if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
-            self.safety.fault(Reason.ENDED, begun)
+            self.safety.fault(Reason.LINK, tick_begun)
+        if operator_is_gone and mode_before not in (Mode.IDLE, Mode.PREFLIGHT):
+            self.safety.fault(Reason.ENDED, tick_begun)
         objection = ""
-        if mode is Mode.STAND and not self.plan.ignore_latency:
+        if mode_before is Mode.STAND and not self.plan.ignore_latency:
             objection = delay_objection(
                 self.latency.quantile(0.95), self.latency.count, self.trained_delay_s
             )
 
-        self.modes.grant(now, state.position, self.safety, objection)
+        self.modes.grant(decision_time, state.position, self.safety, objection)
         limits = self.safety.limits
         if self._sweep is not None and self.modes.mode is Mode.SWEEP:
-            desired = self.modes.follow_sweep(now, self._sweep_command(self._sweep, now))
+            desired = self.modes.follow_sweep(
+                decision_time, self._sweep_command(self._sweep, decision_time)
+            )
             limits = self._sweep.limits
         else:
-            desired = self.modes.desired(now, state.position, self.safety, self.action)
+            desired = self.modes.desired(decision_time, state.position, self.safety, self.action)
         if self.modes.notice:
             self._report("notice", self.modes.notice)
-        self._publish(begun)
+        self._publish(tick_begun)
 
         sent: Command | None = None
         if desired.command is None:
@@ -348,36 +386,36 @@ class Servo:
             sent, decision = self.safety.judge(
                 self._new_states or [state],
                 desired.command,
-                now,
-                dead_man=dead_man or self.modes.mode is not Mode.POLICY,
+                decision_time,
+                dead_man=dead_man_held or self.modes.mode is not Mode.POLICY,
                 limits=limits,
             )
         send_error = self._send(machine, sent)
-        done = time.monotonic()
+        sent_at = time.monotonic()
 
         fault_text = decision.text if decision.detail else ""
         if standby_damps:
             pass  # errors of the link are those of two writers
         elif send_error or link_error:
-            self.safety.fault(Reason.LINK, done)
+            self.safety.fault(Reason.LINK, sent_at)
             fault_text = send_error or link_error
-        self._act_on_faults(level, begun, fault_text)
-        if self._sweep is not None and mode is Mode.SWEEP:
+        self._act_on_faults(level_before, tick_begun, fault_text)
+        if self._sweep is not None and mode_before is Mode.SWEEP:
             if sent is not None:
-                self._sweep.sent(now, sent.position)
+                self._sweep.sent(decision_time, sent.position)
             if self.modes.mode is not Mode.SWEEP:
                 self._end_sweep()
-        if self.modes.mode is not mode:
+        if self.modes.mode is not mode_before:
             self._report("mode", self.modes.mode.name)
         if FilterAction.PASS < decision.level < FilterAction.DAMP:
             self.interventions[decision.reason.name.lower()] += 1
         latency = np.nan
-        if fresh and self.action is not None and self.modes.mode in _DECIDING:
-            latency = done - float(self.action["state_time"])
+        if action_is_new and self.action is not None and self.modes.mode in _DECIDING:
+            latency = sent_at - float(self.action["state_time"])
             self.latency.add(max(0.0, latency))
         if self.plan.sweep is None:  # the log of a sweep is of its samples
-            self._tick_record["begun"] = begun
-            self._tick_record["done"] = done
+            self._tick_record["begun"] = tick_begun
+            self._tick_record["done"] = sent_at
             self._tick_record["latency"] = latency
             self._log_tick(state, desired, sent, decision)
 
@@ -391,14 +429,20 @@ class Servo:
         self.action = action
         return True
 
-    def _act_on_faults(self, level: FilterAction, begun: float, text: str) -> None:
-        """Report a fault that is worse than the `level` before the tick, and leave the mode."""
+    def _act_on_faults(self, level_before: FilterAction, tick_begun: float, text: str) -> None:
+        """Enter FAULT while a fault lasts; report one that is worse than before the tick.
+
+        Args:
+            level_before: Level of the fault before the tick.
+            tick_begun: Time at which the tick began [s].
+            text: Text of a new fault with its numbers; empty for that of its reason.
+        """
         safety = self.safety
         if safety.faulted:
-            if safety.level > level:
+            if safety.level > level_before:
                 self.faults.append(text or safety.reason.text)
                 self._report("fault", self.faults[-1], reason=safety.reason, level=safety.level)
-            self.modes.faulted(begun)
+            self.modes.faulted(tick_begun)
 
     def _send(self, machine: Machine, sent: Command | None) -> str:
         """Write to the machine; return the link's error, or ""."""

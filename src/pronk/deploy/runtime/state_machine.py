@@ -3,19 +3,20 @@
     mode        left when                                              for
     IDLE        (the servo enters PREFLIGHT)                           PREFLIGHT
     PREFLIGHT   the states were checked                                DAMP, SWEEP or IDLE
-    DAMP        STAND is requested, after `RunTiming.damp_s`              STAND
-    STAND       WALK is requested, once the robot has risen            POLICY
+    DAMP        STAND is requested, after `RunTiming.damp_s`           STAND
+    STAND       WALK is requested, once the time to rise has passed    POLICY
                 SIT is requested                                       SIT
     POLICY      SIT is requested                                       HALT
-    HALT        `RunTiming.halt_s` has passed                             SIT
-    SIT         the robot has reached the folded pose                  DAMP
+    HALT        `RunTiming.halt_s` has passed                          SIT
+    SIT         `RunTiming.sit_s` has passed                           DAMP
     SWEEP       the sweep is over                                      DAMP
     FAULT       RESET or STAND is requested and the fault is over      DAMP
     any driven  DAMP or QUIT is requested                              DAMP
     any driven  the safety filter damps                                FAULT
 
-It gives the desired command; the safety filter decides what is sent. Time, states and requests are
-arguments.
+Rising and sitting down end by time: the measured pose is not compared with the path. The state
+machine gives the desired command; the safety filter decides what is sent. Time, states and requests
+are arguments.
 """
 
 from __future__ import annotations
@@ -127,8 +128,8 @@ class StateMachine:
         self.timing = timing
         self.sweeps = sweeps
         self.mode = Mode.IDLE
-        self.entry = 0
-        """Number of mode changes."""
+        self.mode_count = 0
+        """Number of mode changes so far."""
         self.since = 0.0
         """Time of the last one [s]."""
         self.notice = ""
@@ -139,8 +140,9 @@ class StateMachine:
         self._swing_check = SwingCheck(robot, timing)
         self._blending_since: float | None = None
         """Time of the policy's first action in this run of it [s]; None before it."""
-        self._policy_entry = 0
-        """Number of the mode change that started the policy."""
+        self._policy_mode_count = 0
+        """`mode_count` with which POLICY was entered last; an action with a smaller one is not
+        followed."""
         self._request = OperatorRequest.NONE
 
     @property
@@ -157,7 +159,7 @@ class StateMachine:
         """Change the mode."""
         self.mode = mode
         self.since = t
-        self.entry += 1
+        self.mode_count += 1
 
     def preflighted(self, refusals: Sequence[str], t: float) -> None:
         """Leave the pre-flight checks: idle if there are refusals, else damp or begin the sweep."""
@@ -229,13 +231,13 @@ class StateMachine:
                 self._swing_check.begin()
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
-        elif request is OperatorRequest.WALK and mode is Mode.STAND and self._has_risen(t):
+        elif request is OperatorRequest.WALK and mode is Mode.STAND and self._rise_is_over(t):
             self.notice = objection
             self._request = OperatorRequest.NONE
             if not objection:
                 self._blending_since = None
                 self.enter(Mode.POLICY, t)
-                self._policy_entry = self.entry
+                self._policy_mode_count = self.mode_count
         # A granted request is over; that to quit lasts, and that to stand until the robot does.
         if self.mode is not mode and request not in (OperatorRequest.QUIT, OperatorRequest.STAND):
             self._request = OperatorRequest.NONE
@@ -272,8 +274,8 @@ class StateMachine:
         self.enter(Mode.DAMP, t)
         return DesiredCommand()
 
-    def _has_risen(self, t: float) -> bool:
-        """Whether the robot has reached the default pose."""
+    def _rise_is_over(self, t: float) -> bool:
+        """Whether the time of the path to the default pose has passed, wherever the robot is."""
         return self._path is not None and self._path.done(t)
 
     def _sit(self, t: float, position: Array) -> None:
@@ -302,7 +304,7 @@ class StateMachine:
         """Return the policy's targets, blended in; the standing pose until the first of them."""
         if self._blending_since is None:
             # Halted before its first action, the policy may act for either mode.
-            if action is None or action["entry"] < self._policy_entry:
+            if action is None or action["mode_count"] < self._policy_mode_count:
                 if t - self.since > FIRST_ACTION_S:
                     safety.fault(Reason.EXPIRED, t)
                     return DesiredCommand()

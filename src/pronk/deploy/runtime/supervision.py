@@ -76,16 +76,19 @@ class SensorHistory:
         """Mean specific force in the world's frame [m/s^2]."""
         # Of each joint.
         self.encoder = np.zeros(n)
-        """Position less integral of velocity, beyond its uncertainty [rad]."""
+        """Position less integral of velocity, beyond its uncertainty [rad], (n,)."""
         self.constant_s = np.zeros(2 * n)
-        """Time for which each position, then each velocity has not changed in one bit [s]."""
+        """Time for which each position, then each velocity has not changed in one bit [s], (2n,):
+        entry i is the position of joint i, entry n + i its velocity."""
         self.moved = np.zeros(2 * n)
-        """Meanwhile: range of the integral of the velocity, then of the position, beyond their
-        uncertainty [rad]."""
+        """Motion that contradicts the constant, beyond its uncertainty [rad], (2n,): entry i is the
+        range of the integral of the velocity of joint i while its position is constant, entry n + i
+        the range of its position while its velocity is constant."""
         self.load = np.zeros(n)
-        """Change of the commanded torque while neither has changed in one bit [N m]."""
+        """Change of the commanded torque while neither position nor velocity of a joint has changed
+        in one bit [N m], (n,)."""
         self.others = np.zeros(n)
-        """Meanwhile: sum of the displacements of the other joints [rad]."""
+        """Meanwhile: sum of the displacements of the other joints [rad], (n,)."""
         # Lateness of the states against their number, and its spread over the window [s].
         self._late = 0.0
         self._late_spread = 0.0
@@ -186,7 +189,26 @@ class SensorHistory:
         )
 
     def _observe_joints(self, before: State, state: State, seconds: float) -> None:
-        """Update the quantities of the joints between two states."""
+        """Update the quantities of the joints between two states.
+
+        `path` (n,) is the integral of the velocity from one state to the next, by the trapezium
+        rule; `_travel` (n,) its sum. `uncertainty` (n,), not negative, is that of an integral over
+        the window: the fastest speed within it times the spread of the states' lateness. Then
+
+            encoder = |sum over the window of (change of position - path)| - uncertainty
+
+        where each term is reduced in size, by at most half the change of speed times the time, if
+        states in between were lost. In arrays of 2n entries, entry i belongs to the position of
+        joint i and entry n + i to its velocity. `compared` is (`_travel`, position): what should
+        not move while the position, or the velocity, is constant. `_lowest` and `_highest` are its
+        range since that quantity changed last. Then
+
+            moved = _highest - _lowest - uncertainties - offset
+
+        where `uncertainties` is `uncertainty` twice, and `offset` is `SPEED_STEP` times the time
+        for which both are constant in the first n entries (a joint at rest may show so much
+        velocity), 0 in the others. `moved` is negative where the motion is within the uncertainty.
+        """
         n = self._joints
         position = state.position
         velocity = state.velocity

@@ -179,7 +179,7 @@ class SweepController:
             limits: Limits of the sweep.
             sink: Takes the records of the logs (`sample_dtype`).
             state: A measured state.
-            start: Time of the first tick on the machine's clock [s].
+            start: Time of the first tick on the clock of the states [s].
             real_time: Whether the machine's clock does not wait: the joints are stiffened first,
                 and held while the operator clamps others.
         """
@@ -215,14 +215,14 @@ class SweepController:
 
     @property
     def now(self) -> float:
-        """The next tick on the machine's clock, counted so that rounding never adds up [s]."""
+        """The next tick on the clock of the states, counted so that rounding never adds up [s]."""
         return self._start + self._ticks * self._tick
 
     def command(self, t: float, states: Sequence[State], slack: float = 0.0) -> Command | None:
         """Return the command at a time, a new one once the next tick is due.
 
         Args:
-            t: Time on the machine's clock [s].
+            t: Time on the clock of the states [s].
             states: States measured since the last call, oldest first.
             slack: How long before it is due a tick may begin [s].
 

@@ -32,7 +32,8 @@ class OperatorCommand:
     jump: bool = False
     """Jump input."""
     dead_man: bool = False
-    """Whether the dead-man button is held; without it the robot is damped while the policy runs."""
+    """Whether the dead-man button is held; without it the robot is damped in `Mode.POLICY`, and in
+    no other mode."""
     request: OperatorRequest = OperatorRequest.NONE
     """A new request."""
 
@@ -184,7 +185,7 @@ class TimeLimit(Operator):
 
 
 HELP = """\
-  hold SPACE   dead-man: releasing it damps the joints
+  hold SPACE   dead-man: releasing it while the policy runs damps the joints
   1 stand up   2 start the policy   3 sit down   0 damp at once   r reset a fault   q quit
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
@@ -302,7 +303,7 @@ _PAD_REQUESTS: dict[int, OperatorRequest] = {
 }
 
 PAD_HELP = """\
-  hold LB      dead-man: releasing it damps the joints
+  hold LB      dead-man: releasing it while the policy runs damps the joints
   A stand up   Y start the policy   X sit down   B damp at once   START reset a fault   BACK quit
   left stick forward and sideways   right stick turn   RB jump"""
 """Buttons of the gamepad."""
