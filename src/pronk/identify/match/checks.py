@@ -353,7 +353,9 @@ def _period_of_changes(times: Array, changes: Array, tick_s: float) -> tuple[flo
     peak_hz = hz[near[np.argmax(spectrum[near])]]
     # The timestamps themselves, about the peak, at a tenth of the resolution of the excitation.
     fine_hz = peak_hz + np.linspace(-0.5, 0.5, 21) / span
-    lengths = np.abs(np.exp(2j * np.pi * np.outer(fine_hz, times)) @ changes)
+    changed = changes > 0.0
+    turns = np.exp(2j * np.pi * np.outer(fine_hz, times[changed]))
+    lengths = np.abs(turns @ changes[changed])
     best = int(np.argmax(lengths))
     return 1.0 / float(fine_hz[best]), float(lengths[best] / changes.sum())
 
