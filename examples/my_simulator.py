@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.identify.simulators.info import SimulatorInfo
-from pronk.identify.simulators.simulator import PARAMETERS
+from pronk.identify.simulators.simulator import SETTABLE_PARAMETERS
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Pendulum:
             engine="numpy", version="1", timestep_s=0.002, decimation=10, integrator="euler"
         )
         self.joints = robot.joint_names
-        self.parameters = frozenset(PARAMETERS)
+        self.parameters = frozenset(SETTABLE_PARAMETERS)
         self._robot_values = {
             "stiffness": np.array([joint.stiffness for joint in robot.joints]),
             "damping": np.array([joint.damping for joint in robot.joints]),
@@ -60,7 +60,7 @@ class Pendulum:
         """
         runs, steps, joints = command.shape
         parameters = {}
-        for name in PARAMETERS:
+        for name in SETTABLE_PARAMETERS:
             value = values.get(name, self._robot_values[name])
             parameters[name] = np.broadcast_to(value, (runs, joints))
         timestep = self.info.timestep_s

@@ -15,7 +15,7 @@ from pronk.errors import HardwareError, LogError, PronkError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import Reader
-from pronk.identify.simulators.simulator import PARAMETERS, Simulator
+from pronk.identify.simulators.simulator import SETTABLE_PARAMETERS, Simulator
 from pronk.robots.machine import Command, RefusedError, damping_command
 from pronk.robots.robot import RobotSpec
 
@@ -35,7 +35,7 @@ def check_simulator(simulator: Simulator) -> None:
     _require(info.timestep_s > 0.0 and info.decimation >= 1, "info: timestep and decimation > 0")
     _require(bool(info.engine), "info: engine is named")
     _require(len(joints) > 0 and len(set(joints)) == len(joints), "joints: unique names")
-    unknown = parameters - set(PARAMETERS)
+    unknown = parameters - set(SETTABLE_PARAMETERS)
     _require(not unknown, f"parameters: {', '.join(sorted(unknown))} unknown to pronk")
     _require({"stiffness", "damping"} <= parameters, "parameters: the gains")
 

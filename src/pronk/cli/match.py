@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
 WARNING_STATUS = 3
-"""Exit status of a match that is no better than less fitting on held-out recordings."""
+"""Exit status of a match that is no better than less fitting on what was held out of the fit."""
 
 
 def match_command(

@@ -249,8 +249,8 @@ def _held_out_table(result: MatchResult) -> Table:
     )
     note = (
         "RMSE on the last repeat of each amplitude (every fourth part where there is one), which "
-        "these fits did not use; each octave counts alike. plain fit: stiffness, damping and "
-        "delay, with the model's friction."
+        "these fits did not use; each octave counts alike. plain fit: of stiffness, damping and "
+        "delay those that the match fits, with the model's friction."
     )
     return Table(
         title="Errors on held-out recordings", columns=columns, rows=tuple(rows), notes=(note,)

@@ -36,7 +36,8 @@ class ComparedResponses:
     nominal_error_db: float
     """Root mean square gain error in the band with the nominal gains [dB]."""
     coherence_min: float
-    """Lowest coherence in the band."""
+    """Lowest coherence of the compared response, 0 to 1: in the whole band by `compare`, at the
+    compared frequencies alone by `compare_recordings`."""
 
 
 def compare(

@@ -7,11 +7,15 @@ gains, so that neither passes for stiffness or damping.
 
 `fit_drives` takes these steps:
 
-1. Fit everything, from the nominal gains, and from two more points where that settles badly.
-2. Find how well each parameter is known, from repeats, or from blocks of time where nothing was
+1. Choose the start: fit the delay alone, with the nominal drive, from `Parameter.start` or from a
+   larger nominal delay. The search then begins at this delay and at the nominal value of every
+   other parameter, or at its `Parameter.start` where the nominal value is smaller.
+2. Fit everything from there, and also from half and twice these gains where that settles badly.
+3. Find how well each parameter is known, from repeats, or from blocks of time where nothing was
    repeated. Parameters that are not known are flagged, held at their nominal value, or refused.
-3. Fit again without the samples that `training_samples` keeps out, and compare there with the
-   nominal gains, the nominal gains with the best delay, and a plain fit of three parameters.
+4. Fit again without the samples that `training_samples` keeps out, and compare there with the
+   nominal gains, the nominal gains with the best delay, and a plain fit: of `PLAIN`, those
+   parameters that the match fits.
 
 Several joints of a chain are fitted together. The parameters of a joint move its own position far
 more than its neighbours', so the Jacobian is taken block-diagonal: one simulation for each
@@ -59,7 +63,8 @@ from pronk.identify.simulators.chain import DriveValues, published
 from pronk.robots.robot import RobotSpec
 
 PLAIN = ("stiffness", "damping", "delay")
-"""Parameters of the plain fit that the match is compared with."""
+"""Parameters of the plain fit that the match is compared with. Those that the match does not fit,
+as the stiffness in mode `drive`, have their nominal value."""
 OTHER_STARTS = (0.5, 2.0)
 """Factors on the nominal gains from which a fit begins again where it settled badly."""
 SETTLED_WELL = 0.9
@@ -93,7 +98,8 @@ def fit_drives(
     Args:
         replay: Recordings of a joint that moved alone, or of a chain whose joints moved together.
         parameters: Names out of `PARAMETERS`; those that the simulator cannot set are left out.
-            `stribeck` is fitted with `frictionloss` where the drive has a Stribeck speed.
+            `stribeck` is fitted with `frictionloss` by `ChainReplay` alone, where the drive has a
+            Stribeck speed.
         nominal: All parameters of each joint, as published, with the gains that were on its drive.
         unidentified: What becomes of a parameter that the recordings do not identify. `flag`: its
             value stays with a flag. `hold`: it is held at the nominal value, up to `MOST_HELD` of a
@@ -184,10 +190,11 @@ def _fit_from_nominal(
     fitted: Mapping[str, Sequence[str]],
     nominal: DriveValues,
 ) -> Optimum:
-    """Fit from the nominal gains with the best delay, and again where that settles badly.
+    """Fit from the nominal drive with the best delay, and again where that settles badly.
 
-    A fit settles badly if it runs out of evaluations, ends at a bound of the search, or is hardly
-    better than where it began. It then begins at `OTHER_STARTS` too, and the best counts.
+    These are steps 1 and 2 of this module. A fit settles badly if it runs out of evaluations, ends
+    at a bound of the search, or is hardly better than where it began. It then begins at
+    `OTHER_STARTS` too, and the best counts.
     """
     delay = _restricted(fitted, ["delay"])
     vector = DriveVector(delay, _raised(nominal, delay))
@@ -223,7 +230,7 @@ def _restricted(
 def _raised(
     drives: DriveValues, fitted: Mapping[str, Sequence[str]]
 ) -> dict[str, dict[str, float]]:
-    """Raise fitted parameters to where a search may begin (`Parameter.start`)."""
+    """Raise fitted parameters to `Parameter.start` where they are smaller (step 1)."""
     raised = {}
     for joint, values in drives.items():
         raised[joint] = dict(values)
@@ -450,10 +457,10 @@ def _parameter_flags(
 
 
 def _gains_by_amplitude(joint: str, best: Optimum) -> Array:
-    """Amplitude, stiffness and damping of each amplitude by itself, shape (m, 3).
+    """Amplitude, stiffness and damping of each amplitude, the largest first, shape (m, 3).
 
-    To first order about the common optimum, friction and delay held. Empty for joints that moved
-    together.
+    By one linear step from the common optimum, with the residuals of this amplitude alone and all
+    other parameters held. Empty for joints that moved together.
     """
     amplitudes = best.residuals.amplitude
     if np.isnan(amplitudes).any():

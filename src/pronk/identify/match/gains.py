@@ -46,10 +46,12 @@ class FittedValue:
 
     value: float
     repeat95: Interval = UNKNOWN
-    """95 % interval by the spread of the repeats alone."""
+    """95 % interval by the spread of the repeats alone. Where nothing was repeated, as where joints
+    moved together, it is by blocks of time, and by the coherence with method `paper`."""
     total95: Interval = UNKNOWN
     """95 % interval with the change between amplitudes and between parts of the recording, which
-    the model does not explain."""
+    the model does not explain. That of joints that moved together is `repeat95`; NaN with method
+    `paper`."""
 
     def scaled(self, factor: float) -> FittedValue:
         """Return the value and its intervals times a factor that is not negative."""
@@ -94,7 +96,8 @@ class MatchQuality:
     nominal_error_db: float = NAN
     """Root mean square of the gain error in the band with the gains of the real drive [dB]."""
     coherence_min: float = NAN
-    """Lowest coherence of the measured response in the band, 0 to 1."""
+    """Lowest coherence of the measured response, 0 to 1: in the whole band, or at the compared
+    frequencies of a joint that moved together with others."""
     amplitude_spread: float = NAN
     """Largest relative change of the stiffness between amplitudes; NaN with one amplitude."""
 
@@ -116,13 +119,16 @@ class JointGains:
     delay_s: FittedValue = ZERO
     """Delay of the command that goes with the gains [s]."""
     covariance: tuple[Interval, Interval] = (UNKNOWN, UNKNOWN)
-    """Covariance of (stiffness, damping), with the repeats as the unit of uncertainty."""
+    """Covariance of (stiffness, damping) by what `FittedValue.repeat95` is by: the repeats, or
+    blocks of time or the coherence where nothing was repeated."""
     quality: MatchQuality = MatchQuality()
     """Agreement of the simulated with the measured response."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
     """The drive by a torque channel (mode `drive`), by the names of `match.torque_fit.UNITS`."""
     flags: tuple[str, ...] = ()
-    """Warnings about this match, one sentence each."""
+    """Warnings about this match, one sentence each: of its excitations and response (`checks`), of
+    amplitudes and frequencies left out (`measured`, `match`), and of its fit (`drive_fit` or
+    `magnitude`, `result`, `torque_fit`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,13 @@ from pronk.identify.match.measured import (
     simulated_response,
 )
 from pronk.identify.match.nominal_gains import DriveGains, with_drive_gains
-from pronk.identify.match.parameters import DRIVE_MODE, FREE, GAINS_MODE, checked_names
+from pronk.identify.match.parameters import (
+    DRIVE_MODE,
+    FREE,
+    GAINS_MODE,
+    WITHOUT_FRICTION,
+    checked_names,
+)
 from pronk.identify.match.ranges import group_gains
 from pronk.identify.match.replay import ChainReplay, JointReplay
 from pronk.identify.match.result import (
@@ -47,8 +53,6 @@ from pronk.robots.robot import RobotSpec
 Method = Literal["time", "paper"]
 Mode = Literal["gains", "drive"]
 
-WITHOUT_FRICTION = ("stiffness", "damping", "delay")
-"""Parameters that are fitted for frameworks whose joints have no dry friction as a torque."""
 NO_MATCH_DB = 1.0
 """Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
 of a good log stays below."""
@@ -70,7 +74,7 @@ def match(
     """Find the gains with which a simulated joint responds as the measured one.
 
     Joints that were excited one at a time are matched one by one. Where several joints moved at
-    once, the whole leg or arm is simulated and fitted in time.
+    once, the whole leg or arm is simulated and fitted in time; `match_chains` says what differs.
 
     Args:
         logs: One or more logs of one robot; a joint may be excited in several.
@@ -260,15 +264,25 @@ def match_chains(
 ) -> MatchResult:
     """Match legs or arms whose joints moved together, one chain after the other.
 
-    With a fixed base chains do not move each other. Parameters of a joint that the logs do not
-    identify are held at their nominal value.
+    With a fixed base chains do not move each other. The steps are those of `match` in another
+    order, and some of its choices do not apply:
+
+    - The fit comes first, always in time, whatever the method. The response of a joint is estimated
+      afterwards, from the recording with the most coherent frequencies (`compare_recordings`): it
+      judges the fit and takes no part in it.
+    - Parameters of a joint that the logs do not identify are held at their nominal value, where
+      `match` flags them (mode `gains`) or refuses them (mode `drive`).
+    - Of the settings, `estimator` and `coherence_min` are not used: responses come from the default
+      estimator, and frequencies of a coherence below `compared.COHERENCE_MIN` are not compared.
+    - An incoherent band is no error, and the joint then has no response. No response is checked
+      (`check_response`), so that every joint counts as matched.
 
     Args:
         logs: Logs of one robot, in some of which several joints move at once.
         simulation: The robot in its simulator.
         parameters: Names of the parameters to fit.
         torque_fits: Drives by a torque channel.
-        settings: Threads of the simulator.
+        settings: The threads of the simulator are used.
         progress: Called with the stage and the share of it that is done.
 
     Raises:

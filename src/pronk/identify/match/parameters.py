@@ -1,4 +1,4 @@
-"""The one table of the parameters of a joint's drive, and which of them each mode fits."""
+"""The table of the parameters of a joint's drive that can be fitted, and which each mode fits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Parameter:
     high: float
     """Upper bound of the search."""
     start: float
-    """Where the search begins if the nominal value is smaller."""
+    """Where the search begins if the nominal value is smaller (`drive_fit`, step 1)."""
     step: float
     """Finite difference, of the logarithm or of the parameter itself. Far above the chatter of dry
     friction, and small against the curvature of the error."""
@@ -130,6 +130,8 @@ DRIVE_MODE = ("damping", "armature", "frictionloss", "delay")
 GAINS_MODE = ("stiffness", "damping", "frictionloss", "delay")
 """Parameters of mode `gains`, in which the armature is known. Friction and delay are fitted too, so
 that they do not pass for damping."""
+WITHOUT_FRICTION = ("stiffness", "damping", "delay")
+"""Parameters of mode `gains` for frameworks whose joints have no dry friction as a torque."""
 
 
 def checked_names(names: Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:

@@ -179,7 +179,7 @@ def _next_multiple(value: float, step: float) -> float:
 def interval_points(gains: JointGains, level: float = 0.95) -> Array:
     """Compute points on the ellipse that holds a joint's true gains with some probability.
 
-    Where the covariance is not finite, as without repeats, the gains are taken for exact.
+    Where no covariance is known, so that it is not finite, the gains are taken for exact.
 
     Args:
         gains: Matched gains of a joint.

@@ -3,9 +3,11 @@
 Two kinds of log become recordings, and differ in what counts as a repeat, a block and a weight:
 
 - A joint that was excited alone (`joint_recordings`): each excitation is a recording. Repeats of
-  one command are the unit of uncertainty. Every octave and every amplitude counts alike: a sample
-  is divided by the square root of the frequency, at which a linear chirp spends its time, and by
-  the amplitude. The mean of each recording is left out, for the zero of an encoder is no dynamics.
+  one command are the unit of uncertainty. A sample is divided by the amplitude, so that every
+  amplitude counts alike, and by the square root of its frequency: in a linear chirp, which has as
+  many samples in each hertz, every octave then counts alike. A log without a frequency channel, as
+  CSV may be, has samples that count alike, so that the upper octaves of a linear chirp count most.
+  The mean of each recording is left out, for the zero of an encoder is no dynamics.
 - Joints that moved together (`chain_recordings`): each joint of each log is a recording. Nothing
   was repeated, so pieces of time are the unit of uncertainty. Samples count alike, and the mean
   counts too: how far a joint sags under gravity shows its stiffness. Samples that the drive could

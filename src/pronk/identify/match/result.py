@@ -35,17 +35,18 @@ SCHEMA = "pronk/match/4"
 NO_MATCH = "no match: "
 """Beginning of the flag on gains with which the simulated response is not the measured one."""
 NOT_BETTER = "not better: "
-"""Beginning of the flag on a match that is no better than less fitting on held-out recordings."""
+"""Beginning of the flag on a match that is no better than less fitting on what was held out of the
+fit: the last repeat of each command, or blocks of time where nothing was repeated."""
 _NOT_BETTER = 1.02
 """Held-out error over that of the best of the other drives from which on a match is not better:
 where the model's friction is right all fits are equal but for noise."""
 _LESS_FITTING = {
     "nominal": "the nominal gains",
     "nominal_delayed": "the nominal gains with the best delay",
-    "plain": "a plain fit of stiffness, damping and delay",
+    "plain": "a plain fit of the gains and the delay",
 }
 HELD_OUT = (*_LESS_FITTING, "matched")
-"""Drives whose errors on held-out recordings are compared."""
+"""Drives whose errors on what was held out are compared."""
 SPREAD_MAX = 0.05
 """Relative change of stiffness between amplitudes that is worth a flag; the paper's own
 randomization is 2 N m/rad on 20 (D3), twice that."""
@@ -66,20 +67,25 @@ class DriveFit:
     sd: Mapping[str, float] = field(default_factory=dict)
     """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
     ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """95 % interval of each fitted parameter by the repeats alone."""
+    """95 % interval of each fitted parameter by the repeats alone; where nothing was repeated, by
+    blocks of time, or by the coherence with method `paper`."""
     total95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """95 % interval of each fitted parameter with what the model does not explain: the change
-    between amplitudes and between parts of the log."""
+    between amplitudes and between parts of the log. That of joints that moved together is `ci95`,
+    by blocks of time; empty with method `paper`."""
     covariance: Array = field(default_factory=lambda: _no_numbers(2, 2))
-    """Covariance of (stiffness, damping), zero for what was held, shape (2, 2)."""
+    """Covariance of (stiffness, damping) by what `ci95` is by, zero for what was held,
+    shape (2, 2)."""
     held: tuple[str, ...] = ()
     """Parameters held at their nominal value because the logs do not identify them."""
     at_bound: tuple[str, ...] = ()
     """Fitted parameters that ended at a bound of the search."""
     held_out: Mapping[str, float] = field(default_factory=dict)
-    """Root mean square error of the drives `HELD_OUT` on held-out recordings [rad]."""
+    """Root mean square error of the drives `HELD_OUT` on the samples that `training_samples` keeps
+    out of the fit, repeats or blocks of time [rad]."""
     amplitude_gains: Array = field(default_factory=lambda: _no_numbers(0, 3))
-    """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
+    """(amplitude, stiffness, damping) of each amplitude, the largest first, shape (m, 3): by one
+    linear step from the common optimum of a fit in time, fitted by itself with method `paper`."""
     rmse: float = NAN
     """Root mean square error of the position in time, weighted as the fit weights it [rad]."""
     nominal_rmse: float = NAN
@@ -383,10 +389,10 @@ def _fitted_value(fit: DriveFit, name: str) -> FittedValue:
 
 
 def amplitude_spread(gains: Array) -> float:
-    """Return the largest relative change of stiffness from the first amplitude.
+    """Return the largest relative change of stiffness from the largest amplitude.
 
     Args:
-        gains: Rows of (amplitude, stiffness, damping), the matched amplitude first, shape (m, 3).
+        gains: Rows of (amplitude, stiffness, damping), the largest amplitude first, shape (m, 3).
 
     Returns:
         The change; NaN with one amplitude.
@@ -411,7 +417,12 @@ def amplitude_flags(gains: Array) -> tuple[str, ...]:
 
 
 def held_out_flags(errors: Mapping[str, float]) -> tuple[str, ...]:
-    """Warn of a match that is no better on held-out recordings than less or no fitting."""
+    """Warn of a match that is no better on what was held out than less or no fitting.
+
+    Args:
+        errors: Root mean square error of each of the drives `HELD_OUT` on repeats or blocks of time
+            that the fit did not see [rad]; empty where nothing was held out.
+    """
     if not errors:
         return ()
     best = min(_LESS_FITTING, key=errors.__getitem__)

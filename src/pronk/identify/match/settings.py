@@ -22,13 +22,14 @@ class MatchSettings:
     """Repeat the search of method `paper` without rotor inertia (paper F13)."""
     coherence_min: float = 0.8
     """Coherence below which a frequency is left out of the comparison; a joint with most of its
-    band below is refused."""
+    band below is refused. Not used for joints that moved together (`match_chains`)."""
     threads: int = 2
     """Threads of MuJoCo."""
     simulator_python: Path | None = None
     """Interpreter in which another simulator than MuJoCo runs; this interpreter if None."""
     estimator: Estimator = field(default_factory=Estimator)
-    """Estimator of the responses, the same for the log and the simulation."""
+    """Estimator of the responses, the same for the log and the simulation. Not used for joints that
+    moved together (`match_chains`)."""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot work.

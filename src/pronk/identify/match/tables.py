@@ -15,7 +15,8 @@ from pronk.tables import Cell, Column, Table
 def gains_table(result: MatchResult) -> Table:
     """Make the table of the matched gains, one joint a row; columns without a value are left out.
 
-    Intervals by the repeats alone are followed by those with what the model does not explain.
+    Intervals by the repeats alone (`FittedValue.repeat95`) are followed by those with what the
+    model does not explain.
     """
     has_total = False
     has_friction = False

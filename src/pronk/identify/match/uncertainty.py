@@ -130,7 +130,7 @@ class Estimate:
     sd: Mapping[str, float]
     """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
     ci95: Mapping[str, tuple[float, float]]
-    """95 % interval of each fitted parameter."""
+    """95 % interval of each fitted parameter, by repeats or by blocks of time."""
 
     @property
     def unidentified(self) -> tuple[str, ...]:
@@ -188,16 +188,17 @@ def total_intervals(
     part_moves: Array,
     gains_by_amplitude: Array,
 ) -> dict[str, tuple[float, float]]:
-    """Widen intervals by repeats so that they cover what the model does not explain.
+    """Widen intervals so that they cover what the model does not explain.
 
-    Repeats and parts of the excitations count in quadrature. The gains of several amplitudes show
-    what the model lacks better than the parts, which then count with their deviation alone; no
-    interval of a gain is narrower than its change between amplitudes.
+    Where nothing was repeated, the given intervals are by blocks. Repeats and parts of the
+    excitations count in quadrature. The gains of several amplitudes show what the model lacks
+    better than the parts, which then count with their deviation alone; no interval of a gain is
+    narrower than its change between amplitudes.
 
     Args:
         fitted: Names of the fitted parameters.
         x: Searched numbers at the optimum, shape (p,).
-        ci95: Their intervals by repeats.
+        ci95: Their intervals by repeats, or by blocks where nothing was repeated.
         part_moves: Where the optimum moves without each part of the excitations, shape (n, p).
         gains_by_amplitude: Amplitude, stiffness and damping of each amplitude, shape (m, 3).
 

@@ -1,8 +1,10 @@
-"""The training simulator: whole chains, and one joint excited on the test rig.
+"""MuJoCo: whole chains, and one joint excited on the test rig.
 
-The model is `pronk.robots.model.bench_spec`: fixed base, the joint's own chain, explicit PD at the
-start of each 5 ms step, clipped by the torque-speed curve. `mujoco.rollout` runs thousands of gain
-pairs on its threads; the trajectories are those of the training environment.
+The model is `pronk.robots.model.bench_spec`: the joint's own chain on a fixed base, with the
+physics step and the drive law of the robot. A robot as it is loaded has those of the training
+environment, whose trajectories the simulation then gives: an explicit PD at the start of each step
+of `RobotSpec.timestep_s`, clipped by the torque-speed curve. A profile of a framework gives the
+robot another step and another law. `mujoco.rollout` runs thousands of gain pairs on its threads.
 """
 
 from __future__ import annotations
@@ -19,7 +21,13 @@ from pronk.errors import PronkError, RobotError
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.command_trace import CommandTrace
 from pronk.identify.simulators.info import mujoco_info
-from pronk.identify.simulators.simulator import CHUNK, PARAMETERS, Closing, JointRigs, Values
+from pronk.identify.simulators.simulator import (
+    CHUNK,
+    SETTABLE_PARAMETERS,
+    Closing,
+    JointRigs,
+    Values,
+)
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import RobotSpec
 
@@ -272,7 +280,7 @@ class MujocoSimulator(JointRigs):
         self.robot = robot
         self.info = mujoco_info(robot)
         self.joints = robot.joint_names
-        self.parameters = frozenset(PARAMETERS)
+        self.parameters = frozenset(SETTABLE_PARAMETERS)
         self._threads = threads
         self._rigs: dict[str, JointTestRig] = {}
 
@@ -302,7 +310,7 @@ class MujocoSimulator(JointRigs):
         unknown = set(values) - self.parameters
         if unknown:
             raise PronkError(
-                f"MuJoCo sets {', '.join(PARAMETERS)}, not {', '.join(sorted(unknown))}."
+                f"MuJoCo sets {', '.join(SETTABLE_PARAMETERS)}, not {', '.join(sorted(unknown))}."
             )
         steps = command.shape[1]
         delayed_command = command.copy()

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 Values = Mapping[str, Array]
 """Name of a parameter to its values."""
 
-PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "delay")
-"""Parameters of a joint [N m/rad, N m s/rad, kg m^2, N m, s]; the gains must be settable."""
+SETTABLE_PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "delay")
+"""Parameters of a joint that a simulator may let a match set [N m/rad, N m s/rad, kg m^2, N m, s];
+stiffness and damping it must."""
 CHUNK = 100
 """Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
 
@@ -41,7 +42,7 @@ class Simulator(Protocol):
     joints: tuple[str, ...]
     """Names of the J joints, in the order of the columns."""
     parameters: frozenset[str]
-    """Which of `PARAMETERS` it can set."""
+    """Which of `SETTABLE_PARAMETERS` it can set."""
 
     def rollout(
         self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
@@ -51,7 +52,7 @@ class Simulator(Protocol):
         Args:
             command: Target position during each physics step [rad], shape (B, T, J).
             values: Name of a parameter to its values, each of shape (B, J), in the units of
-                `PARAMETERS`; those of the robot where a name is missing.
+                `SETTABLE_PARAMETERS`; those of the robot where a name is missing.
             locked: Joints that are held at their first command; their motion is not needed.
 
         Returns:
@@ -80,7 +81,7 @@ class JointRigs(Closing, ABC):
     info: SimulatorInfo
     """The engine and its settings."""
     parameters: frozenset[str]
-    """Which of `PARAMETERS` can be set."""
+    """Which of `SETTABLE_PARAMETERS` can be set."""
     steps: int = 0
     """Physics steps done so far."""
 
