@@ -73,7 +73,7 @@ _POLICY = Path(__file__).parents[1] / "policies" / "matched" / "policy.onnx"
 
 def operate(port: int, log: str) -> None:
     """Walk a virtual robot over LCM until SIGTERM; prints its processes when it walks."""
-    link = Link(robot=WALKING_ROBOT, address=Address(kind="lcm", options={"port": port}))
+    link = Link(robot=WALKING_ROBOT, address=Address(scheme="lcm", options={"port": port}))
     plan = RunPlan(link=link, policy=_POLICY, timing=TIMING, ignore_latency=True, log=Path(log))
     with Deployment(plan) as deployment:
         if not begin_to_walk(deployment):

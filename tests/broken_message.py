@@ -29,21 +29,21 @@ def some_state(**changes: Any) -> State:
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     """A broken copy of a message: one flipped bit, a burst, cut, longer, shifted, or noise."""
-    kind = rng.integers(6)
+    damage = rng.integers(6)
     changed = bytearray(data)
-    if kind == 0:
+    if damage == 0:
         return flip_bit(data, int(rng.integers(8 * len(data))))
-    if kind == 1:  # a burst
-        at, size = int(rng.integers(len(data))), int(rng.integers(1, 64))
-        changed[at : at + size] = rng.bytes(len(changed[at : at + size]))
-    elif kind == 2:  # cut off
+    if damage == 1:  # a burst
+        start = int(rng.integers(len(data)))
+        stop = min(start + int(rng.integers(1, 64)), len(data))
+        changed[start:stop] = rng.bytes(stop - start)
+    elif damage == 2:  # cut off
         del changed[int(rng.integers(len(data))) :]
-    elif kind == 3:  # too long
+    elif damage == 3:  # too long
         changed += rng.bytes(int(rng.integers(1, 64)))
-    elif kind == 4:  # shifted
-        at = int(rng.integers(len(data)))
-        del changed[at : at + 1]
+    elif damage == 4:  # shifted
+        del changed[int(rng.integers(len(data)))]
         changed += b"\0"
-    else:  # nothing of it is left
+    else:  # noise
         changed = bytearray(rng.bytes(len(data)))
     return bytes(changed)

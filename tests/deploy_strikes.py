@@ -138,7 +138,7 @@ def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]
     other_end.close()
     try:
         end.recv()
-        yield Address(kind=link, options=options), end
+        yield Address(scheme=link, options=options), end
     finally:
         process.kill()
         process.join()

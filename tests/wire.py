@@ -31,10 +31,16 @@ class Wire:
     ) -> None:
         self.began = math.nan
         """When it spoke first [s]."""
-        self._publish, self._listen, self._decode = publish, listen, decode
-        self._met: list[tuple[float, bytes]] = []
-        self._over, self._speaking = threading.Event(), threading.Event()
-        self._threads = [threading.Thread(target=each) for each in (self._hear, self._speak)]
+        self._publish = publish
+        self._listen = listen
+        self._decode = decode
+        self._messages: list[tuple[float, bytes]] = []
+        self._ended = threading.Event()
+        self._speaking = threading.Event()
+        self._threads = (
+            threading.Thread(target=self._hear),
+            threading.Thread(target=self._speak),
+        )
 
     def __enter__(self) -> Wire:
         for thread in self._threads:
@@ -42,7 +48,7 @@ class Wire:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._ended.set()
         for thread in self._threads:
             thread.join()
 
@@ -56,22 +62,23 @@ class Wire:
 
     def received(self) -> tuple[np.ndarray, np.ndarray]:
         """When each command that is not its own came [s], and whether it damps."""
-        met = [(when, self._decode(data)) for when, data in self._met]
-        others = [
-            (when, not command.stiffness.any())
-            for when, command in met
-            if not np.allclose(command.position, OTHER.position, atol=1e-5)
-        ]
-        return np.array([when for when, _ in others]), np.array([damps for _, damps in others])
+        times = []
+        damps = []
+        for arrival, data in list(self._messages):
+            command = self._decode(data)
+            if not np.allclose(command.position, OTHER.position, atol=1e-5):
+                times.append(arrival)
+                damps.append(not command.stiffness.any())
+        return np.array(times), np.array(damps)
 
     def _speak(self) -> None:
-        while not self._over.wait(0.01):
+        while not self._ended.wait(0.01):
             if self._speaking.is_set():
                 self._publish()
 
     def _hear(self) -> None:
-        while not self._over.is_set():
-            self._met += self._listen()
+        while not self._ended.is_set():
+            self._messages += self._listen()
 
 
 def over_lcm(port: int) -> Wire:
@@ -81,18 +88,20 @@ def over_lcm(port: int) -> Wire:
     from pronk.deploy.links.lcm.layouts import CHEETAH
     from pronk.deploy.links.lcm.link import url_of
 
-    sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
-    met: list[tuple[float, bytes]] = []
+    sender = lcm.LCM(url_of(port=port))
+    listener = lcm.LCM(url_of(port=port))
+    received: list[tuple[float, bytes]] = []
+
+    def receive(_: str, data: bytes) -> None:
+        received.append((time.monotonic(), data))
 
     def listen() -> list[tuple[float, bytes]]:
         listener.handle_timeout(20)
-        found = met.copy()
-        met.clear()
-        return found
+        messages = received.copy()
+        received.clear()
+        return messages
 
-    listener.subscribe(
-        CHEETAH.command.channel, lambda _, data: met.append((time.monotonic(), data))
-    ).set_queue_capacity(500)
+    listener.subscribe(CHEETAH.command.channel, receive).set_queue_capacity(500)
     data = encode_lcm_command(CHEETAH, OTHER)
     return Wire(
         lambda: sender.publish(CHEETAH.command.channel, data),
@@ -112,19 +121,21 @@ def over_dds(domain: int) -> Wire:
     )
     from pronk.deploy.links.dds.messages import LowCmd
 
-    joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
-    sender = own.writer(COMMANDS, LowCmd)
-    listener = own.reader(COMMANDS, LowCmd, include_local=False)
+    joints = joint_map(ROBOT)
+    participant = Participant(DdsNetwork(domain=domain))
+    sender = participant.writer(COMMANDS, LowCmd)
+    listener = participant.reader(COMMANDS, LowCmd, include_local=False)
     counts: Counter[str] = Counter()
     # Every sample says when it was written, by the wall clock.
     wall = time.time() - time.monotonic()
 
     def listen() -> list[tuple[float, bytes]]:
         time.sleep(0.002)
-        return [
-            (m.sample_info.source_timestamp * 1e-9 - wall, m.data)
-            for m in take_samples(listener, counts)
-        ]
+        messages = []
+        for sample in take_samples(listener, counts):
+            written_s = sample.sample_info.source_timestamp * 1e-9 - wall
+            messages.append((written_s, sample.data))
+        return messages
 
     data = encode_dds_command(joints, OTHER)
     return Wire(

@@ -106,7 +106,7 @@ def test_the_standby_damps_after_a_servo_that_stopped(
 ) -> None:
     address, wire = reached
     # A servo that is killed over LCM is in `test_sweep_link.py`.
-    number = signal.SIGSTOP if address.kind == "lcm" else signal.SIGKILL
+    number = signal.SIGSTOP if address.scheme == "lcm" else signal.SIGKILL
     plan = patient_plan(address, tmp_path)
     late = []
     # A computer that is busy may be late once, or stop the servo by itself.

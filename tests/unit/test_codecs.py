@@ -274,7 +274,7 @@ def test_bytes_are_those_of_lcm_gen(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         source += f"struct {class_name(message)} {{\n"
         for field in message.fields:
             dimension = "" if field.count is None else f"[{field.count}]"
-            source += f"    {field.kind} {field.name}{dimension};\n"
+            source += f"    {field.number} {field.name}{dimension};\n"
         source += "}\n"
     (tmp_path / "all.lcm").write_text(source, encoding="ascii")
     tool = Path(sys.executable).with_name("lcm-gen")

@@ -73,7 +73,7 @@ def deploy_command(
 
     contract = load_policy(policy).contract
     address = machine.address(base)
-    if capture is not None and (address.kind != SIM or address.interface == "bench"):
+    if capture is not None and (address.scheme != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     plan = RunPlan(
         link=Link(robot=robot or contract.robot, address=address, release=machine.release),

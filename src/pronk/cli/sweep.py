@@ -60,7 +60,7 @@ def sweep(
 
     spec = load_robot(robot)
     address = machine.address()
-    virtual = address.kind == SIM
+    virtual = address.scheme == SIM
     if virtual and (address.interface not in (None, "bench") or machine.release):
         raise HardwareError(
             f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
@@ -95,7 +95,7 @@ def sweep(
     if not (address.local or machine.yes):
         console.confirm(spec.name, str(address))
     with console.progress() as report:
-        progress = report.bar(f"excite over {address.kind}")
+        progress = report.bar(f"excite over {address.scheme}")
         if virtual:
             stated_file = address.options.get("params")
             params_file = None if stated_file is None else str(stated_file)

@@ -51,7 +51,7 @@ def find_link(name: str) -> Callable[..., Machine]:
 class Address:
     """Link to a robot and its options."""
 
-    kind: str = SIM
+    scheme: str = SIM
     """Name of the link."""
     interface: str | None = None
     """Network interface to a real robot (`lo` for LCM on the robot itself), None for loopback; of
@@ -72,19 +72,19 @@ class Address:
         Raises:
             HardwareError: The link or an option is unknown, or an option has another type.
         """
-        kind = text
+        scheme = text
         named_interface = ""
         query = ""
         if "://" in text:
             parts = urlsplit(text)
-            kind = parts.scheme
+            scheme = parts.scheme
             named_interface = parts.netloc
             query = parts.query
         if named_interface and interface not in (None, named_interface):
             raise HardwareError(
                 f"{text} names the interface {named_interface}; leave out {interface}."
             )
-        types = _option_types(find_link(kind))
+        types = _option_types(find_link(scheme))
         texts: dict[str, str | int] = dict(parse_qsl(query))
         for name, value in options.items():
             if value is not None:
@@ -93,24 +93,24 @@ class Address:
         for name, value in texts.items():
             if name not in types:
                 raise HardwareError(
-                    f"link {kind} has no {name}; its options are {', '.join(types) or 'none'}."
+                    f"link {scheme} has no {name}; its options are {', '.join(types) or 'none'}."
                 )
             try:
                 converted[name] = msgspec.convert(value, types[name], strict=False)
             except msgspec.ValidationError:
                 raise HardwareError(
-                    f"{name} of link {kind} is {value!r}; expected {types[name]}."
+                    f"{name} of link {scheme} is {value!r}; expected {types[name]}."
                 ) from None
-        return cls(kind=kind, interface=named_interface or interface, options=converted)
+        return cls(scheme=scheme, interface=named_interface or interface, options=converted)
 
     @property
     def local(self) -> bool:
         """True where nothing leaves this computer, so that no real robot can move."""
-        return self.kind == SIM or self.interface is None
+        return self.scheme == SIM or self.interface is None
 
     def __str__(self) -> str:
         """The URI of this address."""
-        uri = f"{self.kind}://{self.interface or ''}"
+        uri = f"{self.scheme}://{self.interface or ''}"
         if self.options:
             query = "&".join(f"{name}={quote(str(value))}" for name, value in self.options.items())
             uri += f"?{query}"
@@ -118,7 +118,7 @@ class Address:
 
     def machine(self, robot: RobotSpec, settings: LinkSettings | None = None) -> Machine:
         """Make the machine, not yet connected, with the usual settings if there are none."""
-        link = find_link(self.kind)
+        link = find_link(self.scheme)
         return link(robot, interface=self.interface, settings=settings, **self.options)
 
 

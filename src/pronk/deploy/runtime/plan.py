@@ -139,8 +139,6 @@ class RunPlan:
 
     def real_time_settings(self, priority: int, core: int) -> RealTimeSettings:
         """Return what a process requests of the operating system."""
-        return (
-            RealTimeSettings(priority=priority, core=core)
-            if self.real_time
-            else RealTimeSettings(lock=False)
-        )
+        if not self.real_time:
+            return RealTimeSettings(lock=False)
+        return RealTimeSettings(priority=priority, core=core)

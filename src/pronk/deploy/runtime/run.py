@@ -160,7 +160,7 @@ class Deployment:
             self.policy = self._process("policy", serve_policy)
         if plan.log is not None or plan.sweep is not None:
             self.logger = self._process("log", write_log, self._header)
-        if plan.link.address.kind != SIM:
+        if plan.link.address.scheme != SIM:
             self.standby = self._process("standby", serve_standby)
         self._interrupts.__enter__()
         self._open = True

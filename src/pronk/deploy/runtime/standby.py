@@ -54,11 +54,10 @@ def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
     end.send_bytes(b"\1" if damp is not None else b"\0")
     if damp is None:
         return
-    enter(
-        RealTimeSettings(priority=STANDBY_PRIORITY)
-        if plan.real_time
-        else RealTimeSettings(lock=False)
-    )
+    if plan.real_time:
+        enter(RealTimeSettings(priority=STANDBY_PRIORITY))
+    else:
+        enter(RealTimeSettings(lock=False))
     shared = Shared(name, len(plan.robot.joints))
     parent = os.getppid()
     record = np.zeros((), STANDBY)

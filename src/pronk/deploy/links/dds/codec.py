@@ -137,14 +137,15 @@ def decode_dds_command(joints: JointMap, data: bytes) -> Command:
         raise RefusedError(
             "mode", f"a motor's mode is {mode.max()}, expected 1 (servo) or 0 (off)."
         )
-    q = _finite("motor_cmd", motors["q"])
-    dq = _finite("motor_cmd", motors["dq"])
-    tau = _finite("motor_cmd", motors["tau"])
-    kp = _finite("motor_cmd", motors["kp"])
-    kd = _finite("motor_cmd", motors["kd"])
+    q = motors["q"]
+    dq = motors["dq"]
+    tau = motors["tau"]
+    kp = motors["kp"]
+    kd = motors["kd"]
+    _check_finite("motor_cmd", (q, dq, tau, kp, kd))
     # A motor that is off ignores the rest, and a part that is stopped has no gain.
-    stiffness = kp * mode * (q != np.float32(POS_STOP))
-    damping = kd * mode * (dq != VEL_STOP)
+    stiffness = kp.astype(np.float64) * mode * (q != np.float32(POS_STOP))
+    damping = kd.astype(np.float64) * mode * (dq != VEL_STOP)
     position = np.where(stiffness > 0.0, joints.sign * q, 0.0)
     _check_range("position", abs(position), _MAX_POSITION)
     _check_range("stiffness", stiffness, _MAX_STIFFNESS)
@@ -208,14 +209,15 @@ class DdsStateDecoder(StateNumbering):
         """
         record = deserialize_image(LowState, data)
         motors = record["motor_state"][0, :_JOINTS]
-        q = _finite("motor_state", motors["q"])
-        dq = _finite("motor_state", motors["dq"])
-        _finite("motor_state", motors["ddq"])
-        tau_est = _finite("motor_state", motors["tau_est"])
+        q = motors["q"]
+        dq = motors["dq"]
+        tau_est = motors["tau_est"]
+        _check_finite("motor_state", (q, dq, motors["ddq"], tau_est))
         imu = record["imu_state"][0]
-        quaternion = _finite("imu_state", imu["quaternion"])
-        gyroscope = _finite("imu_state", imu["gyroscope"])
-        accelerometer = _finite("imu_state", imu["accelerometer"])
+        quaternion = imu["quaternion"]
+        gyroscope = imu["gyroscope"]
+        accelerometer = imu["accelerometer"]
+        _check_finite("imu_state", (quaternion, gyroscope, accelerometer))
         serial = record["sn"][0]
         self.virtual = (int(serial[0]), int(serial[1])) == VIRTUAL_SERIAL
         tick = int(record["tick"][0])
@@ -229,10 +231,10 @@ class DdsStateDecoder(StateNumbering):
             position=sign * q,
             velocity=sign * dq,
             torque=sign * tau_est,
-            gyro=gyroscope,
-            accelerometer=accelerometer,
+            gyro=gyroscope.astype(np.float64),
+            accelerometer=accelerometer.astype(np.float64),
             bus_voltage=float(record["power_v"][0]),
-            orientation=unit_quaternion("imu_state.quaternion", quaternion),
+            orientation=unit_quaternion("imu_state.quaternion", quaternion.astype(np.float64)),
             robot_time=tick / TICKS_PER_S,
             temperature=temperature,
         )
@@ -247,8 +249,7 @@ def _record_with_head(message: Any) -> NDArray[Any]:
     return record
 
 
-def _finite(struct_name: str, values: NDArray[Any]) -> Array:
-    """Convert values to float64; refuse what is not finite."""
-    if not np.isfinite(values).all():
+def _check_finite(struct_name: str, members: tuple[NDArray[Any], ...]) -> None:
+    """Refuse members that are not finite, before a conversion warns of a signalling NaN."""
+    if not np.isfinite(np.concatenate(members)).all():
         raise RefusedError("not finite", f"{struct_name} holds a number that is not finite.")
-    return values.astype(np.float64)

@@ -67,10 +67,10 @@ def _member_dtype(member: Any) -> np.dtype[Any]:
     """The C image of a member: a struct, a number, or an array of either."""
     if hasattr(member, "__idl__"):
         return c_image_dtype(member)
-    kind = member.__metadata__[-1]
-    if isinstance(kind, str):  # a number by its name, such as uint8
-        return np.dtype(kind)
-    return np.dtype((_member_dtype(kind.subtype), (kind.length,)))
+    annotation = member.__metadata__[-1]
+    if isinstance(annotation, str):  # a number by its name, such as uint8
+        return np.dtype(annotation)
+    return np.dtype((_member_dtype(annotation.subtype), (annotation.length,)))
 
 
 @cache

@@ -91,16 +91,16 @@ def decode_lcm_command(layout: LcmLayout, data: bytes) -> Command:
                 "damping are understood.",
             )
     sequence = 0
-    made = 0.0
+    made_s = 0.0
     if layout.numbered:
         sequence = int(fields["id"])
-        made = int(fields["timestamp_us"]) * 1e-6
+        made_s = int(fields["timestamp_us"]) * 1e-6
     return Command(
         position=position * layout.signs,
         stiffness=stiffness / layout.gain_ratios,
         damping=damping / layout.gain_ratios,
         sequence=sequence,
-        made=made,
+        made=made_s,
     )
 
 

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pronk.robots.machine import RefusedError
 
-LcmKind = Literal["int8_t", "int32_t", "int64_t", "float", "double"]
+LcmNumber = Literal["int8_t", "int32_t", "int64_t", "float", "double"]
 
-_NUMPY_KINDS: dict[LcmKind, str] = {
+_NUMPY_TYPES: dict[LcmNumber, str] = {
     "int8_t": ">i1",
     "int32_t": ">i4",
     "int64_t": ">i8",
@@ -34,7 +34,7 @@ _WORD = (1 << 64) - 1
 class LcmField:
     """One field of a message."""
 
-    kind: LcmKind
+    number: LcmNumber
     """Type of its numbers in LCM's own language."""
     name: str
     count: int | None = None
@@ -63,7 +63,7 @@ class LcmMessage:
         columns: list[Any] = [("_fingerprint", ">u8")]
         for field in fields:
             shape = () if field.count is None else (field.count,)
-            columns.append((field.name, _NUMPY_KINDS[field.kind], shape))
+            columns.append((field.name, _NUMPY_TYPES[field.number], shape))
         self.dtype = np.dtype(columns)
 
     def encode(self, values: Mapping[str, ArrayLike]) -> bytes:
@@ -101,7 +101,7 @@ def _fingerprint(fields: tuple[LcmField, ...]) -> int:
     """Hash the fields as `lcmgen.c` does."""
     fingerprint = _FINGERPRINT_SEED
     for field in fields:
-        hashed = _counted_text(field.name) + _counted_text(field.kind)
+        hashed = _counted_text(field.name) + _counted_text(field.number)
         if field.count is None:
             hashed += b"\0"  # no dimension
         else:
