@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pronk.identify.excitation.signals import Chirp
@@ -22,11 +20,44 @@ def chirp_log(
     length_s: float = 8.0,
     noise_rad: float = 0.0,
     seed: int = 0,
-    **more: Any,
+    delay_s: float = 0.0,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+    threads: int = 2,
 ) -> JointLog:
-    """Chirps of some amplitudes [rad], white noise on the position; `more` of `synthetic_log`."""
-    chirps = [Chirp(length_s=length_s, amplitude=amplitude).samples() for amplitude in amplitudes]
-    excitations = [Excitation(offsets=one, repeats=repeats) for one in chirps]
-    rows = repeats * len(amplitudes), 500 * round(length_s + 2.0)
-    noise = noise_rad * np.random.default_rng(seed).standard_normal(rows)
-    return synthetic_log(robot, joint, excitations, *gains, noise=list(noise), **more)
+    """Return a log of chirps to one joint, with white noise on the position.
+
+    Args:
+        robot: The robot.
+        joint: The joint to excite.
+        gains: Stiffness [N m/rad] and damping [N m s/rad] of the joint.
+        amplitudes: Amplitudes of the chirps [rad].
+        repeats: Times each chirp is repeated.
+        length_s: Length of a chirp [s].
+        noise_rad: Standard deviation of the noise [rad].
+        seed: Seed of the noise.
+        delay_s: Delay from a command to its effect [s].
+        armature: Armature of the joint [kg m^2]; the drive's if None.
+        frictionloss: Dry friction of the joint [N m]; the drive's if None.
+        threads: Simulations at the same time.
+    """
+    excitations = []
+    for amplitude in amplitudes:
+        chirp = Chirp(length_s=length_s, amplitude=amplitude)
+        excitations.append(Excitation(offsets=chirp.samples(), repeats=repeats))
+    rows = repeats * len(amplitudes)
+    samples = 500 * round(length_s + 2.0)
+    noise = noise_rad * np.random.default_rng(seed).standard_normal((rows, samples))
+    stiffness, damping = gains
+    return synthetic_log(
+        robot,
+        joint,
+        excitations,
+        stiffness,
+        damping,
+        noise=list(noise),
+        delay_s=delay_s,
+        armature=armature,
+        frictionloss=frictionloss,
+        threads=threads,
+    )

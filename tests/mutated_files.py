@@ -8,7 +8,6 @@ native code is not watched).
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import importlib
 import importlib.util
@@ -36,6 +35,7 @@ import numpy as np
 from mcap.writer import Writer
 
 import pronk.identify.match.gains as gains_file
+from pronk.arrays import Array
 from pronk.cli import console
 from pronk.cli.export import TargetName
 from pronk.cli.main import run
@@ -46,7 +46,7 @@ from pronk.deploy.runtime.records import STEP, TICK
 from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.logs.mcap import records
+from pronk.identify.logs.mcap import Record, records
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.export.targets import export
@@ -68,12 +68,17 @@ from pronk.report import deploy_run
 from pronk.robots import load_robot
 from pronk.robots.bare import yaml_of_model
 from pronk.robots.load import read_model, read_robot
+from pronk.robots.robot import RobotSpec
 from pronk.tables import Cell, Column, Table
 
 _TORCH = importlib.util.find_spec("torch") is not None
 ROOT = Path(__file__).parents[1]
-MEMORY, CPU_S, WALL_S = 500_000_000, 5, 30
-"""Limits of one file: address space [bytes], time of processor and on the wall [s]."""
+MEMORY = 500_000_000
+"""Address space that reading one file may take [bytes]."""
+CPU_S = 5
+"""Time of the processor that reading one file may take [s]."""
+WALL_S = 30
+"""Time on the wall that reading one file may take [s]."""
 _WORD = re.compile(rb"[-+\w.]+")
 _TOKENS = (
     *(b"-1", b"0", b"1e999", b"1e308", b"nan", b"null", b"true", b"[[[[", b"{}", b"[]", b"'", b'"'),
@@ -102,7 +107,9 @@ _URDF = """<robot name="r"><link name="base"/><link name="leg"><inertial><origin
 
 
 @dataclass(frozen=True)
-class _Kind:
+class _Format:
+    """A kind of file, and how it is read."""
+
     files: tuple[str, ...]
     """Files that are mutated, one at a time."""
     read: Callable[[Path], Any]
@@ -110,12 +117,14 @@ class _Kind:
     checked: bool = False
     """Whether the format has checksums, so that other numbers must not pass silently."""
     share: float = 1.0
+    """How often the kind is drawn, relative to the others."""
 
 
 def _write(folder: Path) -> None:
     """Write a sound file of each kind."""
     sys.path.append(str(ROOT / "tests"))
-    cases, logs = map(importlib.import_module, ("report_cases", "log_files"))
+    cases = importlib.import_module("report_cases")
+    logs = importlib.import_module("log_files")
     cases.write_tree(folder / "tree")
     result = cases.match(legs=1)
     result = replace(result, joints={"FR_knee": result.joints["FR_knee"]})
@@ -125,49 +134,25 @@ def _write(folder: Path) -> None:
     responses = cases.joint_result("knee").responses.measured
     response_file.save_responses(folder / "tree" / "a.response.npz", responses)
     log = logs.example(600, ("FR_hip_pitch", "FR_knee"))
-    for name in ("npz", "csv", "mcap"):
-        getattr(logs, f"write_{name}")(folder / f"a.{name}", log)
+    logs.write_npz(folder / "a.npz", log)
+    logs.write_csv(folder / "a.csv", log)
+    logs.write_mcap(folder / "a.mcap", log)
     t = np.arange(1200) / 100.0
     chirp = 0.2 * np.sin(2.0 * np.pi * 0.5 * t**2)
     rows = np.column_stack([t, chirp, 0.9 * chirp])
     header = "time,command.FR_knee,position.FR_knee"
     np.savetxt(folder / "chirp.csv", rows, "%.6f", delimiter=",", header=header, comments="")
-    sage = folder / "sage"
-    sage.mkdir()
-    (sage / "joint_list.txt").write_text("hip\nknee\n")
-    states = (f'S,{2000 * k},"[0.{k:02d}, 1]","[0, 0]","[0, 0]"\n' for k in range(60))
-    controls = (f'C,{20000 * k},"[{k}.0, 0.5]"\n' for k in range(6))
-    first = "type,timestamp,positions"
-    (sage / "state_motor.csv").write_text(f"{first},velocities,torques\n{''.join(states)}")
-    (sage / "control.csv").write_text(f"{first}\n{''.join(controls)}")
-    events = "type,timestamp,event\nE,2000,MOTION_START\nE,100000,DISABLE\n"
-    (sage / "event.csv").write_text(events)
+    _write_sage(folder / "sage")
     if _TORCH:
         torch = importlib.import_module("torch")
-        values = {"time": t[:400], "dof_pos": rows[:400, 1:], "des_dof_pos": rows[:400, 1:]}
-        torch.save({k: torch.from_numpy(v.copy()) for k, v in values.items()}, folder / "a.pt")
-    ros = importlib.import_module("mcap_ros2.writer").Writer
-    with (folder / "bag.mcap").open("wb") as stream, ros(stream) as writer:
-        state = writer.register_msgdef("sensor_msgs/msg/JointState", _STATE)
-        for k, topic in ((k, topic) for k in range(200) for topic in ("/joint_states", "/command")):
-            stamp = {"stamp": {"sec": 1 + k // 100, "nanosec": k % 100 * 10**7}, "frame_id": ""}
-            message = {"header": stamp, "name": ["knee"], "position": [float(chirp[k])]}
-            message |= {"velocity": [], "effort": []}
-            writer.write_message(topic, state, message, 10**9 + k * 10**7, 0)
+        positions = torch.from_numpy(rows[:400, 1:].copy())
+        recording = {"time": torch.from_numpy(t[:400].copy())}
+        recording["dof_pos"] = positions
+        recording["des_dof_pos"] = positions.clone()
+        torch.save(recording, folder / "a.pt")
+    _write_bag(folder / "bag.mcap", chirp)
     robot = cases.ROBOT
-    policy = {"file": "policy.onnx", "delay_range_s": [0.0, 0.01]}
-    about = {"robot": robot.name, "joints": robot.joint_names, "link": "sim", "policy": policy}
-    made = DeployLogWriter(folder / "deploy.mcap", about | {"limits": {"tilt": 0.8}})
-    for k in range(200):
-        tick, step = np.zeros((), TICK), np.zeros((), STEP)
-        tick["tick"] = tick["sequence"] = k
-        for name in ("deadline", "begun", "done", "time"):
-            tick[name] = k / 500.0
-        tick["mode"], tick["latency"], step["begun"], step["live"] = Mode.POLICY, 0.003, k / 500, 1
-        made.write(np.frombuffer(tick.tobytes(), TICK)[0])
-        if k % 10 == 0:
-            made.write(np.frombuffer(step.tobytes(), STEP)[0])
-    made.end(complete=True, figures={})
+    _write_deploy_log(folder / "deploy.mcap", robot)
     shutil.copytree(Path(load_robot.__code__.co_filename).parent / robot.name, folder / "robot")
     shutil.copy(folder / "robot" / f"{robot.name}.xml", folder / "model.xml")
     (folder / "model.urdf").write_text(_URDF)
@@ -180,17 +165,78 @@ def _write(folder: Path) -> None:
     capture.save_capture(folder / "capture.npz", cases.jump_capture(400, 1.0))
 
 
-def _kinds() -> dict[str, _Kind]:
+def _write_sage(folder: Path) -> None:
+    """Write a folder of SAGE: states at 500 Hz and commands at 50 Hz of two joints."""
+    folder.mkdir()
+    (folder / "joint_list.txt").write_text("hip\nknee\n")
+    states = ["type,timestamp,positions,velocities,torques\n"]
+    for k in range(60):
+        states.append(f'S,{2000 * k},"[0.{k:02d}, 1]","[0, 0]","[0, 0]"\n')
+    controls = ["type,timestamp,positions\n"]
+    for k in range(6):
+        controls.append(f'C,{20000 * k},"[{k}.0, 0.5]"\n')
+    (folder / "state_motor.csv").write_text("".join(states))
+    (folder / "control.csv").write_text("".join(controls))
+    events = "type,timestamp,event\nE,2000,MOTION_START\nE,100000,DISABLE\n"
+    (folder / "event.csv").write_text(events)
+
+
+def _write_bag(path: Path, positions: Array) -> None:
+    """Write a rosbag2 of one joint whose states equal its commands."""
+    ros = importlib.import_module("mcap_ros2.writer").Writer
+    with path.open("wb") as stream, ros(stream) as writer:
+        state = writer.register_msgdef("sensor_msgs/msg/JointState", _STATE)
+        for k in range(200):
+            stamp = {"stamp": {"sec": 1 + k // 100, "nanosec": k % 100 * 10**7}, "frame_id": ""}
+            message = {
+                "header": stamp,
+                "name": ["knee"],
+                "position": [float(positions[k])],
+                "velocity": [],
+                "effort": [],
+            }
+            for topic in ("/joint_states", "/command"):
+                writer.write_message(topic, state, message, 10**9 + k * 10**7, 0)
+
+
+def _write_deploy_log(path: Path, robot: RobotSpec) -> None:
+    """Write the log of 0.4 s of a deployment: 200 ticks and 20 steps of the policy."""
+    header = {
+        "robot": robot.name,
+        "joints": robot.joint_names,
+        "link": "sim",
+        "policy": {"file": "policy.onnx", "delay_range_s": [0.0, 0.01]},
+        "limits": {"tilt": 0.8},
+    }
+    writer = DeployLogWriter(path, header)
+    for k in range(200):
+        tick = np.zeros((), TICK)
+        tick["tick"] = k
+        tick["sequence"] = k
+        for name in ("deadline", "begun", "done", "time"):
+            tick[name] = k / 500.0
+        tick["mode"] = Mode.POLICY
+        tick["latency"] = 0.003
+        writer.write(np.frombuffer(tick.tobytes(), TICK)[0])
+        if k % 10 == 0:
+            step = np.zeros((), STEP)
+            step["begun"] = k / 500
+            step["live"] = 1
+            writer.write(np.frombuffer(step.tobytes(), STEP)[0])
+    writer.end(complete=True, figures={})
+
+
+def _formats() -> dict[str, _Format]:
     """How each kind is read; the files lie in the folder that `_write` filled."""
 
     def log(**options: Any) -> Callable[[Path], Any]:
         return lambda path: read_log(path, options=ReadOptions(**options))
 
     def gains(path: Path) -> None:
-        found = gains_file.load_gains(path)
+        matched = gains_file.load_gains(path)
         for target in get_args(TargetName):
             with contextlib.suppress(PronkError):
-                write_text(path.parent / "out" / "a.py", export(found, target))
+                write_text(path.parent / "out" / "a.py", export(matched, target))
 
     def match(path: Path) -> Any:
         return load_match(path)
@@ -201,58 +247,70 @@ def _kinds() -> dict[str, _Kind]:
         load_robot(path)
 
     def deploy(path: Path) -> None:
-        found = read_deploy_log(path)
-        deploy_run.stretches(found)
-        deploy_run.jump_inputs(found)
-        deploy_run.interventions(found)
-        deploy_run.margins(found)
-        deploy_run.timed_parts(found)
-        deploy_run.measured_delay(found, None)
+        deploy_log = read_deploy_log(path)
+        deploy_run.stretches(deploy_log)
+        deploy_run.jump_inputs(deploy_log)
+        deploy_run.interventions(deploy_log)
+        deploy_run.margins(deploy_log)
+        deploy_run.timed_parts(deploy_log)
+        deploy_run.measured_delay(deploy_log, None)
 
-    def trial(kind: results.RunKind) -> _Kind:
-        path = f"tree/trial/{kind.summary}"
-        return _Kind((path,), lambda path: results.load_results(path.parent, kind))
+    def trial(run_kind: results.RunKind) -> _Format:
+        summary = f"tree/trial/{run_kind.summary}"
+        return _Format((summary,), lambda path: results.load_results(path.parent, run_kind))
 
     def command(*words: str) -> Callable[[Path], None]:
         return lambda path: _command([word.format(path, path.parent) for word in words])
 
-    sage = tuple(f"sage/{name}" for name in ("state_motor.csv", "control.csv", "joint_list.txt"))
-    pages = ("gains.yaml", "match.npz", "fresh.prediction.npz")
-    trials = ("summary.json", "videos/matched_forward_2.png")
+    sage_files = (
+        "sage/state_motor.csv",
+        "sage/control.csv",
+        "sage/joint_list.txt",
+        "sage/event.csv",
+    )
+    page_files = (
+        "page/gains.yaml",
+        "page/match.npz",
+        "page/fresh.prediction.npz",
+        "page/trial/summary.json",
+        "page/trial/videos/matched_forward_2.png",
+    )
     response = ("response", "{0}", "--unit", "rad", "--no-plots", "--out", "{1}/out")
-    kinds = {
-        "npz": _Kind(("a.npz",), log(unit="rad"), True),
-        "csv": _Kind(("a.csv",), log(unit="rad")),
-        "mcap": _Kind(("a.mcap",), log(), True),
-        "bag": _Kind(("bag.mcap",), log(command_topic="/command"), True),
-        "sage": _Kind((*sage, "sage/event.csv"), lambda path: read_log(path.parent)),
-        "pace": _Kind(("a.pt",), log(joint_order="hip,knee"), True),
-        "pronk response": _Kind(("chirp.csv",), command(*response)),
-        "deploy log": _Kind(("deploy.mcap",), deploy),
-        "gains": _Kind(("tree/gains.yaml",), gains),
-        "match": _Kind(("tree/match.npz",), match, True),
-        "prediction": _Kind(("page/fresh.prediction.npz",), load_prediction, True),
-        "response": _Kind(("tree/a.response.npz",), response_file.load_responses, True),
-        "capture": _Kind(("capture.npz",), capture.load_capture, True),
+    formats = {
+        "npz": _Format(("a.npz",), log(unit="rad"), True),
+        "csv": _Format(("a.csv",), log(unit="rad")),
+        "mcap": _Format(("a.mcap",), log(), True),
+        "bag": _Format(("bag.mcap",), log(command_topic="/command"), True),
+        "sage": _Format(sage_files, lambda path: read_log(path.parent)),
+        "pace": _Format(("a.pt",), log(joint_order="hip,knee"), True),
+        "pronk response": _Format(("chirp.csv",), command(*response)),
+        "deploy log": _Format(("deploy.mcap",), deploy),
+        "gains": _Format(("tree/gains.yaml",), gains),
+        "match": _Format(("tree/match.npz",), match, True),
+        "prediction": _Format(("page/fresh.prediction.npz",), load_prediction, True),
+        "response": _Format(("tree/a.response.npz",), response_file.load_responses, True),
+        "capture": _Format(("capture.npz",), capture.load_capture, True),
         "trial": trial(results.JUMPS),
         "walk": trial(WALK),
         "crossing": trial(CROSSING),
-        "conditions": _Kind(("conditions.yaml",), read_conditions),
-        "evaluation": _Kind(("evaluation.json",), load_speed_errors),
-        "policy": _Kind(("policy.onnx",), load_policy),
-        "contract": _Kind(("contract.json",), lambda p: from_json(p.read_text("l1"), source=p)),
-        "robot.yaml": _Kind(("robot/robot.yaml",), read_robot),
-        "MJCF": _Kind(("model.xml",), model),
-        "URDF": _Kind(("model.urdf",), model),
-        "pronk robot check": _Kind(("robot/robot.yaml",), command("robot", "check", "{0}")),
-        "sim_params": _Kind(("sim_params.yaml",), load_sim_params),
-        "pronk report": _Kind(
-            tuple(f"page/{n}" for n in (*pages, *(f"trial/{t}" for t in trials))),
+        "conditions": _Format(("conditions.yaml",), read_conditions),
+        "evaluation": _Format(("evaluation.json",), load_speed_errors),
+        "policy": _Format(("policy.onnx",), load_policy),
+        "contract": _Format(("contract.json",), lambda p: from_json(p.read_text("l1"), source=p)),
+        "robot.yaml": _Format(("robot/robot.yaml",), read_robot),
+        "MJCF": _Format(("model.xml",), model),
+        "URDF": _Format(("model.urdf",), model),
+        "pronk robot check": _Format(("robot/robot.yaml",), command("robot", "check", "{0}")),
+        "sim_params": _Format(("sim_params.yaml",), load_sim_params),
+        "pronk report": _Format(
+            page_files,
             lambda path: _command(["report", str(path.parent)]),
             share=0.2,
         ),
     }
-    return {name: kind for name, kind in kinds.items() if name != "pace" or _TORCH}
+    if not _TORCH:
+        del formats["pace"]
+    return formats
 
 
 def _command(words: list[str]) -> None:
@@ -274,7 +332,8 @@ def _mutated(data: bytes, rng: np.random.Generator) -> bytes:
     out = bytearray(data)
     for _ in range(rng.geometric(0.6)):
         end = min(len(out), 4096)
-        at, size = int(rng.integers(len(out) + 1)), int(2 ** rng.uniform(0, 9))
+        at = int(rng.integers(len(out) + 1))
+        size = int(2 ** rng.uniform(0, 9))
         at = (at, at, at % (end + 1), len(out) - at % (end + 1))[rng.integers(4)]
         token = _TOKENS[rng.integers(len(_TOKENS))]
         match rng.integers(7):
@@ -289,59 +348,71 @@ def _mutated(data: bytes, rng: np.random.Generator) -> bytes:
             case 4:
                 out[at:] = out[at + size :] + out[at : at + size]
             case _:
-                if word := _WORD.search(out, max(at - 8, 0)):
+                word = _WORD.search(out, max(at - 8, 0))
+                if word:
                     out[slice(*word.span())] = token
     return bytes(out)
 
 
 def _mutated_inside(data: bytes, rng: np.random.Generator) -> bytes | None:
     """Change what a zip archive or MCAP file holds, with right checksums; None for others."""
-    made = io.BytesIO()
+    changed_file = io.BytesIO()
     if data.startswith(b"PK"):
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w", 8) as new:
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(changed_file, "w", 8) as new:
             changed = rng.choice(old.namelist())
             for name in old.namelist():
                 part = old.read(name)
                 new.writestr(name, _mutated(part, rng) if name == changed else part)
-        return made.getvalue()
+        return changed_file.getvalue()
     if not data.startswith(b"\x89MCAP"):
         return None
-    found = [one for batch in records(io.BytesIO(data), len(data)) for one in batch]
-    few = [*range(3), *rng.integers(len(found), size=3), len(found) - 1]
-    changed = rng.choice(few, size=rng.integers(1, 3))
-    writer, channels = Writer(made), dict[str, int]()
+    messages: list[Record] = []
+    for batch in records(io.BytesIO(data), len(data)):
+        messages.extend(batch)
+    candidates = [*range(3), *rng.integers(len(messages), size=3), len(messages) - 1]
+    changed = rng.choice(candidates, size=rng.integers(1, 3))
+    writer = Writer(changed_file)
+    channels: dict[str, int] = {}
     writer.start()
-    for i, one in enumerate(found):
-        if one.topic not in channels:
+    for i, message in enumerate(messages):
+        if message.topic not in channels:
             schema = 0
-            if one.schema is not None:
-                about = one.schema.data
-                about = _mutated(about, rng) if rng.random() < 0.03 else about
-                schema = writer.register_schema(one.schema.name, one.schema.encoding, about)
-            channels[one.topic] = writer.register_channel(one.topic, one.encoding, schema)
-        data = _mutated(one.data, rng) if i in changed else one.data
-        writer.add_message(channels[one.topic], one.log_time, data, one.log_time)
+            if message.schema is not None:
+                definition = message.schema.data
+                if rng.random() < 0.03:
+                    definition = _mutated(definition, rng)
+                schema = writer.register_schema(
+                    message.schema.name, message.schema.encoding, definition
+                )
+            channels[message.topic] = writer.register_channel(
+                message.topic, message.encoding, schema
+            )
+        content = message.data
+        if i in changed:
+            content = _mutated(content, rng)
+        writer.add_message(channels[message.topic], message.log_time, content, message.log_time)
     writer.finish()  # type: ignore[no-untyped-call]
-    return made.getvalue()
+    return changed_file.getvalue()
 
 
-def _numbers(found: Any) -> Iterator[Any]:
+def _numbers(content: Any) -> Iterator[Any]:
     """Numbers and arrays of a dataclass of lists and further dataclasses."""
-    if is_dataclass(found):
-        found = [getattr(found, field.name) for field in fields(found)]
-    if isinstance(found, dict):
-        found = list(found.values())
-    if isinstance(found, list | tuple):
-        for one in found:
-            yield from _numbers(one)
-    elif isinstance(found, np.ndarray | float):
-        yield found
+    if is_dataclass(content):
+        content = [getattr(content, field.name) for field in fields(content)]
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, list | tuple):
+        for part in content:
+            yield from _numbers(part)
+    elif isinstance(content, np.ndarray | float):
+        yield content
 
 
-def _same(found: Any, right: Any) -> bool:
-    pairs = zip(_numbers(found), _numbers(right), strict=True)
+def _same_numbers(content: Any, right_content: Any) -> bool:
+    """Return True if two contents have the same numbers and arrays."""
+    pairs = zip(_numbers(content), _numbers(right_content), strict=True)
     try:
-        return all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
+        return all(np.array_equal(number, right, equal_nan=True) for number, right in pairs)
     except ValueError:
         return False
 
@@ -357,14 +428,14 @@ def _watch(folder: Path) -> None:
     changes = ("mkdir", "rename", "remove", "rmdir", "link", "symlink", "truncate", "chmod")
     starts = ("subprocess.", "os.exec", "os.fork", "os.posix_spawn", "os.system", "socket.connect")
 
-    def hook(event: str, given: tuple[Any, ...]) -> None:
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event.startswith(starts):
-            raise _OutsideError(event, *map(str, given))
+            raise _OutsideError(event, *map(str, arguments))
         paths: tuple[Any, ...] = ()
-        if event == "open" and given[2] & writes:
-            paths = given[:1]
+        if event == "open" and arguments[2] & writes:
+            paths = arguments[:1]
         elif event.startswith("os.") and event[3:] in changes:
-            paths = given[:2]
+            paths = arguments[:2]
         for path in paths:
             if isinstance(path, str | bytes | os.PathLike):
                 place = os.path.realpath(os.fsdecode(path))
@@ -380,10 +451,10 @@ def _memory(name: str) -> int:
     return int(text.partition(f"{name}:")[2].split()[0]) << 10
 
 
-def _one(kind: _Kind, path: Path, right: Any) -> tuple[str, str]:
+def _read_file(file_format: _Format, path: Path, right: Any) -> tuple[str, str]:
     """Read one file; whether it was `read`, `refused`, or a `fault`, and why."""
     try:
-        found = kind.read(path)
+        content = file_format.read(path)
     except PronkError as error:
         return "refused" if str(error).isprintable() else "fault", str(error)
     except (Exception, _OutsideError) as error:
@@ -391,17 +462,20 @@ def _one(kind: _Kind, path: Path, right: Any) -> tuple[str, str]:
         return "fault", f"{place.filename}:{place.lineno}: {type(error).__name__} {error}"
     if right is None:
         return "read", ""
-    said = isinstance(found, JointLog) and (not found.origin.complete or found.notes != right.notes)
-    if said or _same(found, right):
+    if _same_numbers(content, right):
         return "read", ""
+    if isinstance(content, JointLog):
+        is_noted = not content.origin.complete or content.notes != right.notes
+        if is_noted:
+            return "read", ""
     return "fault", "other numbers without a word"
 
 
-def _chosen(kinds: dict[str, _Kind], seed: int, i: int) -> tuple[str, np.random.Generator]:
+def _drawn(formats: dict[str, _Format], seed: int, i: int) -> tuple[str, np.random.Generator]:
     """Kind of file `i`, and what its mutations are drawn with."""
     rng = np.random.default_rng([seed, i])
-    shares = np.array([kind.share for kind in kinds.values()])
-    return str(rng.choice(list(kinds), p=shares / shares.sum())), rng
+    shares = np.array([file_format.share for file_format in formats.values()])
+    return str(rng.choice(list(formats), p=shares / shares.sum())), rng
 
 
 def _read(sound: Path, folder: Path, rows: Path, numbers: range, seed: int, at: Any) -> None:
@@ -411,30 +485,40 @@ def _read(sound: Path, folder: Path, rows: Path, numbers: range, seed: int, at: 
     tempfile.tempdir = str(folder)
     sys.dont_write_bytecode = True
     warnings.simplefilter("ignore")
-    kinds = _kinds()
-    right = {name: kind.read(folder / kind.files[0]) for name, kind in kinds.items()}
+    formats = _formats()
+    right_contents = {}
+    for name, file_format in formats.items():
+        right_contents[name] = file_format.read(folder / file_format.files[0])
     resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
     with rows.open("a") as file:
         _watch(folder)
         for i in numbers:
             at.value = i
-            name, rng = _chosen(kinds, seed, i)
-            kind = kinds[name]
-            path = folder / rng.choice(kind.files)
+            name, rng = _drawn(formats, seed, i)
+            file_format = formats[name]
+            path = folder / rng.choice(file_format.files)
             data = path.read_bytes()
-            inside = _mutated_inside(data, rng) if rng.random() < 0.5 else None
-            path.write_bytes(inside or _mutated(data, rng))
+            mutated_inside = None
+            if rng.random() < 0.5:
+                mutated_inside = _mutated_inside(data, rng)
+            path.write_bytes(mutated_inside or _mutated(data, rng))
             Path("/proc/self/clear_refs").write_text("5")
-            memory, begun = _memory("VmRSS"), time.process_time()
+            memory = _memory("VmRSS")
+            begin = time.process_time()
             signal.setitimer(signal.ITIMER_PROF, CPU_S)
             signal.setitimer(signal.ITIMER_REAL, WALL_S)
-            known = right[name] if kind.checked and inside is None else None
-            outcome, why = _one(kind, folder / kind.files[0], known)
+            right = None
+            if file_format.checked and mutated_inside is None:
+                right = right_contents[name]
+            outcome, reason = _read_file(file_format, folder / file_format.files[0], right)
             for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
                 signal.setitimer(timer, 0.0)
-            row = {"i": i, "kind": name, "outcome": outcome, "s": time.process_time() - begun}
+            row: dict[str, Any] = {"i": i, "kind": name, "outcome": outcome}
+            row["s"] = time.process_time() - begin
             row["mb"] = (_memory("VmHWM") - memory) / 1e6
-            file.write(json.dumps(row | {"why": why[:300]} if outcome == "fault" else row) + "\n")
+            if outcome == "fault":
+                row["why"] = reason[:300]
+            file.write(json.dumps(row) + "\n")
             file.flush()
             path.write_bytes(data)
 
@@ -457,14 +541,15 @@ def fuzz(
         _write(folder / "sound")
         rows = (out or folder / "rows.jsonl").resolve()
         rows.write_text("")
-        context, last = multiprocessing.get_context("spawn"), first + count
+        context = multiprocessing.get_context("spawn")
+        end = first + count
         running: dict[int, tuple[Any, int, Any]] = {}
 
         def start(begin: int, place: int) -> None:
             at = context.Value("q", begin - jobs)
-            numbers = range(begin, last, jobs)
-            given = (folder / "sound", folder / str(place), rows, numbers, seed, at)
-            process = context.Process(target=_read, args=given)
+            numbers = range(begin, end, jobs)
+            arguments = (folder / "sound", folder / str(place), rows, numbers, seed, at)
+            process = context.Process(target=_read, args=arguments)
             process.start()
             running[process.sentinel] = (process, place, at)
 
@@ -477,27 +562,35 @@ def fuzz(
                 if process.exitcode:
                     if at.value < first or process.exitcode > 0:
                         raise PronkError("a process of this benchmark failed; see above.")
-                    why = f"ended the process with {process.exitcode}"
+                    name_of_format, _ = _drawn(_formats(), seed, at.value)
+                    row = {
+                        "i": at.value,
+                        "kind": name_of_format,
+                        "outcome": "fault",
+                        "s": 0.0,
+                        "mb": 0.0,
+                        "why": f"ended the process with {process.exitcode}",
+                    }
                     with rows.open("a") as file:
-                        kind, _ = _chosen(_kinds(), seed, at.value)
-                        row = {"i": at.value, "kind": kind, "outcome": "fault", "s": 0.0, "mb": 0.0}
-                        file.write(json.dumps(row | {"why": why}) + "\n")
-                    if at.value + jobs < last:
+                        file.write(json.dumps(row) + "\n")
+                    if at.value + jobs < end:
                         start(at.value + jobs, place + jobs)
-        found = [json.loads(line) for line in rows.read_text().splitlines()]
-    return _outcome(found, seed)
+        read_files = [json.loads(line) for line in rows.read_text().splitlines()]
+    return _outcome(read_files, seed)
 
 
-def _outcome(found: list[dict[str, Any]], seed: int) -> console.Outcome:
-    by_kind = collections.defaultdict[str, list[dict[str, Any]]](list)
-    for row in found:
-        by_kind[row["kind"]].append(row)
+def _outcome(read_files: list[dict[str, Any]], seed: int) -> console.Outcome:
+    """Show a table of what became of the files, a row for each kind, and the faults."""
+    by_kind: dict[str, list[dict[str, Any]]] = {}
+    for row in read_files:
+        by_kind.setdefault(row["kind"], []).append(row)
     counts = []
     cells: list[tuple[Cell, ...]] = []
-    for kind, rows in sorted(by_kind.items()):
+    for name in sorted(by_kind):
+        rows = by_kind[name]
         outcomes = [row["outcome"] for row in rows]
         count_row = {
-            "kind": kind,
+            "kind": name,
             "n": len(rows),
             "read": outcomes.count("read"),
             "refused": outcomes.count("refused"),
@@ -516,10 +609,10 @@ def _outcome(found: list[dict[str, Any]], seed: int) -> console.Outcome:
         Column(heading="longest", unit="s", digits=2),
         Column(heading="most memory", unit="MB", digits=0),
     )
-    title = f"{len(found)} mutated files, seed {seed}"
+    title = f"{len(read_files)} mutated files, seed {seed}"
     console.show(Table(title=title, columns=columns, rows=tuple(cells)))
-    faults = [row for row in found if row["outcome"] == "fault"]
+    faults = [row for row in read_files if row["outcome"] == "fault"]
     for row in faults[:60]:
         console.say(f"{row['i']} {row['kind']}: {row['why']}")
-    figures = {"count": len(found), "faults": len(faults), "kinds": counts}
+    figures = {"count": len(read_files), "faults": len(faults), "kinds": counts}
     return console.Outcome(figures=figures, status=1 if faults else 0)

@@ -42,16 +42,17 @@ def simulate_second_order(
     return np.asarray(lfilter(np.ravel(numerator), denominator, command - command[0]) + command[0])
 
 
-def held(time: Array) -> Array:
+def tick_time(time: Array) -> Array:
     """The policy tick in force at each instant."""
     return np.floor(time * TICK_HZ + 1e-9) / TICK_HZ
 
 
 def chirp_command(kind: str, rate: float) -> tuple[Array, Array, Array]:
     """Time, command held at 50 Hz, instantaneous frequency of a chirp of 0.1 to 25 Hz in 20 s."""
-    duration, settle = 20.0, 1.0
+    duration = 20.0
+    settle = 1.0
     time = np.arange(round((duration + settle) * rate)) / rate
-    tick = held(time)
+    tick = tick_time(time)
     method = "linear" if kind == "chirp" else "logarithmic"
     wave = chirp(tick, 0.1, duration, 25.0, method=method, phi=-90)
     share = np.minimum(time / duration, 1.0)
@@ -62,9 +63,10 @@ def chirp_command(kind: str, rate: float) -> tuple[Array, Array, Array]:
 
 def multisine_command(rate: float, *, periods: int = 5, seed: int = 0) -> tuple[Array, Array]:
     """Random-phase multisine of period 4 s on odd lines, every fourth odd line left silent."""
-    period, settle = 4.0, 0.5
+    period = 4.0
+    settle = 0.5
     time = np.arange(round((periods * period + settle) * rate)) / rate
-    tick = held(time)
+    tick = tick_time(time)
     lines = np.arange(1, 96, 2)
     lines = lines[np.arange(len(lines)) % 4 != 2]
     phases = np.random.default_rng(seed + 1000).uniform(0.0, 2.0 * np.pi, len(lines))
@@ -75,10 +77,11 @@ def multisine_command(rate: float, *, periods: int = 5, seed: int = 0) -> tuple[
 
 def steps_command(rate: float, frequencies: tuple[float, ...]) -> tuple[Array, Array, Array]:
     """Sine steps of six periods or two seconds each, whichever is longer."""
-    pieces, hz = [], []
+    pieces = []
+    hz = []
     for f in frequencies:
         length = max(6, int(np.ceil(2.0 * f))) / f
-        tick = held(np.arange(round(length * rate)) / rate)
+        tick = tick_time(np.arange(round(length * rate)) / rate)
         pieces.append(AMPLITUDE * np.sin(2.0 * np.pi * f * tick))
         hz.append(np.full(len(tick), f))
     command = np.concatenate([*pieces, np.zeros(round(0.5 * rate))])
@@ -90,9 +93,13 @@ def friction_joint(frictionloss: float) -> Callable[[Array, float], Array]:
     """The knee with dry friction, stepped at 8 times the log rate."""
 
     def simulate(command: Array, rate: float) -> Array:
-        fine, step = 8, 1.0 / (8.0 * rate)
-        k, d, inertia = KNEE.values()
-        q = v = 0.0
+        fine = 8
+        step = 1.0 / (fine * rate)
+        k = KNEE["stiffness"]
+        d = KNEE["damping"]
+        inertia = KNEE["inertia"]
+        q = 0.0
+        v = 0.0
         out = np.empty(len(command))
         for i, u in enumerate(command.tolist()):
             out[i] = q
@@ -127,7 +134,12 @@ def make_log(
     reads its state and puts the command of that row into force at the moved instant.
     """
     rng = np.random.default_rng(seed)
-    start, columns, segments = 3.0, [], []
+    start = 3.0
+    times = []
+    commands = []
+    positions = []
+    frequencies = []
+    segments = []
     for repeat, (time, command, frequency) in enumerate(signals):
         rate = round(1.0 / float(time[1] - time[0]))
         # The motion between samples is simulated on a grid forty times as fine.
@@ -138,7 +150,10 @@ def make_log(
         dense = np.repeat(command, np.diff(np.append(index, index[-1] + 1)))
         position = joint(dense, rate * fine)[index] + noise * rng.standard_normal(len(time))
         hz = np.full(len(time), np.nan) if frequency is None else frequency
-        columns.append((moved, command, position, hz))
+        times.append(moved)
+        commands.append(command)
+        positions.append(position)
+        frequencies.append(hz)
         segments.append(
             Segment(
                 kind=kind,
@@ -151,14 +166,14 @@ def make_log(
             )
         )
         start += float(time[-1]) + 0.5
-    stacked = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    all_frequencies = np.concatenate(frequencies)
     return JointLog(
         robot="bench",
         joints=("knee",),
-        time=stacked[0],
-        command=stacked[1][:, None],
-        position=stacked[2][:, None],
-        frequency=stacked[3] if np.isfinite(stacked[3]).any() else None,
+        time=np.concatenate(times),
+        command=np.concatenate(commands)[:, None],
+        position=np.concatenate(positions)[:, None],
+        frequency=all_frequencies if np.isfinite(all_frequencies).any() else None,
         segments=tuple(segments),
         origin=LogOrigin(source="made for a test"),
     )

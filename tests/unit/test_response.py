@@ -53,7 +53,10 @@ def chirps(
 def multisines(
     count: int = 1, joint: Any = KNEE_JOINT, *, rate: float = 500.0, periods: int = 5, **more: Any
 ) -> JointLog:
-    signals = [(*multisine_command(rate, seed=k, periods=periods), None) for k in range(count)]
+    signals: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = []
+    for seed in range(count):
+        time, command = multisine_command(rate, seed=seed, periods=periods)
+        signals.append((time, command, None))
     return make_log(signals, joint, **{"kind": "multisine", "period": 4.0} | more)
 
 
@@ -64,7 +67,8 @@ def errors(
     expected = second_order(response.omega, delay_s=delay, **joint)
     use = response.band(0.25, 24.0, 0.95)
     ratio = response.response[use] / expected[use]
-    gain, phase = np.abs(np.abs(ratio) - 1.0), np.degrees(np.abs(np.angle(ratio)))
+    gain = np.abs(np.abs(ratio) - 1.0)
+    phase = np.degrees(np.abs(np.angle(ratio)))
     return float(gain.max()), float(phase.max()), int(use.sum())
 
 
@@ -117,7 +121,8 @@ def test_measured_timestamps_are_used(jitter: float) -> None:
 
 def test_held_mean_is_the_zero_order_hold_on_the_grid_and_moves_no_step_off_it() -> None:
     rng = np.random.default_rng(0)
-    time, command = np.arange(400) / 500.0, np.repeat(rng.normal(size=40), 10)
+    time = np.arange(400) / 500.0
+    command = np.repeat(rng.normal(size=40), 10)
     assert np.abs(held_mean(time, command, grid_over(time).edges) - command).max() < 1e-12
     off = Grid(start=0.0013, rate_hz=487.0, count=380)
     fine = np.linspace(off.start, off.start + off.count / off.rate_hz, 400_001)[:-1]
@@ -129,11 +134,15 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
     time, command, hz = chirp_command("chirp", 200.0)
     signals = [(time, size * command, hz) for size in (0.5, 0.5, 1.0, 1.0, 1.0)]
     log = make_log(signals, KNEE_JOINT, kind="chirp")
-    segments = tuple(replace(s, amplitude=float("nan")) for s in log.segments)
-    responses = estimate_response(replace(log, segments=segments), "knee")
-    assert [r.amplitude for r in responses] == pytest.approx([0.25, 0.125], rel=0.01)
-    assert [len(r.repeats) for r in responses] == [3, 2]
-    assert np.array_equal(responses[0].omega, responses[1].omega)
+    segments = []
+    for segment in log.segments:
+        segments.append(replace(segment, amplitude=float("nan")))
+    large, small = estimate_response(replace(log, segments=tuple(segments)), "knee")
+    assert large.amplitude == pytest.approx(0.25, rel=0.01)
+    assert small.amplitude == pytest.approx(0.125, rel=0.01)
+    assert len(large.repeats) == 3
+    assert len(small.repeats) == 2
+    assert np.array_equal(large.omega, small.omega)
 
 
 def test_settings_are_checked() -> None:
@@ -156,6 +165,7 @@ def test_logs_without_a_response_are_refused() -> None:
     bare = make_log([(time, command, None)], KNEE_JOINT, kind="sine_steps")
     hurried = make_log([(time[:600], command[:600], hz[:600])], KNEE_JOINT, kind="sine_steps")
     two_columns = np.repeat(stuck.command, 2, axis=1)
+    two_joints = replace(stuck, joints=("knee", "hip"), command=two_columns, position=two_columns)
     for log, joint, words in (
         (stuck, "knee", "knee did not move"),
         (still, "knee", "stands still"),
@@ -165,10 +175,7 @@ def test_logs_without_a_response_are_refused() -> None:
         (multisines(period=None), "knee", "no period_s"),
         (bare, "knee", "instantaneous frequency"),
         (hurried, "knee", "the step at 1 Hz lasts"),
-        (
-            replace(stuck, joints=("knee", "hip"), command=two_columns, position=two_columns),
-            *("hip", "hip was not excited; knee"),
-        ),
+        (two_joints, "hip", "hip was not excited; knee"),
     ):
         with pytest.raises(LogError, match=words):
             estimate_response(log, joint)
@@ -228,12 +235,12 @@ def test_friction_shows_in_the_third_harmonic() -> None:
         ((time, 0.5 * command, hz), 0.2, "chirp"),
         (steps_command(500.0, (1.0, 2.0, 3.0)), 0.2, "sine_steps"),
     )
-    logs = [
-        make_log([signal], friction_joint(dry), kind=k, noise=2e-5) for signal, dry, k in signals
-    ]
-    no_friction, full_friction, half_amplitude, by_steps = (
-        estimate_response(log, "knee")[0].third_harmonic for log in logs
-    )
+    third_harmonics = []
+    for signal, frictionloss, signal_kind in signals:
+        joint = friction_joint(frictionloss)
+        log = make_log([signal], joint, kind=signal_kind, noise=2e-5)
+        third_harmonics.append(estimate_response(log, "knee")[0].third_harmonic)
+    no_friction, full_friction, half_amplitude, by_steps = third_harmonics
     assert no_friction < 0.001
     assert 0.008 < full_friction < 0.02
     assert half_amplitude == pytest.approx(2.0 * full_friction, rel=0.15)
@@ -270,16 +277,23 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     rng = np.random.default_rng(repeats)
     time, command, _ = chirp_command("chirp", 200.0)
     operator = H1Operator.build(time, command, SETTINGS)
-    matrix, ones = operator.matrix(time), np.ones(len(operator.omega))
+    matrix = operator.matrix(time)
+    ones = np.ones(len(operator.omega))
     clean = simulate_second_order(command, 200.0, **KNEE)
     noise = coloured(rng, (300, repeats, len(time)), 2e-3)
-    expected, weights = clean @ matrix, {"coherence": ones, "averages": ones}
-    hits = np.array(
-        [
-            covered(operator.omega, expected, response=row.mean(axis=0), repeats=row, **weights)
-            for row in (clean + noise) @ matrix
-        ]
-    )
+    expected = clean @ matrix
+    covered_trials = []
+    for trial_repeats in (clean + noise) @ matrix:
+        is_covered = covered(
+            operator.omega,
+            expected,
+            response=trial_repeats.mean(axis=0),
+            repeats=trial_repeats,
+            coherence=ones,
+            averages=ones,
+        )
+        covered_trials.append(is_covered)
+    hits = np.array(covered_trials)
     for shares in hits.swapaxes(0, 1):
         assert 0.93 < shares.mean() < 0.97
         assert shares.mean(axis=0).min() > 0.88
@@ -290,32 +304,44 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
 def laid_out() -> tuple[SegmentLayout, np.ndarray]:
     """Segments over one chirp at 200 Hz, and its spectra."""
     time, command, _ = chirp_command("chirp", 200.0)
-    where = segment_layout(grid_over(time), SETTINGS, padded=True)
-    return where, where.spectra(held_mean(time, command, where.grid.edges))
+    layout = segment_layout(grid_over(time), SETTINGS, padded=True)
+    return layout, layout.spectra(held_mean(time, command, layout.grid.edges))
 
 
 @pytest.mark.parametrize("colour", ["white", "coloured"])
 def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> None:
-    rng, (where, excited) = np.random.default_rng(7), laid_out()
+    rng = np.random.default_rng(7)
+    layout, excited = laid_out()
     clean = KNEE_JOINT(chirp_command("chirp", 200.0)[1], 200.0)
-    expected = sum_spectra(excited, where.spectra(clean), where).response(where.omega, 200.0)
+    expected = sum_spectra(excited, layout.spectra(clean), layout).response(layout.omega, 200.0)
     hits = []
     for _ in range(150):
         white = 4e-3 * rng.standard_normal(len(clean))
         noise = white if colour == "white" else coloured(rng, (len(clean),), 8e-3)
-        s = sum_spectra(excited, where.spectra(clean + noise), where)
-        estimated = s.response(where.omega, 200.0)
-        parts = {"coherence": s.coherence(), "averages": s.averages(), "repeats": estimated[None]}
-        hits.append(covered(where.omega, expected, response=estimated, **parts)[0])
+        spectra = sum_spectra(excited, layout.spectra(clean + noise), layout)
+        estimated = spectra.response(layout.omega, 200.0)
+        is_covered = covered(
+            layout.omega,
+            expected,
+            response=estimated,
+            repeats=estimated[None],
+            coherence=spectra.coherence(),
+            averages=spectra.averages(),
+        )
+        hits.append(is_covered[0])
     assert 0.90 < np.mean(hits) < 0.99
 
 
 def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
-    rng, (where, excited) = np.random.default_rng(3), laid_out()
-    noise = [rng.standard_normal(where.grid.count) for _ in range(150)]
-    shares = [sum_spectra(excited, where.spectra(one), where) for one in noise]
-    raw = np.mean([np.abs(s.uy) ** 2 / (s.uu * s.yy) for s in shares], axis=0)
-    assert float((raw * shares[0].averages())[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
+    rng = np.random.default_rng(3)
+    layout, excited = laid_out()
+    raw_coherences = []
+    for _ in range(150):
+        noise = rng.standard_normal(layout.grid.count)
+        spectra = sum_spectra(excited, layout.spectra(noise), layout)
+        raw_coherences.append(np.abs(spectra.uy) ** 2 / (spectra.uu * spectra.yy))
+    times_averages = np.mean(raw_coherences, axis=0) * spectra.averages()
+    assert float(times_averages[8:-8].mean()) == pytest.approx(1.0, abs=0.1)
     # Nor is a single noisy repeat coherent by construction.
     assert float(np.median(estimate_response(chirps(noise=0.5), "knee")[0].coherence)) < 0.7
 
@@ -360,7 +386,8 @@ def test_matrix_takes_positions_at_physics_steps() -> None:
     time, command, _ = chirp_command("chirp", 500.0)
     operator = H1Operator.build(time, command, Estimator())
     steps = np.arange(round(time[-1] / 0.005)) * 0.005
-    matrix, own_matrix = operator.matrix(steps), operator.matrix(time)
+    matrix = operator.matrix(steps)
+    own_matrix = operator.matrix(time)
     # Offsets do not matter.
     assert np.allclose((command + 1.7) @ own_matrix, command @ own_matrix, atol=1e-8)
     for joint in (KNEE, HIP, LIVELY):
