@@ -48,9 +48,12 @@ def integrated(robot: RobotSpec, joint: str, command: Array, start: Array) -> Ar
     model = bench_spec(robot, joint).compile()
     data = mujoco.MjData(model)
     data.qpos[:] = start
-    joints = [robot.joint(model.joint(index).name) for index in range(model.nv)]
-    kp = np.array([chain_joint.stiffness for chain_joint in joints])
-    kd = np.array([chain_joint.damping for chain_joint in joints])
+    kp = np.zeros(model.nv)
+    kd = np.zeros(model.nv)
+    for index in range(model.nv):
+        chain_joint = robot.joint(model.joint(index).name)
+        kp[index] = chain_joint.stiffness
+        kd[index] = chain_joint.damping
     spring = np.zeros(model.nv)
     if law.kind == "implicit":
         spring = h * kp

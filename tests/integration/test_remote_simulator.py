@@ -30,6 +30,7 @@ ADAPTERS = '''
 import os, time
 import numpy as np
 from pronk.errors import PronkError
+from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.links import links_of
 
 class Resting:
@@ -92,20 +93,20 @@ def adapters(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_gives_the_same_positions_to_the_last_bit(python: Path) -> None:
-    here = load_simulator(EXAMPLE, ROBOT)
+    local = load_simulator(EXAMPLE, ROBOT)
     generator = np.random.default_rng(0)
     command = 0.1 * generator.normal(size=(3, 50, 12)).cumsum(axis=1)
     values = {
         "stiffness": generator.uniform(1.0, 2.0, (3, 12)),
         "damping": generator.uniform(1.0, 2.0, (3, 12)),
     }
-    with load_simulator(EXAMPLE, ROBOT, python=python) as there:  # type: ignore[attr-defined]
-        assert there.info == here.info
-        assert there.joints == here.joints
-        assert there.parameters == here.parameters
-        position = there.rollout(command, values, locked=("FL_knee",))
-        assert np.array_equal(position, here.rollout(command, values, locked=("FL_knee",)))
-        check_simulator(there)
+    with load_simulator(EXAMPLE, ROBOT, python=python) as remote:  # type: ignore[attr-defined]
+        assert remote.info == local.info
+        assert remote.joints == local.joints
+        assert remote.parameters == local.parameters
+        position = remote.rollout(command, values, locked=("FL_knee",))
+        assert np.array_equal(position, local.rollout(command, values, locked=("FL_knee",)))
+        check_simulator(remote)
 
 
 def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) -> None:
@@ -115,12 +116,12 @@ def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) 
     write_mcap(tmp_path / "log.mcap", log)
     gains = tmp_path / "gains.yaml"
     figures = tmp_path / "figures.json"
-    here = [tmp_path / "log.mcap", "--robot", ROBOT.name, "--simulator", EXAMPLE]
-    there = [*here, "--simulator-python", python]
-    assert invoke(["match", *there, "--out", gains]).exit_code in (0, WARNING_STATUS)
+    local = [tmp_path / "log.mcap", "--robot", ROBOT.name, "--simulator", EXAMPLE]
+    remote = [*local, "--simulator-python", python]
+    assert invoke(["match", *remote, "--out", gains]).exit_code in (0, WARNING_STATUS)
     assert load_gains(gains).joints["FR_knee"].stiffness.value == pytest.approx(19.3, rel=2e-3)
     replays = []
-    for words in (here, there):
+    for words in (local, remote):
         accepted("predict", *words, "--gains", gains, "--json", figures)
         replays.append(figures.read_text())
     assert replays[0] == replays[1]
@@ -129,8 +130,8 @@ def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) 
 def test_chains_arrive_as_they_are_and_prints_do_no_harm(python: Path, adapters: Path) -> None:
     command = np.full((2, 4, 3), 0.3)
     stiffness = np.array([[10.0] * 3, [20.0] * 3])
-    with load_simulator(f"{adapters}:Resting", ROBOT, python=python) as there:  # type: ignore[attr-defined]
-        position = there.rollout(command, {"stiffness": stiffness, "damping": stiffness})
+    with load_simulator(f"{adapters}:Resting", ROBOT, python=python) as remote:  # type: ignore[attr-defined]
+        position = remote.rollout(command, {"stiffness": stiffness, "damping": stiffness})
     links = links_of(ROBOT, "FR_hip_roll")
     for run in range(2):
         expected = links.rest(command[run, 0], stiffness[run])

@@ -94,9 +94,12 @@ def at_rest(joint: str) -> dict[str, float]:
     model = bench_spec(ROBOT, joint).compile()
     data = mujoco.MjData(model)
     chain = ROBOT.joint(joint).chain
-    joints = [ROBOT.joint(name) for name in chain]
-    target = np.array([chain_joint.default_position for chain_joint in joints])
-    stiffness = np.array([MATCHED.groups[chain_joint.group].stiffness for chain_joint in joints])
+    target = np.zeros(len(chain))
+    stiffness = np.zeros(len(chain))
+    for i, name in enumerate(chain):
+        chain_joint = ROBOT.joint(name)
+        target[i] = chain_joint.default_position
+        stiffness[i] = MATCHED.groups[chain_joint.group].stiffness
     data.qpos[:] = target
     for _ in range(10):
         mujoco.mj_forward(model, data)
@@ -159,7 +162,7 @@ def test_the_training_simulator_responds_like_the_matched_one(joint: str, delay:
         timestep=ROBOT.timestep_s,
         command=ROBOT.joint(joint).default_position
         + np.concatenate([np.zeros(delay), steps[: len(steps) - delay]]),
-        pose=np.array([j.default_position for j in ROBOT.joints]),
+        pose=np.array([robot_joint.default_position for robot_joint in ROBOT.joints]),
     )
     joints = []
     for robot_joint in ROBOT.joints:

@@ -28,7 +28,9 @@ from pronk.opengl import keep_opengl_out, requested_opengl
 from pronk.policy.script import STILL, Script
 from seen_jump import STANDING, G, motion
 
-RATE, LIFTOFF, RISE_SPEED = 200.0, 1.0, 2.0
+RATE = 200.0
+LIFTOFF = 1.0
+RISE_SPEED = 2.0
 FLIGHT = 2.0 * RISE_SPEED / G
 EVENTS = JumpEvents(on=0.8, off=1.3, liftoff=LIFTOFF, touchdown=LIFTOFF + FLIGHT)
 SIZE = (640, 400)
@@ -55,7 +57,8 @@ def planned(capture: Capture | None = None, **changes: Any) -> Film:
 
 
 def test_only_the_flight_is_slowed_down() -> None:
-    real, slow = planned(span=(0.2, 2.5)), planned(span=(0.2, 2.5), slow=4.0)
+    real = planned(span=(0.2, 2.5))
+    slow = planned(span=(0.2, 2.5), slow=4.0)
     assert real.time == pytest.approx(0.2 + np.arange(len(real.time)) / FPS)
     flying = (slow.time > LIFTOFF) & (slow.time < LIFTOFF + FLIGHT)
     assert (slow.rate[flying] == 0.25).all()
@@ -69,8 +72,8 @@ def test_frames_are_of_the_capture_and_the_camera_follows_smoothly() -> None:
     source = captured(yaw=0.4)
     film = planned(source, span=(0.2, 2.8))
     rows = np.rint(film.time * RATE).astype(int)
-    parts = (source.position, source.orientation, source.joint_position)
-    assert film.qpos == pytest.approx(np.hstack([part[rows] for part in parts]))
+    qpos = np.hstack([source.position, source.orientation, source.joint_position])
+    assert film.qpos == pytest.approx(qpos[rows])
     assert (film.jumping == ((film.time >= 0.8) & (film.time < 1.3))).all()
     middle = (film.time > 0.8) & (film.time < 2.2)
     assert film.look[middle, 0] == pytest.approx(film.qpos[middle, 0], abs=0.01)
@@ -133,7 +136,9 @@ def test_files_are_rendered(backend: str, tmp_path: Path) -> None:
     count = len(film.time)
     reader = imageio_ffmpeg.read_frames(str(files[0]))
     assert next(reader)["fps"] == FPS
-    images = [np.frombuffer(raw, np.uint8).reshape(*SIZE[::-1], 3) for raw in reader]
+    images = []
+    for raw in reader:
+        images.append(np.frombuffer(raw, np.uint8).reshape(*SIZE[::-1], 3))
     assert len(images) == count
     assert (images[0] != images[-1]).any()
     # The orange tape at the place of lift-off is where `project` puts it.
@@ -171,8 +176,8 @@ def test_without_gl_or_encoder_one_warning_names_what_to_install(
     record.find_gl.cache_clear()
     warnings: list[str] = []
     nothing: Any = None
-    how: Any = {"robot": ROBOT, "cases": (), "warn": warnings.append}
-    assert record.record_trial(nothing, tmp_path, tmp_path / "out", **how) == ()
+    options: Any = {"robot": ROBOT, "cases": (), "warn": warnings.append}
+    assert record.record_trial(nothing, tmp_path, tmp_path / "out", **options) == ()
     record.find_gl.cache_clear()
     (warning,) = warnings
     assert "libosmesa6" in warning
@@ -196,9 +201,9 @@ def test_only_rendering_needs_the_requested_opengl(
     keep_opengl_out()
     assert os.environ["MUJOCO_GL"] == "disable"
     assert requested_opengl() == "nonsense"
-    found = record.environment("osmesa")
-    assert found["MUJOCO_GL"] == "osmesa"
-    assert "PYOPENGL_PLATFORM" not in found
+    environment = record.environment("osmesa")
+    assert environment["MUJOCO_GL"] == "osmesa"
+    assert "PYOPENGL_PLATFORM" not in environment
     assert "MUJOCO_GL" not in record.environment("")
 
 
@@ -206,24 +211,24 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
     pytest.importorskip("onnxruntime")
     script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0)
     cases = (Case(name="forward 1", command=(1.0, 0.0, 0.0)),)
-    found = run_trial(
+    results = run_trial(
         [write_hopper(tmp_path / "policy.onnx"), write_hopper(tmp_path / "still.onnx", 0.0)],
         TrialPlan(cases=cases, jumps=1, script=script, spread_s=0.0),
         TrialSetup(robot=ROBOT, sim_params=load_sim_params(), out=tmp_path / "trial"),
     )
     # A robot given by its path is filmed with its own model.
-    own = replace(ROBOT, source="mine/robot.yaml")
-    how: Any = {"folder": tmp_path / "trial", "robot": own}
-    (stem, hop), (_, still) = record.plan_films(found, cases=("forward 1",), **how).items()
-    assert hop.robot == own.source
-    assert stem == f"{found.subjects[0].name}_forward_1".replace(" ", "_")
+    robot = replace(ROBOT, source="mine/robot.yaml")
+    options: Any = {"folder": tmp_path / "trial", "robot": robot}
+    (stem, hop), (_, still) = record.plan_films(results, cases=("forward 1",), **options).items()
+    assert hop.robot == robot.source
+    assert stem == f"{results.subjects[0].name}_forward_1".replace(" ", "_")
     assert hop.title == "forward 1 m/s"
 
     assert hop.events is not None
-    figures = found.rows[0].figures.flight
+    figures = results.rows[0].figures.flight
     assert hop.events.liftoff - hop.events.on == pytest.approx(figures.delay, abs=0.002)
     flight = hop.events.touchdown - hop.events.liftoff
     assert flight == pytest.approx(figures.duration, abs=0.002)
     assert (hop.rate == 1.0 / record.SLOW).any()
     assert still.events is None
-    assert not record.plan_films(found, cases=("back 2",), **how)
+    assert not record.plan_films(results, cases=("back 2",), **options)

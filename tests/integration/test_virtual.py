@@ -57,7 +57,8 @@ def excite(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
 
 def column(states: list[State], joint: str) -> Array:
     """Return the positions of a joint [rad]."""
-    return np.array([state.position[NAMES.index(joint)] for state in states])
+    index = NAMES.index(joint)
+    return np.array([state.position[index] for state in states])
 
 
 def chirp(seconds: float, amplitude: float = 0.25) -> Array:
@@ -154,8 +155,13 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
     states = machine.wait(0.2)
     drive = ROBOT.joint("FR_knee").drive
     scale = sim_params.joints["FR_knee"].torque_scale
-    torque = scale * np.array([state.torque[2] for state in states])
-    speed = np.array([state.velocity[2] for state in states])
+    measured_torque = []
+    measured_speed = []
+    for state in states:
+        measured_torque.append(state.torque[2])
+        measured_speed.append(state.velocity[2])
+    torque = scale * np.array(measured_torque)
+    speed = np.array(measured_speed)
     believed, resistance = drive.motor
     constant = scale * believed
     line = -constant / resistance * (voltage + constant * speed)
@@ -208,10 +214,14 @@ def test_delays_shift_the_response() -> None:
 
 def test_timestamps_jitter_increase_and_lose_nothing() -> None:
     machine = bench()
-    states = [machine.latest(), *machine.wait(4.0)]
-    time = np.array([state.time for state in states])
+    times = []
+    sequence = []
+    for state in (machine.latest(), *machine.wait(4.0)):
+        times.append(state.time)
+        sequence.append(state.sequence)
+    time = np.array(times)
     assert time[0] == 0.0
-    assert [state.sequence for state in states] == list(range(2001))
+    assert sequence == list(range(2001))
     assert (np.diff(time) > 0.0).all()
     jitter = np.std(time - np.arange(2001) / 500.0)
     assert 0.8 * 51e-6 < jitter < 1.2 * 51e-6  # 50 us and 10 us
@@ -295,16 +305,19 @@ def test_legs_on_a_rigid_bench_are_independent() -> None:
     # Absent legs report their default pose; present ones sag under their weight.
     assert column(alone, "HL_hip_roll")[-1] == POSE[NAMES.index("HL_hip_roll")]
     assert column(together, "HL_hip_roll")[-1] != POSE[NAMES.index("HL_hip_roll")]
-    assert all(len(state.position) == 12 for state in alone)
+    for state in alone:
+        assert len(state.position) == 12
 
 
 def test_mirrored_legs_mirror_each_other_when_their_parameters_agree() -> None:
     same = replace(SIM_PARAMS.joints["FR_hip_roll"], encoder_offset=0.0)
     sim_params = replace(quiet(**IDEAL), joints=dict.fromkeys(NAMES, same))
     command = chirp(1.0)
-    right = column(excite(bench(sim_params, legs=None), "FR_hip_roll", command), "FR_hip_roll")
-    left = column(excite(bench(sim_params, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
-    np.testing.assert_allclose(left, -right, atol=1e-6)
+    right_states = excite(bench(sim_params, legs=None), "FR_hip_roll", command)
+    left_states = excite(bench(sim_params, legs=None), "FL_hip_roll", -command)
+    right_position = column(right_states, "FR_hip_roll")
+    left_position = column(left_states, "FL_hip_roll")
+    np.testing.assert_allclose(left_position, -right_position, atol=1e-6)
 
 
 @pytest.mark.parametrize(

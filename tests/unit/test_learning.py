@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import socket
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -103,17 +104,21 @@ def test_impossible_inputs_are_refused(changes: dict[str, Any], words: str) -> N
         build(**changes)
 
 
+def identities(parameters: Iterable[Any]) -> list[int]:
+    """Return which tensors the parameters are, in an order of their own."""
+    return sorted(map(id, parameters))
+
+
 def test_ppo_and_supervision_change_different_weights() -> None:
     """Every weight has one optimizer."""
     algorithm = build()
     actor = algorithm.get_policy()
     (estimator_group,) = algorithm.estimator_optimizer.param_groups
     (ppo_group,) = algorithm.optimizer.param_groups
-    estimator_ids = sorted(id(parameter) for parameter in estimator_group["params"])
-    assert estimator_ids == sorted(id(parameter) for parameter in actor.estimator.parameters())
+    assert identities(estimator_group["params"]) == identities(actor.estimator.parameters())
     optimized = [*estimator_group["params"], *ppo_group["params"]]
     parameters = [*actor.parameters(), *algorithm.critic.parameters()]
-    assert sorted(id(p) for p in optimized) == sorted(id(p) for p in parameters)
+    assert identities(optimized) == identities(parameters)
     for _ in range(2):  # the second time the estimator has had gradients of its own
         roll_out(algorithm)
         estimator = weights(actor.estimator)
@@ -121,7 +126,8 @@ def test_ppo_and_supervision_change_different_weights() -> None:
         PPO.update(algorithm)
         assert same(weights(actor.estimator), estimator)
         assert not same(weights(actor.mlp), network)
-        assert all(p.grad is None for p in actor.estimator.parameters())
+        for parameter in actor.estimator.parameters():
+            assert parameter.grad is None
         algorithm.update()
         assert not same(weights(actor.estimator), estimator)
 
@@ -242,7 +248,8 @@ def test_fed_zeros_the_jump_input_stays_blank() -> None:
     """After updates on zeros its weights are zero, and the function is that without it."""
     algorithm = trained(3, jump=False, hidden=PAPER)
     assert len(jump_weights(algorithm)) == 3
-    assert not any(value.any() for value in jump_weights(algorithm))
+    for value in jump_weights(algorithm):
+        assert not value.any()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         for rows in (1, 2, 7, 64, 500):
@@ -257,7 +264,8 @@ def test_fed_zeros_the_jump_input_stays_blank() -> None:
     plain = torch.nn.functional.linear(x[:, :52].contiguous(), layer.weight, layer.bias)
     assert torch.equal(layer(x), plain)
     learn(algorithm)
-    assert all(value.any() for value in jump_weights(algorithm))
+    for value in jump_weights(algorithm):
+        assert value.any()
 
 
 def test_the_moments_of_the_jump_inputs_begin_anew() -> None:
@@ -305,7 +313,7 @@ def test_saved_and_loaded_it_continues_alike(tmp_path: Path) -> None:
     second = build()
     path = tmp_path / "model_3.pt"
     checkpoint.write_checkpoint(path, {**first.save(), "iter": 3, "infos": {"note": "x"}})
-    assert [p.name for p in tmp_path.iterdir()] == ["model_3.pt"]
+    assert [file.name for file in tmp_path.iterdir()] == ["model_3.pt"]
     state = checkpoint.read_checkpoint(path)
     assert second.load(state)
     for algorithm in (first, second):

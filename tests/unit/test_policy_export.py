@@ -32,7 +32,8 @@ def contract(*, jump: bool) -> Contract:
 def test_onnx_equals_pytorch(tmp_path: Path, jump: bool) -> None:
     torch.manual_seed(5)
     actor = trained(jump=jump, hidden=(1024, 512, 256)).get_policy()
-    before, path = weights(actor), tmp_path / "policy.onnx"
+    before = weights(actor)
+    path = tmp_path / "policy.onnx"
     export_policy(actor, contract(jump=jump), path)
     assert path.stat().st_size < 4e6
     assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
@@ -49,7 +50,9 @@ def test_onnx_equals_pytorch(tmp_path: Path, jump: bool) -> None:
 
 
 def test_verify_finds_another_policy_and_refuses_other_files(tmp_path: Path) -> None:
-    actor, path, observations = trained(1).get_policy(), tmp_path / "policy.onnx", observe(8)
+    actor = trained(1).get_policy()
+    path = tmp_path / "policy.onnx"
+    observations = observe(8)
     with pytest.raises(ArtefactError, match="no such file"):
         verify(path, actor, observations)
     export_policy(actor, contract(jump=True), path)
@@ -64,26 +67,27 @@ def test_verify_finds_another_policy_and_refuses_other_files(tmp_path: Path) -> 
 def test_the_jump_input_reaches_estimator_and_actor(tmp_path: Path) -> None:
     """A walking policy is the one with the jump input at zero."""
     actor = trained(1).get_policy()
-    for jump in (False, True):
-        export_policy(actor, contract(jump=jump), tmp_path / f"{jump}.onnx")
+    for has_jump in (False, True):
+        export_policy(actor, contract(jump=has_jump), tmp_path / f"{has_jump}.onnx")
     measured = observe(1)["measured"].numpy()
     policy = load_policy(tmp_path / "True.onnx")
-    walk, jump_ = policy.infer(measured), policy.infer(measured, [[1.0]])
+    walk = policy.infer(measured)
+    jump = policy.infer(measured, [[1.0]])
     plain = load_policy(tmp_path / "False.onnx").infer(measured)
     np.testing.assert_allclose(plain.action, walk.action, atol=1e-6)
     for name in ("action", "contact", "linear_velocity"):
-        assert not np.array_equal(getattr(walk, name), getattr(jump_, name))
+        assert not np.array_equal(getattr(walk, name), getattr(jump, name))
     assert ((walk.contact > 0.0) & (walk.contact < 1.0)).all()
 
 
 def test_contract_by_hand() -> None:
-    made = contract(jump=True)
-    assert made.stiffness == (20.0, 17.5, 21.5) * 4
-    assert made.damping == (0.45, 0.4, 0.55) * 4
-    assert made.default_position == (0.0, -0.8, 1.6) * 4
-    assert made.action_scale == (0.35,) * 12
-    assert made.delay_range_s == (0.0, 0.01)
-    assert made.command_ranges == {"vx": (-3.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
-    assert (made.gains, made.gains_sha256, made.virtual) == ("matched", SHA256, True)
-    assert made.versions["torch"] == torch.__version__
-    check(made, ROBOT, gains_sha256=SHA256)
+    jumping = contract(jump=True)
+    assert jumping.stiffness == (20.0, 17.5, 21.5) * 4
+    assert jumping.damping == (0.45, 0.4, 0.55) * 4
+    assert jumping.default_position == (0.0, -0.8, 1.6) * 4
+    assert jumping.action_scale == (0.35,) * 12
+    assert jumping.delay_range_s == (0.0, 0.01)
+    assert jumping.command_ranges == {"vx": (-3.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
+    assert (jumping.gains, jumping.gains_sha256, jumping.virtual) == ("matched", SHA256, True)
+    assert jumping.versions["torch"] == torch.__version__
+    check(jumping, ROBOT, gains_sha256=SHA256)

@@ -20,6 +20,9 @@ MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}
 
 
 def gains(*names: str, **extra: float) -> MatchedGains:
+    extra_values = {}
+    for parameter, value in extra.items():
+        extra_values[parameter] = FittedValue(value=value)
     joints = {}
     for name in names or MADE_WITH:
         stiffness, damping = MADE_WITH[name]
@@ -27,7 +30,7 @@ def gains(*names: str, **extra: float) -> MatchedGains:
             stiffness=FittedValue(value=stiffness),
             damping=FittedValue(value=damping),
             armature=FittedValue(value=ROBOT.joint(name).drive.armature),
-            **{parameter: FittedValue(value=value) for parameter, value in extra.items()},
+            **extra_values,
         )
     return MatchedGains(robot=ROBOT.name, simulator=SimulatorInfo(), joints=joints, groups={})
 

@@ -15,15 +15,20 @@ COMMAND = (2.0, 0.0, 0.5)
 
 
 def test_commands_over_time_by_hand_and_despite_rounding() -> None:
-    made = Script(command=COMMAND)
-    assert (made.start, made.on, made.off, made.stop, made.seconds) == (1.0, 3.5, 4.0, 4.5, 7.5)
+    script = Script(command=COMMAND)
+    assert (script.start, script.on, script.off) == (1.0, 3.5, 4.0)
+    assert (script.stop, script.seconds) == (4.5, 7.5)
     for ticks in range(26):
-        made = Script(command=COMMAND, run_s=2.5 + ticks / 50)
-        commanded = [made.commanded(k / 50) for k in range(round(made.seconds * 50))]
-        runs = [STILL] * 50 + [COMMAND] * (175 + ticks) + [STILL] * 150
-        assert [command for command, _ in commanded] == runs
-        jumps = [k for k, (_, jump) in enumerate(commanded) if jump]
-        assert jumps == list(range(175 + ticks, 200 + ticks))
+        script = Script(command=COMMAND, run_s=2.5 + ticks / 50)
+        commands = []
+        jump_ticks = []
+        for tick in range(round(script.seconds * 50)):
+            command, jump = script.commanded(tick / 50)
+            commands.append(command)
+            if jump:
+                jump_ticks.append(tick)
+        assert commands == [STILL] * 50 + [COMMAND] * (175 + ticks) + [STILL] * 150
+        assert jump_ticks == list(range(175 + ticks, 200 + ticks))
 
 
 @pytest.mark.parametrize(
@@ -47,7 +52,7 @@ def test_bad_commands_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "named"),
     [
         ({"stand_s": -1.0}, "Script.stand_s"),
         ({"stop_s": math.inf}, "Script.stop_s"),
@@ -55,6 +60,6 @@ def test_bad_commands_are_refused(text: str) -> None:
         ({"command": (1.0, math.nan, 0.0)}, "command"),
     ],
 )
-def test_impossible_scripts_are_refused(changes: dict[str, Any], what: str) -> None:
-    with pytest.raises(PronkError, match=what):
+def test_impossible_scripts_are_refused(changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(PronkError, match=named):
         Script(**({"command": COMMAND} | changes))
