@@ -46,7 +46,8 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    n, width = data.draw(st.integers(2, 40)), data.draw(st.integers(1, 4))
+    n = data.draw(st.integers(2, 40))
+    width = data.draw(st.integers(1, 4))
     matrix = arrays(float, (n, width), elements=st.floats(-1e6, 1e6, allow_nan=False))
     name = st.from_regex(r"\w[\w. -]{0,20}\w", fullmatch=True)
     names = st.lists(name, min_size=width, max_size=width, unique=True)
@@ -68,22 +69,27 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        assert {c.topic for c in summary.channels.values()} == set(sweep_writer.TOPICS)
-        assert all(c.message_encoding == "json" for c in summary.channels.values())
+        channels = summary.channels.values()
+        assert {channel.topic for channel in channels} == set(sweep_writer.TOPICS)
+        assert {channel.message_encoding for channel in channels} == {"json"}
         for schema in summary.schemas.values():
             assert schema.encoding == "jsonschema"
             assert json.loads(schema.data)["type"] == "object"
-        messages = [(c.topic, json.loads(m.data)) for _, c, m in reader.iter_messages()]
-    samples = [body for topic, body in messages if topic == sweep_writer.SAMPLE]
+        samples = []
+        order = []
+        for _, channel, message in reader.iter_messages():
+            body = json.loads(message.data)
+            order.append((channel.topic, body.get("segment")))
+            if channel.topic == sweep_writer.SAMPLE:
+                samples.append(body)
     assert len(samples) == 2000
     assert samples[0]["frequency"] is None
     # In time order the excitation is announced before its first sample.
-    order = [(topic, body.get("segment")) for topic, body in messages]
     assert order.index((sweep_writer.SEGMENT, None)) < order.index((sweep_writer.SAMPLE, 0))
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cut") / "whole.mcap"
     write_mcap(path, LOG)
     return path
@@ -103,34 +109,39 @@ def read_or_one_sentence(path: Path, data: bytes) -> JointLog | None:
 
 @settings(max_examples=150, deadline=None)
 @given(share=st.floats(0.0, 1.0, exclude_max=True))
-def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Path, share: float) -> None:
-    data, log = whole.read_bytes(), LOG
-    short = read_or_one_sentence(whole.with_name("cut.mcap"), data[: int(share * len(data))])
+def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(
+    sound_file: Path, share: float
+) -> None:
+    data = sound_file.read_bytes()
+    cut = data[: int(share * len(data))]
+    short = read_or_one_sentence(sound_file.with_name("cut.mcap"), cut)
     if short is None:
         # Only what lies before the second sample may be lost altogether.
         assert share < 0.25
         return
     assert not short.origin.complete
     count = len(short.time)
-    np.testing.assert_array_equal(short.time, log.time[:count])
-    np.testing.assert_array_equal(short.position, log.position[:count])
+    np.testing.assert_array_equal(short.time, LOG.time[:count])
+    np.testing.assert_array_equal(short.position, LOG.position[:count])
     # At most one chunk of half a second is lost.
-    assert count >= share * len(log.time) - 2 * 256
-    assert all(s.stop <= short.time[-1] for s in short.segments)
-    begun = [s for s in log.segments if s.start < short.time[-1]]
-    assert [s.repeat for s in short.segments] == [s.repeat for s in begun]
+    assert count >= share * len(LOG.time) - 2 * 256
+    begun = [segment for segment in LOG.segments if segment.start < short.time[-1]]
+    for segment, begun_segment in zip(short.segments, begun, strict=True):
+        assert segment.stop <= short.time[-1]
+        assert segment.repeat == begun_segment.repeat
 
 
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
-def test_a_damaged_file_never_gives_wrong_numbers(whole: Path, data: st.DataObject) -> None:
-    bad = bytearray(whole.read_bytes())
+def test_a_damaged_file_never_gives_wrong_numbers(sound_file: Path, data: st.DataObject) -> None:
+    bad = bytearray(sound_file.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         bad[data.draw(st.integers(0, len(bad) - 1))] ^= data.draw(st.integers(1, 255))
-    if (found := read_or_one_sentence(whole.with_name("bad.mcap"), bytes(bad))) is not None:
-        count = len(found.time)
-        np.testing.assert_array_equal(found.time, LOG.time[:count])
-        np.testing.assert_array_equal(found.command, LOG.command[:count])
+    log = read_or_one_sentence(sound_file.with_name("bad.mcap"), bytes(bad))
+    if log is not None:
+        count = len(log.time)
+        np.testing.assert_array_equal(log.time, LOG.time[:count])
+        np.testing.assert_array_equal(log.command, LOG.command[:count])
 
 
 KILLED = """
@@ -171,7 +182,8 @@ def test_the_reason_of_an_early_end_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
-    path, size = tmp_path / "bomb.mcap", 300 * 2**20
+    path = tmp_path / "bomb.mcap"
+    size = 300 * 2**20
     McapLogWriter(path, LogHeader(robot="r", joints=("a",))).end()
     data = path.read_bytes()
     bomb = zstandard.compress(bytes(size))

@@ -103,10 +103,12 @@ def test_expectations_that_the_timestamps_contradict_are_refused() -> None:
 
 def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
     """States and commands on clocks of their own: the last command at or before each state."""
-    states = "".join(
-        f'STATE_MOTOR,{2000 * k + 500},"[0.{k:02d}, 1.0]","[0, 0]","[0, 0]"\n' for k in range(60)
-    )
-    controls = "".join(f'CONTROL,{20000 * k + 10000},"[{k}.0, 0.5]"\n' for k in range(6))
+    states = ""
+    for k in range(60):
+        states += f'STATE_MOTOR,{2000 * k + 500},"[0.{k:02d}, 1.0]","[0, 0]","[0, 0]"\n'
+    controls = ""
+    for k in range(6):
+        controls += f'CONTROL,{20000 * k + 10000},"[{k}.0, 0.5]"\n'
     files = {
         "joint_list.txt": "hip\nknee\n",
         "state_motor.csv": "type,timestamp,positions,velocities,torques\n" + states,
@@ -129,11 +131,16 @@ def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.npz", "a.csv", "A.CSV", "a.txt"])
 def test_round_trip(tmp_path: Path, name: str) -> None:
-    log, path = example(), tmp_path / name
-    (write_npz if name == "a.npz" else write_csv)(path, log)
-    back = read_log(
-        path, options=ReadOptions(unit="rad", format="csv" if name == "a.txt" else None)
-    )
+    log = example()
+    path = tmp_path / name
+    if name == "a.npz":
+        write_npz(path, log)
+    else:
+        write_csv(path, log)
+    options = ReadOptions(unit="rad")
+    if name == "a.txt":
+        options = ReadOptions(unit="rad", format="csv")
+    back = read_log(path, options=options)
     for quantity in ("time", "command", "position", "velocity", "torque"):
         np.testing.assert_array_equal(getattr(back, quantity), getattr(log, quantity))
     assert back.joints == log.joints
@@ -150,10 +157,13 @@ def test_csv_in_degrees_with_names_of_its_own(
     tmp_path_factory: pytest.TempPathFactory, values: list[float], delimiter: str, bom: bool
 ) -> None:
     path = tmp_path_factory.mktemp("csv") / "a.csv"
-    rows = [["t_ms", " q ", "q_des", "remark"]]
-    rows += [[repr(20.0 * k), repr(v), repr(v / 2.0), "x"] for k, v in enumerate(values)]
-    text = "\r\n".join(delimiter.join(row) for row in rows)
-    path.write_bytes(("\ufeff" * bom + text).encode())
+    lines = [delimiter.join(("t_ms", " q ", "q_des", "remark"))]
+    for k, value in enumerate(values):
+        lines.append(delimiter.join((repr(20.0 * k), repr(value), repr(value / 2.0), "x")))
+    text = "\r\n".join(lines)
+    if bom:
+        text = "\ufeff" + text
+    path.write_bytes(text.encode())
     log = read_log(
         path,
         robot=load_robot("mini_cheetah"),
@@ -202,23 +212,24 @@ def test_without_pytorch_a_pace_recording_is_refused_with_the_way_out(
 def test_jitter_gaps_and_lost_samples_are_counted() -> None:
     rng = np.random.default_rng(0)
     time = np.arange(2000) / 500.0 + rng.normal(0.0, 50e-6, 2000)
-    found = examine_time(np.delete(time, np.r_[300:310, 900:905]))
-    assert (len(found.gaps), found.lost) == (2, 15)
+    timing = examine_time(np.delete(time, np.r_[300:310, 900:905]))
+    assert len(timing.gaps) == 2
+    assert timing.lost == 15
     # Each interval has the jitter of two stamps.
-    assert found.jitter_s == pytest.approx(50e-6 * np.sqrt(2.0), rel=0.1)
-    assert found.gaps[0][0] == pytest.approx(299 / 500.0, abs=1e-3)
+    assert timing.jitter_s == pytest.approx(50e-6 * np.sqrt(2.0), rel=0.1)
+    assert timing.gaps[0][0] == pytest.approx(299 / 500.0, abs=1e-3)
     # Lost samples do not make the clock slow.
-    check_rate(found, "log", 500.0)
+    check_rate(timing, "log", 500.0)
 
 
 def test_a_perfect_clock_and_one_that_drifts() -> None:
     index = np.arange(1000)
-    found = examine_time(index / 500.0)
-    assert (found.rate_hz, found.lost) == (pytest.approx(500.0), 0)
-    assert max(found.jitter_s, found.drift_s) < 1e-9
-    assert (
-        0.3e-3 < examine_time(index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0)).drift_s < 1e-3
-    )
+    perfect = examine_time(index / 500.0)
+    assert perfect.rate_hz == pytest.approx(500.0)
+    assert perfect.lost == 0
+    assert max(perfect.jitter_s, perfect.drift_s) < 1e-9
+    drifting = examine_time(index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0))
+    assert 0.3e-3 < drifting.drift_s < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -234,8 +245,10 @@ def test_another_unit_of_time_is_recognized(rate: float, read_as: str, written_i
 
 
 def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> None:
-    path, kept = tmp_path / "a.csv", [f"{0.01 * k},{0.1 * (k % 3)},{0.1 * k}" for k in range(50)]
-    rows = [kept[k] for k in sorted([*range(50), 7, 7, 20])]
+    path = tmp_path / "a.csv"
+    rows = []
+    for k in sorted([*range(50), 7, 7, 20]):
+        rows.append(f"{0.01 * k},{0.1 * (k % 3)},{0.1 * k}")
     path.write_text("\n".join(["time,position.a,command.a", *rows]))
     with pytest.raises(LogError, match="row 10 repeats the timestamp"):
         read_log(path, options=ReadOptions(unit="rad"))
@@ -307,9 +320,9 @@ def test_no_motion_is_refused(position: np.ndarray, command: np.ndarray, words: 
         check_motion(moved(position, command).excitations("FR_knee")[0])
 
 
-@pytest.mark.parametrize("wrong", [np.rad2deg(SWING), 20.0 + SWING])
-def test_degrees_read_as_radians_are_refused(tmp_path: Path, wrong: np.ndarray) -> None:
-    write_csv(tmp_path / "a.csv", moved(wrong, wrong))
+@pytest.mark.parametrize("degrees", [np.rad2deg(SWING), 20.0 + SWING])
+def test_degrees_read_as_radians_are_refused(tmp_path: Path, degrees: np.ndarray) -> None:
+    write_csv(tmp_path / "a.csv", moved(degrees, degrees))
     with pytest.raises(LogError, match="probably in degrees"):
         read_log(tmp_path / "a.csv", options=ReadOptions(unit="rad"))
     assert np.ptp(read_log(tmp_path / "a.csv", options=ReadOptions(unit="deg")).position) < 0.6
@@ -341,30 +354,34 @@ uint32 nanosec
 
 
 def test_an_order_of_joints_is_never_assumed(tmp_path: Path) -> None:
-    robot, path = load_robot("mini_cheetah"), tmp_path / "a.npz"
+    robot = load_robot("mini_cheetah")
+    path = tmp_path / "a.npz"
     values = np.cumsum(np.random.default_rng(0).uniform(-0.01, 0.01, (300, 12)), axis=0)
     arrays = {"time": np.arange(300) / 200.0, "command": values, "position": values}
-    theirs = (*robot.joint_names[3:6], *robot.joint_names[:3], *robot.joint_names[6:])
+    file_order = (*robot.joint_names[3:6], *robot.joint_names[:3], *robot.joint_names[6:])
 
-    def joints(order: object, known: RobotSpec | None = robot) -> tuple[str, ...]:
-        return read_log(
-            path, robot=known, options=ReadOptions(unit="rad", joint_order=order)
-        ).joints
+    def joints(order: object, stated_robot: RobotSpec | None = robot) -> tuple[str, ...]:
+        options = ReadOptions(unit="rad", joint_order=order)
+        return read_log(path, robot=stated_robot, options=options).joints
 
     np.savez(path, **arrays)  # type: ignore[arg-type]
-    for known, proposal in ((None, "--robot"), (robot, ",".join(robot.joint_names))):
+    for stated_robot, proposal in ((None, "--robot"), (robot, ",".join(robot.joint_names))):
         with pytest.raises(LogError, match="--joint-order NAME") as caught:
-            joints(None, known)
+            joints(None, stated_robot)
         assert proposal in str(caught.value)
-    assert joints(theirs) == joints(",".join(theirs)) == theirs
+    assert joints(file_order) == file_order
+    assert joints(",".join(file_order)) == file_order
     assert joints("default") == robot.joint_names
-    for wrong in (theirs[:3], (*theirs[:11], theirs[0]), (*theirs[:11], "tail")):
+    too_few = file_order[:3]
+    named_twice = (*file_order[:11], file_order[0])
+    unknown_joint = (*file_order[:11], "tail")
+    for order in (too_few, named_twice, unknown_joint):
         with pytest.raises((LogError, RobotError), match=r"3 joint names|named twice|no joint"):
-            joints(wrong)
+            joints(order)
     # Names in the file count; an order that contradicts them is refused.
-    np.savez(path, **arrays, joints=np.array(theirs))  # type: ignore[arg-type]
-    for order in (None, "default", theirs):
-        assert joints(order) == theirs
+    np.savez(path, **arrays, joints=np.array(file_order))  # type: ignore[arg-type]
+    for order in (None, "default", file_order):
+        assert joints(order) == file_order
     with pytest.raises(LogError, match="by the file"):
         joints(robot.joint_names)
 
@@ -376,7 +393,9 @@ def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") ->
         plain = writer.register_msgdef("std_msgs/msg/Float64MultiArray", "float64[] data\n")
         for k in range(400):
             nano = 100 * 10**9 + k * 5_000_000
-            stamp = {"sec": stamped * (nano // 10**9), "nanosec": stamped * (nano % 10**9)}
+            stamp = {"sec": 0, "nanosec": 0}
+            if stamped:
+                stamp = {"sec": nano // 10**9, "nanosec": nano % 10**9}
             message = {"header": {"stamp": stamp, "frame_id": ""}, "velocity": [], "effort": []}
             if k >= 8 and k % 4 == 0:
                 values = [np.sin(0.1 * k), 2.0]

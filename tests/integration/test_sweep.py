@@ -59,8 +59,10 @@ def sweep(machine: Watched, plan: SweepPlan, out_dir: Path, **options: Any) -> l
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Watched, SweepPlan, list[Path]]:
-    machine, plan = Watched(), plan_of("FR_hip_roll", "FR_knee")
-    return machine, plan, sweep(machine, plan, tmp_path_factory.mktemp("sweep"))
+    machine = Watched()
+    plan = plan_of("FR_hip_roll", "FR_knee")
+    paths = sweep(machine, plan, tmp_path_factory.mktemp("sweep"))
+    return machine, plan, paths
 
 
 Recorded = tuple[Watched, SweepPlan, list[Path]]
@@ -71,11 +73,15 @@ def test_one_whole_log_for_each_joint(recorded: Recorded) -> None:
     assert [path.name for path in paths] == ["FR_hip_roll.mcap", "FR_knee.mcap"]
     for path, joint in zip(paths, plan.joints, strict=True):
         log = read_mcap(path, None, ReadOptions())
-        assert (log.origin.complete, log.notes, log.virtual) == (True, (), True)
+        assert log.origin.complete
+        assert log.notes == ()
+        assert log.virtual
         assert log.robot == "mini_cheetah"
         assert log.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
-        assert [s.joints for s in log.segments] == [(joint,)] * 2
-        assert [s.amplitude for s in log.segments] == [0.2, 0.1]
+        large, small = log.segments
+        assert large.joints == small.joints == (joint,)
+        assert large.amplitude == 0.2
+        assert small.amplitude == 0.1
         assert log.stiffness is not None
         np.testing.assert_array_equal(log.stiffness, [17.0] * 3)
         assert log.rate_hz == pytest.approx(500.0, rel=1e-3)
@@ -92,7 +98,7 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
         log = read_mcap(path, None, ReadOptions())
         column = log.column(joint)
         assert log.pose is not None
-        excitations = [each for each in plan.excitations if each.joint == joint]
+        excitations = [planned for planned in plan.excitations if planned.joint == joint]
         for segment, excitation in zip(log.segments, excitations, strict=True):
             part = log.cut(segment)
             tick = np.floor((part.time - segment.start) * 50.0 + 0.05).astype(int)
@@ -102,13 +108,15 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
                 part.command[:, column], log.pose[column] + offsets[tick], atol=1e-12
             )
             assert np.bincount(tick)[:-1].min() >= 9
-            others = [i for i in range(3) if i != column]
-            assert np.ptp(part.command[:, others]) == np.ptp(log.pose[others])
+            other_columns = np.arange(3) != column
+            assert np.ptp(part.command[:, other_columns]) == np.ptp(log.pose[other_columns])
 
 
 def test_frequency_and_motion_of_other_joints_are_logged(recorded: Recorded) -> None:
     _, _, paths = recorded
-    hip, knee = (read_mcap(path, None, ReadOptions()) for path in paths)
+    hip = read_mcap(paths[0], None, ReadOptions())
+    knee = read_mcap(paths[1], None, ReadOptions())
+    assert len(paths) == 2
     assert hip.frequency is not None
     for segment in hip.segments:
         inside = (hip.time >= segment.start) & (hip.time <= segment.start + SHORT.length_s - 0.05)
@@ -146,14 +154,21 @@ class Slipping(Watched):
     """A knee's encoder slips in the middle of a sweep."""
 
     def wait(self, until: float) -> list[State]:
-        slip = np.where(np.arange(12) == 2, 1.5 if until > 5.0 else 0.0, 0.0)
-        return [replace(state, position=state.position + slip) for state in super().wait(until)]
+        slip = np.zeros(12)
+        if until > 5.0:
+            slip[2] = 1.5
+        states = []
+        for state in super().wait(until):
+            states.append(replace(state, position=state.position + slip))
+        return states
 
 
 def weak(**drive: float) -> SweepPlan:
     """A plan made for the robot, then carried out on one with weaker drives."""
-    joints = tuple(replace(j, drive=replace(j.drive, **drive)) for j in ROBOT.joints)
-    return replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
+    joints = []
+    for joint in ROBOT.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, **drive)))
+    return replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=tuple(joints)))
 
 
 @pytest.mark.parametrize(
@@ -184,8 +199,12 @@ def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
 
 def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> None:
     """The plan excites by 0.2 rad about 1.6 rad; the filter keeps the command within the range."""
-    joints = tuple(replace(j, range=(1.5, 1.7)) if "knee" in j.name else j for j in ROBOT.joints)
-    plan = replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
+    joints = []
+    for joint in ROBOT.joints:
+        if "knee" in joint.name:
+            joint = replace(joint, range=(1.5, 1.7))
+        joints.append(joint)
+    plan = replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=tuple(joints)))
     sweep(Watched(), plan, tmp_path)
     log = read_mcap(tmp_path / "FR_knee.mcap", None, ReadOptions())
     commands = log.command[:, log.column("FR_knee")]
@@ -195,10 +214,12 @@ def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> No
 def test_every_command_of_a_sweep_passes_the_filter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    passed, sent, judge = [], [], SafetyFilter.judge
+    passed = []
+    sent = []
+    judge = SafetyFilter.judge
 
-    def counted(*given: Any, **more: Any) -> Any:
-        result = judge(*given, **more)
+    def counted(*arguments: Any, **keywords: Any) -> Any:
+        result = judge(*arguments, **keywords)
         passed.append(result[0])
         return result
 
@@ -210,14 +231,14 @@ def test_every_command_of_a_sweep_passes_the_filter(
     monkeypatch.setattr(SafetyFilter, "judge", counted)
     sweep(Counted(), plan_of("FR_knee"), tmp_path)
     assert sent
-    assert all(one is other for one, other in zip(sent, passed, strict=True))
+    for sent_command, passed_command in zip(sent, passed, strict=True):
+        assert sent_command is passed_command
 
 
 def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
     plan = plan_of("FR_hip_roll", "FR_knee", amplitudes=(0.1,))
     shares: list[float] = []
-    one = {"joints": ("FR_knee",), "progress": shares.append}
-    paths = sweep(Watched(), plan, tmp_path, **one)
+    paths = sweep(Watched(), plan, tmp_path, joints=("FR_knee",), progress=shares.append)
     assert [path.name for path in paths] == ["FR_knee.mcap"]
     assert list(tmp_path.iterdir()) == paths
     assert shares == sorted(shares)
@@ -229,17 +250,16 @@ def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
 def test_a_task_that_cannot_be_carried_out_moves_nothing(tmp_path: Path) -> None:
     kept = tmp_path / "FR_knee.mcap"
     kept.write_bytes(b"a day's work")
-    machine, other = Watched(), Watched()
-    other.robot = "so101"
-    too_much = plan_of("FR_knee", amplitudes=(1.5,))
-    for each, plan, error, word in (
-        (machine, plan_of("FR_knee"), HardwareError, "FR_knee"),
-        (machine, too_much, PlanError, "fits"),
-        (other, plan_of("FR_knee"), HardwareError, "so101"),
-    ):
-        folder = tmp_path if plan is not too_much else tmp_path / "none"
-        with pytest.raises(error, match=word):
-            sweep(each, plan, folder)
-    assert machine.calls == other.calls == []
+    machine = Watched()
+    with pytest.raises(HardwareError, match="FR_knee"):
+        sweep(machine, plan_of("FR_knee"), tmp_path)
+    with pytest.raises(PlanError, match="fits"):
+        sweep(machine, plan_of("FR_knee", amplitudes=(1.5,)), tmp_path / "none")
+    assert machine.calls == []
+    arm = Watched()
+    arm.robot = "so101"
+    with pytest.raises(HardwareError, match="so101"):
+        sweep(arm, plan_of("FR_knee"), tmp_path)
+    assert arm.calls == []
     assert kept.read_bytes() == b"a day's work"
     assert list(tmp_path.iterdir()) == [kept]
