@@ -134,8 +134,9 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
     machine.send(replace(HOLD, made=machine.now(), valid_for=0.1))
     assert eventually(lambda: machine.counts["expired"] == 1)
     time.sleep(0.05)
-    last = LowCmd.deserialize(take_samples(received, Counter())[-1].data).motor_cmd[PITCH]
-    assert (last.kp, last.kd, last.q) == (0.0, 1.0, 2.146e9)
+    newest = take_samples(received, Counter())[-1]
+    motor = LowCmd.deserialize(newest.data).motor_cmd[PITCH]
+    assert (motor.kp, motor.kd, motor.q) == (0.0, 1.0, 2.146e9)
 
     # And another writer in the middle of it all is followed by damping.
     machine.send(HOLD)
@@ -181,8 +182,8 @@ def test_mode_switcher_and_bench_services() -> None:
         with pytest.raises(HardwareError, match="3203"):
             client.call(9, {})
         assert wire.mode == "ai"
-        held = {"joints": ["FR_knee", "FL_knee"]}
-        assert bench.call(1, {"joints": ["FL_knee", "FR_knee"]}) == held
+        clamped = {"joints": ["FR_knee", "FL_knee"]}
+        assert bench.call(1, {"joints": ["FL_knee", "FR_knee"]}) == clamped
         with pytest.raises(HardwareError, match="3204"):
             bench.call(1, {"joints": ["tail"]})
         assert wire.clamps == ("FR_knee", "FL_knee")
@@ -199,10 +200,11 @@ def test_rival_is_received() -> None:
 def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
     network = own_network(1)
     wires = [DdsServerTransport(ROBOT, domain=network.domain) for _ in range(2)]
-    states, later = itertools.cycle(connected(legs=("FR",)).wait(8.0)), Event()
+    states = itertools.cycle(connected(legs=("FR",)).wait(8.0))
+    both_speak = Event()
 
     def speak() -> None:
-        for wire in wires[: 2 if later.is_set() else 1]:
+        for wire in wires[: 2 if both_speak.is_set() else 1]:
             wire.poll()
             wire.publish(next(states))
 
@@ -211,7 +213,7 @@ def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
     with meanwhile(speak, 0.002):
         machine.connect()
         machine.send(HOLD)
-        later.set()
+        both_speak.set()
         assert eventually(lambda: machine.sources == 2)
         with pytest.raises(HardwareError, match="2 robots"):
             machine.send(HOLD)

@@ -46,10 +46,13 @@ class Process:
     """A server of its own."""
 
     def __init__(self, layout: str, json_file: Path) -> None:
-        self.layout, self.json, self.port = layout, json_file, free_port()
+        self.layout = layout
+        self.json = json_file
+        self.port = free_port()
         code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
         words = ["simulate", "--layout", layout, "--port", str(self.port), "--json", str(json_file)]
-        command, env = [sys.executable, "-c", code, *words], {**os.environ, "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, "-c", code, *words]
+        env = {**os.environ, "OMP_NUM_THREADS": "1"}
         self.running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env)
 
     def machine(self, *, release: bool = False) -> LcmMachine:
@@ -62,21 +65,23 @@ class Process:
 @pytest.fixture(scope="module")
 def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Process]]:
     folder = tmp_path_factory.mktemp("servers")
-    made = {layout: Process(layout, folder / f"{layout}.json") for layout in ("cheetah", "wtw")}
+    processes = {}
+    for layout in ("cheetah", "wtw"):
+        processes[layout] = Process(layout, folder / f"{layout}.json")
     try:
-        for process in made.values():
+        for process in processes.values():
             assert process.running.stdout is not None
             assert process.running.stdout.readline().startswith("ready")
-        yield made
+        yield processes
     finally:
-        for process in made.values():
+        for process in processes.values():
             if process.running.poll() is None:
                 process.running.kill()
             process.running.wait()
 
 
 def follow(
-    machine: LcmMachine, command: Command | None, there: Callable[[np.ndarray], bool]
+    machine: LcmMachine, command: Command | None, arrived: Callable[[np.ndarray], bool]
 ) -> list[State]:
     """Command at 50 Hz until the joints are there, for LIMIT_S at most; the states met."""
     states: list[State] = []
@@ -84,7 +89,7 @@ def follow(
         if command is not None:
             machine.send(replace(command, made=machine.now(), valid_for=10.0, sequence=k))
         states += machine.wait(machine.now() + 0.02)
-        if there(machine.latest().position):
+        if arrived(machine.latest().position):
             break
     return states
 

@@ -315,7 +315,8 @@ def test_knee_gains_orders_and_signs_on_lcm() -> None:
     np.testing.assert_array_equal(fields["q_hip"], [0.125, 1.125, 2.125, 3.125])
     np.testing.assert_array_equal(fields["qd_knee"], [-0.25, -1.25, -2.25, -3.25])
     # The same stance in Unitree's signs: thigh +0.8, calf -1.6; the hips as they are.
-    stance, unitree = np.tile([0.1, -0.8, 1.6], 4), np.tile([0.1, 0.8, -1.6], 4)
+    stance = np.tile([0.1, -0.8, 1.6], 4)
+    unitree = np.tile([0.1, 0.8, -1.6], 4)
     sent = WTW_PD_TAU_TARGETS.decode(lcm.encode_lcm_command(WTW, stiff(stance)))
     np.testing.assert_array_equal(sent["q_des"], unitree)
     np.testing.assert_array_equal(sent["kp"], np.full(12, 17.0))
@@ -383,9 +384,9 @@ def test_control_mode_round_trip() -> None:
 
 def test_clamps_round_trip() -> None:
     names = ROBOT.joint_names
-    for held, number in ((), 0), (names[::5], 2**62), (names, 7):
-        data = lcm.encode_clamps(names, held, number)
-        assert lcm.decode_clamps(names, data) == (number, held)
+    for clamped, request in ((), 0), (names[::5], 2**62), (names, 7):
+        data = lcm.encode_clamps(names, clamped, request)
+        assert lcm.decode_clamps(names, data) == (request, clamped)
 
 
 # --- DDS ----------------------------------------------------------------------------------------
@@ -457,11 +458,11 @@ def fill(values: np.void, rng: np.random.Generator) -> None:
 def test_golden_offsets_on_dds() -> None:
     data = dds.encode_dds_command(JOINTS, COMMAND)[len(HEADER) :]
     for k in range(12):
-        found = struct.unpack_from("<5f", data, 24 + 36 * k)
+        motor = struct.unpack_from("<5f", data, 24 + 36 * k)
         # The Mini Cheetah's pitch axes point the other way.
         q = COMMAND.position[k] * (1.0 if k % 3 == 0 else -1.0)
         gains = (COMMAND.stiffness[k], COMMAND.damping[k])
-        assert found == pytest.approx((q, 0.0, 0.0, *gains), rel=1e-7)
+        assert motor == pytest.approx((q, 0.0, 0.0, *gains), rel=1e-7)
     assert (data[:4], data[22]) == (bytes([0xFE, 0xEF, 0xFF, 0]), 1)
 
     state = some_state()

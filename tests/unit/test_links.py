@@ -84,7 +84,7 @@ REGULAR = np.arange(100) * 2e-3
 
 
 @pytest.mark.parametrize(
-    ("windows", "until", "fresh", "found"),
+    ("windows", "until", "fresh", "expected"),
     [
         ([REGULAR], 0.0, Freshness(), 100),
         ([REGULAR[:80]], 0.0, Freshness(), "80"),
@@ -97,13 +97,13 @@ REGULAR = np.arange(100) * 2e-3
     ],
 )
 def test_states_must_come_often_and_without_gaps(
-    windows: list[np.ndarray], until: float, fresh: Freshness, found: int | str
+    windows: list[np.ndarray], until: float, fresh: Freshness, expected: int | str
 ) -> None:
     link = Windows(*windows, settings=LinkSettings(fresh=fresh))
-    if isinstance(found, int):
-        assert len(link.fresh_states(until=until)) == found
+    if isinstance(expected, int):
+        assert len(link.fresh_states(until=until)) == expected
         return
-    with pytest.raises(HardwareError, match=found):
+    with pytest.raises(HardwareError, match=expected):
         link.fresh_states(until=until)
 
 
@@ -194,7 +194,8 @@ def writing(publish: Publish) -> CommandWriter:
 
 def test_the_writer_repeats_damping_and_nothing_else() -> None:
     written: list[bytes] = []
-    hold, damped = (b"\x01", b"\x00")
+    hold = b"\x01"
+    damped = b"\x00"
     writer = writing(written.append)
     writer.send(HOLD)
     time.sleep(0.05)
@@ -250,10 +251,12 @@ def test_addresses_are_read_and_written() -> None:
         ("dds://?domain=5", None, {"domain": 5}, True),
     ]
     for text, interface, options, local in cases:
-        found = Address.parse(text)
-        assert (found.interface, found.options, found.local) == (interface, options, local)
-        assert Address.parse(str(found)) == found
-        assert Address.parse(text.partition(":")[0], interface, **options) == found
+        address = Address.parse(text)
+        assert address.interface == interface
+        assert address.options == options
+        assert address.local == local
+        assert Address.parse(str(address)) == address
+        assert Address.parse(text.partition(":")[0], interface, **options) == address
     assert isinstance(Address.parse("sim://bench?seed=4").machine(ROBOT), PacedRobot)
 
 
@@ -279,7 +282,8 @@ def test_addresses_that_are_refused(text: str, interface: str | None, words: str
 class Serial:
     """Position, velocity (12 floats each) and a checksum byte; commands have three times twelve."""
 
-    name, state_rate_hz = "serial", 100.0
+    name = "serial"
+    state_rate_hz = 100.0
     torque_kind: TorqueKind = "absent"
 
     def encode(self, command: Command) -> bytes:
@@ -351,7 +355,7 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
 
 
 @pytest.mark.parametrize(
-    ("part", "wrong", "value"),
+    ("part", "method", "value"),
     [
         (Serial, "decode", lambda *_: state()),
         (Serial, "encode", lambda *_: b""),
@@ -359,8 +363,8 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
     ],
 )
 def test_defects_fail_the_check(
-    part: type, wrong: str, value: object, monkeypatch: pytest.MonkeyPatch
+    part: type, method: str, value: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(part, wrong, value)
-    with pytest.raises(PronkError, match=wrong):
+    monkeypatch.setattr(part, method, value)
+    with pytest.raises(PronkError, match=method):
         check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)

@@ -52,9 +52,10 @@ def short_chirp(amplitude: float = 0.25) -> np.ndarray:
 @pytest.mark.parametrize("joint", ["FR_hip_pitch", "FR_knee"])
 def test_positions_are_those_of_the_bench_model_stepped_from_rest(joint: str) -> None:
     trace = trace_of(joint, short_chirp(0.5))
-    found = simulate(ROBOT, trace, 20.0, 0.5)[0]
+    simulated = simulate(ROBOT, trace, 20.0, 0.5)[0]
     model = bench_spec(ROBOT, joint, stiffness={joint: 20.0}, damping={joint: 0.5}).compile()
-    data, key = mujoco.MjData(model), model.key("default")
+    data = mujoco.MjData(model)
+    key = model.key("default")
     chain = ROBOT.joint(joint).chain
     kp = np.array([20.0 if name == joint else ROBOT.joint(name).stiffness for name in chain])
     # Begin where the match begins: at rest, gravity carried by the drives.
@@ -68,7 +69,7 @@ def test_positions_are_those_of_the_bench_model_stepped_from_rest(joint: str) ->
         data.ctrl[chain.index(joint)] = command
         positions.append(data.qpos[chain.index(joint)])
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(found, positions, atol=1e-6)
+    np.testing.assert_allclose(simulated, positions, atol=1e-6)
 
 
 def test_a_mirrored_joint_is_simulated_by_its_original() -> None:
@@ -82,34 +83,38 @@ def test_a_mirrored_joint_is_simulated_by_its_original() -> None:
 
 def test_chunks_and_threads_change_nothing() -> None:
     trace = trace_of("FR_hip_pitch", short_chirp())
-    stiffness, damping = np.linspace(14, 26, 7), np.linspace(0.2, 0.6, 7)
+    stiffness = np.linspace(14, 26, 7)
+    damping = np.linspace(0.2, 0.6, 7)
     values = {"stiffness": stiffness, "damping": damping}
-    found = np.empty((7, len(trace.command)))
+    in_chunks = np.empty((7, len(trace.command)))
     with JointTestRig(ROBOT, "FR_hip_pitch", chunk=3) as rig:
         for part, position in rig.run([trace], values, len(trace.command)):
-            found[part] = position
-    one = simulate(ROBOT, trace, stiffness[4], damping[4], threads=1)[0]
+            in_chunks[part] = position
+    alone = simulate(ROBOT, trace, stiffness[4], damping[4], threads=1)[0]
     centre = ROBOT.joint("FR_hip_pitch").default_position
-    np.testing.assert_array_equal(found[4] + centre, one)
+    np.testing.assert_array_equal(in_chunks[4] + centre, alone)
 
 
 def test_armature_and_friction_are_the_drives_unless_given() -> None:
     trace = trace_of("FR_knee", short_chirp())
     drive = ROBOT.joint("FR_knee").drive
-    known = {"armature": drive.armature, "frictionloss": drive.frictionloss}
-    plain, same = (simulate(ROBOT, trace, 20.0, 0.5, **given) for given in ({}, known))
-    np.testing.assert_array_equal(plain, same)
+    by_default = simulate(ROBOT, trace, 20.0, 0.5)
+    with_values = simulate(
+        ROBOT, trace, 20.0, 0.5, armature=drive.armature, frictionloss=drive.frictionloss
+    )
+    np.testing.assert_array_equal(by_default, with_values)
 
 
 def log_of(time: np.ndarray, command: np.ndarray) -> JointLog:
-    ends, joints = {"start": time[0], "stop": time[-1]}, ("FR_knee",)
+    joints = ("FR_knee",)
+    segment = Segment(kind="chirp", joints=joints, amplitude=0.25, start=time[0], stop=time[-1])
     return JointLog(
         robot="mini_cheetah",
         joints=joints,
         time=time,
         command=command[:, None],
         position=0.5 * command[:, None],
-        segments=(Segment(kind="chirp", joints=joints, amplitude=0.25, **ends),),
+        segments=(segment,),
     )
 
 
@@ -134,10 +139,10 @@ def test_jitter_does_not_move_a_tick(seed: int, offset: float, rate: float) -> N
 
 def test_repeats_are_alike_at_any_tick_that_the_log_begins_in() -> None:
     ticks = 1.6 + np.concatenate([np.zeros(25), short_chirp(), np.zeros(20)])
-    held = np.repeat(ticks, 10)
+    command = np.repeat(ticks, 10)
     trace = []
     for caught in (0, 7, 13):
-        log = log_of(0.002 * np.arange(len(held))[caught:], held[caught:])
+        log = log_of(0.002 * np.arange(len(command))[caught:], command[caught:])
         trace.append(command_trace(log.excitations("FR_knee")[0], ROBOT))
     longer = replace(trace[0], command=np.append(trace[0].command, np.full(8, 1.6)))
     moved = replace(trace[0], command=np.append(trace[0].command, np.full(8, 1.7)))
@@ -212,9 +217,9 @@ def test_gains_matched_in_another_simulator_are_those_it_was_swept_with() -> Non
     rigs = joint_rigs(EXAMPLE, ROBOT)
     log = synthetic_log(ROBOT, "FR_knee", [chirp], 19.3, 0.41, simulator=rigs)
     gains = match([log], ROBOT, EXAMPLE).gains
-    found = gains.joints["FR_knee"]
-    assert found.stiffness.value == pytest.approx(19.3, rel=2e-3)
-    assert found.damping.value == pytest.approx(0.41, rel=5e-3)
+    knee = gains.joints["FR_knee"]
+    assert knee.stiffness.value == pytest.approx(19.3, rel=2e-3)
+    assert knee.damping.value == pytest.approx(0.41, rel=5e-3)
     assert gains.simulator == rigs.info
     replay = predict(log, ROBOT, gains, simulator=EXAMPLE).joints[0]
     assert replay.rmse_matched < 0.1 * replay.rmse_nominal

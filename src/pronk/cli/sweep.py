@@ -204,6 +204,7 @@ def record_wire(
     real_time: bool = True,
     ages: AgeLimits | None = None,
     standby_s: float = 0.04,
+    operator_timeout_s: float = 0.3,
     overwrite: bool = False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> dict[str, Any]:
@@ -216,6 +217,7 @@ def record_wire(
         real_time: True to ask the operating system for real-time scheduling.
         ages: Limits of the age of a state; those of the robot if None.
         standby_s: Silence of the servo after which the standby process damps the joints [s].
+        operator_timeout_s: Silence of this program after which the servo damps the joints [s].
         overwrite: Replace logs that exist.
         progress: Called with the share of the sweep that is done, 0 to 1.
 
@@ -234,7 +236,14 @@ def record_wire(
 
     metadata = {"link": str(link.address), "servo_rate_hz": f"{RunPlan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    run = RunPlan(link=link, sweep=task, real_time=real_time, ages=ages, standby_s=standby_s)
+    run = RunPlan(
+        link=link,
+        sweep=task,
+        real_time=real_time,
+        ages=ages,
+        standby_s=standby_s,
+        operator_timeout_s=operator_timeout_s,
+    )
     operator = BenchOperator(console.RigOperator())
     complete_logs: list[str] = []
 
