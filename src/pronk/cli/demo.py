@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pronk.cli import console
 from pronk.cli.match import summary
@@ -19,6 +19,7 @@ from pronk.names import file_name
 from pronk.processes import pool
 
 if TYPE_CHECKING:
+    from pronk.identify.excitation.plan import SweepPlan
     from pronk.identify.match.predict import JointPrediction
     from pronk.identify.match.result import MatchResult
     from pronk.jump.trial.results import TrialResults
@@ -43,7 +44,7 @@ def demo(
         policies: Folder of policies to try; those that come with pronk if left out.
         jumps: Jumps with each of the paper's commands.
         repeats: Repeats of the matched amplitude.
-        seed: Of the virtual robot's noise.
+        seed: Seed of the virtual robot's noise.
     """
     from pronk.jump.trial import tables
     from pronk.report import figures, style
@@ -56,7 +57,7 @@ def demo(
         "All results below are of pronk's virtual robot, a simulated stand-in for the Mini "
         "Cheetah whose parameters the match cannot read."
     )
-    begun = time.perf_counter()
+    begin = time.perf_counter()
     robot = load_robot(ROBOT)
     tried = find_policies(policies, robot)
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
@@ -68,7 +69,7 @@ def demo(
         report("jumps and film", 1.0)
         hero = style.save_figure(figures.hero(result), out / "hero.svg")
         page, _ = write_report(out, report)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - begin
     cells = show_match(result, replays)
     if trial is not None:
         console.show(tables.paper_table(trial, "height"))
@@ -78,22 +79,26 @@ def demo(
         "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
         f"come with pronk. {seconds:.0f} s in all."
     )
-    found = {
+    demo_figures = {
         "cells_from_table_1": cells,
         "predictions": prediction_rows(replays),
         "trial": out / "trial" / "summary.json" if trial is not None else None,
         "page": page,
         "seconds_total": seconds,
     }
+    following = [
+        f"open {page} in a browser",
+        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
+    ]
+    if tried:
+        following.append(f"pronk trial {tried[0]} --out out/trial")
+    following.append(
+        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS"
+    )
     return console.Outcome(
-        figures=summary(result) | found,
+        figures=summary(result) | demo_figures,
         wrote=[out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page],
-        following=[
-            f"open {page} in a browser",
-            f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
-            *(f"pronk trial {path} --out out/trial" for path in tried[:1]),
-            f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
-        ],
+        following=following,
     )
 
 
@@ -101,10 +106,13 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     """Return the policies of a folder, or of pronk's source if None; the matched one first."""
     from pronk.jump.trial.trial import load_subjects
 
-    place = folder or Path(__file__).parents[3] / "policies"
-    found = [*place.glob("policy.onnx"), *place.glob("*/policy.onnx")]
-    found.sort(key=lambda path: (path.parent.name != "matched", path.parent.name))
-    if folder is not None and not found:
+    policies_folder = folder or Path(__file__).parents[3] / "policies"
+    policies = [
+        *policies_folder.glob("policy.onnx"),
+        *policies_folder.glob("*/policy.onnx"),
+    ]
+    policies.sort(key=lambda path: (path.parent.name != "matched", path.parent.name))
+    if folder is not None and not policies:
         raise PronkError(
             f"--policies {folder}: no policy.onnx in it or in a folder in it; give one that "
             "`pronk train` wrote to, or leave the option out."
@@ -112,11 +120,13 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     if folder is None and importlib.util.find_spec("onnxruntime") is None:
         console.warn("no jumps: onnxruntime is missing; `pip install 'pronk[policy]'`.")
         return []
-    if found:
-        load_subjects(found, robot)
+    if policies:
+        load_subjects(policies, robot)
     else:
-        console.warn(f"no jumps: there are no policies in {place}; --policies DIR names others.")
-    return found
+        console.warn(
+            f"no jumps: there are no policies in {policies_folder}; --policies DIR names others."
+        )
+    return policies
 
 
 def jump_and_film(
@@ -149,7 +159,7 @@ def sweep_and_match(
     """
     from pronk.deploy.bench.virtual_sweep import sweep_virtual
     from pronk.identify.excitation.plan import make_plan
-    from pronk.identify.excitation.signals import Chirp, LogChirp, Signal
+    from pronk.identify.excitation.signals import Chirp, LogChirp
     from pronk.identify.logs.readers import read_logs
     from pronk.identify.match import gains as gains_file
     from pronk.identify.match.match import match
@@ -158,34 +168,37 @@ def sweep_and_match(
     from pronk.identify.response.response import save_responses
     from pronk.jump.virtual.sim_params import load_sim_params
 
-    params, cpus = load_sim_params(), os.cpu_count() or 1
+    sim_params = load_sim_params()
+    processes = os.cpu_count() or 1
 
-    def record(folder: str, seed: int, signal: Signal, **counts: Any) -> list[Path]:
-        plan = make_plan(robot, signal=signal, **counts)
+    def record(folder: str, plan: SweepPlan, seed: int) -> list[Path]:
         plan.check()
         return sweep_virtual(
             plan,
-            params,
+            sim_params,
             out / folder,
             seed=seed,
-            processes=cpus,
+            processes=processes,
             overwrite=True,
             progress=report.bar(f"sweep ({folder})"),
         )
 
-    counts = (repeats, *[1] * len(AMPLITUDES[1:]))
-    paths = record("logs", seed, Chirp(), amplitudes=AMPLITUDES, repeats=counts)
-    fresh = record("fresh", seed + 1, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
-    logs = read_logs(paths, processes=cpus, robot=robot)
+    repeats_by_amplitude = (repeats, *[1] * len(AMPLITUDES[1:]))
+    sweep = make_plan(robot, signal=Chirp(), amplitudes=AMPLITUDES, repeats=repeats_by_amplitude)
+    fresh_sweep = make_plan(robot, signal=LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
+    log_paths = record("logs", sweep, seed)
+    fresh_paths = record("fresh", fresh_sweep, seed + 1)
+    logs = read_logs(log_paths, processes=processes, robot=robot)
     result = match(logs, robot, progress=report)
     gains_file.save_gains(out / "gains.yaml", result.gains)
     save_match(out / "match.npz", result)
     for name, joint in result.joints.items():
         if joint.responses is not None:
-            path = out / "logs" / f"{file_name(name)}.response.npz"
-            save_responses(path, joint.responses.measured)
-    read = read_logs(fresh, robot=robot)
-    replays = [one for log in read for one in predict(log, robot, result.gains).joints]
+            response_path = out / "logs" / f"{file_name(name)}.response.npz"
+            save_responses(response_path, joint.responses.measured)
+    replays: list[JointPrediction] = []
+    for log in read_logs(fresh_paths, robot=robot):
+        replays += predict(log, robot, result.gains).joints
     prediction = Prediction(joints=tuple(replays), source="fresh", virtual=True)
     save_prediction(out / "fresh.prediction.npz", prediction)
     return result, replays

@@ -19,9 +19,10 @@ def report(folder: tyro.conf.Positional[Path]) -> console.Outcome:
     from pronk.report import build
 
     with console.progress() as progress:
-        page, found = build.write_report(folder, progress)
+        page, parts = build.write_report(folder, progress)
+    part_figures = [{"source": part.source, **part.figures} for part in parts]
     return console.Outcome(
-        figures={"page": page, "parts": [{"source": one.source, **one.figures} for one in found]},
+        figures={"page": page, "parts": part_figures},
         wrote=[page],
         following=[f"open {page} in a browser"],
     )
