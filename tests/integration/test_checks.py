@@ -97,7 +97,7 @@ def test_a_misfit_is_named_where_it_is(
 
 
 @pytest.mark.skipif(not SO101.is_dir(), reason="the recordings of the SO-101 are not here")
-def test_recordings_of_an_arm_pass() -> None:
+def test_excitations_of_an_arm_pass() -> None:
     robot = load_robot("so101")
     folders = sorted(path for path in SO101.glob("*") if path.is_dir())
     for log in read_logs(folders, robot=robot):
