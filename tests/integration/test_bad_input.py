@@ -39,7 +39,8 @@ def csv(path: Path, *rows: str, header: str = HEADER) -> Path:
 
 # --- Commands -----------------------------------------------------------------------------------
 
-SWEEP, OF = "sweep mini_cheetah --out x", "--robot mini_cheetah --out x/gains.yaml"
+SWEEP = "sweep mini_cheetah --out x"
+OF = "--robot mini_cheetah --out x/gains.yaml"
 COMMANDS = [
     ("mach", "mach"),
     ("match . --robot mini_cheetah --grids 3", "--grids"),
@@ -206,7 +207,8 @@ class Bomb:
 
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
-    boom, path = tmp_path / "boom", tmp_path / "a.pt"
+    boom = tmp_path / "boom"
+    path = tmp_path / "a.pt"
     bomb = pickle.dumps({"time": Bomb(boom)}, protocol=protocol)
     pickle.loads(bomb)
     assert boom.read_text() == "boom"  # so the bomb works
@@ -255,7 +257,8 @@ def test_a_file_of_pytorch_without_the_tensors_is_refused(tmp_path: Path) -> Non
 
 
 def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
-    header, huge = io.BytesIO(), {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+    header = io.BytesIO()
+    huge = {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
     np.lib.format.write_array_header_1_0(header, huge)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         file.writestr("time.npy", header.getvalue() + bytes(80))
@@ -269,7 +272,8 @@ def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
 
 def test_tensors_whose_numbers_are_cut(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    wave, path = torch.sin(torch.arange(60) / 400.0)[:, None], tmp_path / "a.pt"
+    wave = torch.sin(torch.arange(60) / 400.0)[:, None]
+    path = tmp_path / "a.pt"
     torch.save({"time": wave[:, 0], "dof_pos": wave, "des_dof_pos": wave}, path)
     with zipfile.ZipFile(path) as file:
         parts = {name: file.read(name) for name in file.namelist()}

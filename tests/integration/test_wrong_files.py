@@ -61,7 +61,12 @@ def test_a_clock_in_another_unit_is_refused(swept: JointLog, tmp_path: Path, fac
 @pytest.mark.parametrize("columns", [("command",), ("position",), ("command", "position")])
 def test_degrees_are_refused(swept: JointLog, tmp_path: Path, columns: tuple[str, ...]) -> None:
     """A small chirp, which in degrees stays below a turn."""
-    small = {c: 0.2 * getattr(swept, c) for c in ("command", "position")}
-    wrong = {c: np.rad2deg(small[c]) for c in columns}
+    command = 0.2 * swept.command
+    position = 0.2 * swept.position
+    if "command" in columns:
+        command = np.rad2deg(command)
+    if "position" in columns:
+        position = np.rad2deg(position)
+    in_degrees = replace(swept, velocity=None, command=command, position=position)
     with pytest.raises(LogError, match="degrees"):
-        match([read(tmp_path, replace(swept, velocity=None, **small | wrong))], ROBOT)
+        match([read(tmp_path, in_degrees)], ROBOT)

@@ -17,6 +17,8 @@ from pronk.robots import load_robot
 ROBOT = load_robot("mini_cheetah")
 SHORT = Chirp(length_s=4.0, stop_hz=15.0)
 EXACT = Uncertainty(inertia=0.0, stiffness=0.0, friction=0.0)
+STIFFNESS = {joint.name: joint.stiffness for joint in ROBOT.joints}
+DAMPING = {joint.name: joint.damping for joint in ROBOT.joints}
 
 
 def forecasts(joint: str, signal: Signal, **options: Any) -> dict[str, Forecast]:
@@ -25,8 +27,8 @@ def forecasts(joint: str, signal: Signal, **options: Any) -> dict[str, Forecast]
         joint,
         signal.samples(50.0),
         rate_hz=50.0,
-        stiffness={joint.name: joint.stiffness for joint in ROBOT.joints},
-        damping={joint.name: joint.damping for joint in ROBOT.joints},
+        stiffness=STIFFNESS,
+        damping=DAMPING,
         **options,
     )
     return {joint_forecast.joint: joint_forecast for joint_forecast in chain_forecasts}
@@ -57,7 +59,8 @@ def test_mirrored_joints_have_mirrored_forecasts(plan: SweepPlan) -> None:
     rows = {row["joint"]: row for row in plan.rows()}
     # The chirp begins to the same side for both legs, which is outward for one and inward for the
     # other, so their extremes mirror nearly, not exactly.
-    right_row, left_row = rows["FR_hip_roll"], rows["FL_hip_roll"]
+    right_row = rows["FR_hip_roll"]
+    left_row = rows["FL_hip_roll"]
     assert left_row["highest_rad"] == pytest.approx(-float(right_row["lowest_rad"]), abs=0.01)
     assert left_row["lowest_rad"] == pytest.approx(-float(right_row["highest_rad"]), abs=0.01)
     assert {**rows["HL_knee"], "joint": ""} == {**rows["FR_knee"], "joint": ""}
@@ -69,8 +72,9 @@ def test_mirrored_forecast_equals_the_simulation_of_the_joint_itself() -> None:
     np.testing.assert_array_equal(plan.excitations[0].offsets(50.0), -SHORT.samples(50.0))
     itself = forecasts("FL_hip_roll", SHORT)
     mirrored = forecasts("FR_hip_roll", SHORT)
+    planned_by_joint = {planned.joint: planned for planned in plan.forecasts}
     for name in ("FL_hip_roll", "FL_hip_pitch", "FL_knee"):
-        planned = next(f for f in plan.forecasts if f.joint == name)
+        planned = planned_by_joint[name]
         for value in ("speed", "torque", "electrical_power"):
             expected = getattr(mirrored[name.replace("FL", "FR")], value)
             assert getattr(planned, value) == pytest.approx(expected, rel=1e-6, abs=1e-9)
@@ -81,9 +85,9 @@ def test_a_slow_excitation_is_followed_statically() -> None:
     """At 0.2 Hz position follows the command; peak torque is stiffness times friction's lag."""
     slow = Chirp(start_hz=0.1, stop_hz=0.3, length_s=10.0, amplitude=0.2)
     worst = forecasts("FR_knee", slow, uncertainty=EXACT)["FR_knee"]
-    rest = ROBOT.joint("FR_knee").default_position
-    assert worst.highest == pytest.approx(rest + 0.2, abs=0.03)
-    assert worst.lowest == pytest.approx(rest - 0.2, abs=0.03)
+    rest_position = ROBOT.joint("FR_knee").default_position
+    assert worst.highest == pytest.approx(rest_position + 0.2, abs=0.03)
+    assert worst.lowest == pytest.approx(rest_position - 0.2, abs=0.03)
     assert worst.speed < 2.0
     # Power from the bus is the mechanical power and the loss in the winding.
     assert 0.0 < worst.mechanical_power < worst.electrical_power
@@ -99,10 +103,8 @@ def test_the_corners_enclose_the_model_itself() -> None:
 
 
 def test_the_step_of_the_forecast_has_converged() -> None:
-    coarse, fine = (
-        forecasts("FR_knee", SHORT, uncertainty=EXACT, timestep_s=step)["FR_knee"]
-        for step in (0.001, 0.00025)
-    )
+    coarse = forecasts("FR_knee", SHORT, uncertainty=EXACT, timestep_s=0.001)["FR_knee"]
+    fine = forecasts("FR_knee", SHORT, uncertainty=EXACT, timestep_s=0.00025)["FR_knee"]
     for value in ("speed", "torque", "lowest", "highest"):
         assert getattr(coarse, value) == pytest.approx(getattr(fine, value), rel=0.02)
 
@@ -129,7 +131,9 @@ def test_a_sweep_that_could_exceed_a_range_is_refused(
 
 
 def test_what_no_amplitude_fits_and_what_the_drives_cannot_give_are_refused() -> None:
-    joints = (replace(j, range=(-2.6, 1.0)) if j.name == "FR_knee" else j for j in ROBOT.joints)
+    joints = list(ROBOT.joints)
+    knee = ROBOT.joint_names.index("FR_knee")
+    joints[knee] = replace(joints[knee], range=(-2.6, 1.0))
     bent = replace(ROBOT, joints=tuple(joints))
     with pytest.raises(PlanError, match="no amplitude fits"):
         make_plan(bent, ["FR_knee"], SHORT, repeats=1).check()
@@ -141,8 +145,9 @@ def test_what_no_amplitude_fits_and_what_the_drives_cannot_give_are_refused() ->
 
 def test_each_amplitude_may_have_repeats_of_its_own() -> None:
     plan = make_plan(ROBOT, ["FR_knee"], amplitudes=(0.125, 0.25), repeats=(1, 3))
-    planned = [(excitation.signal.amplitude, excitation.repeat) for excitation in plan.excitations]
-    assert planned == [(0.25, 0), (0.25, 1), (0.25, 2), (0.125, 0)]
+    amplitudes = [excitation.signal.amplitude for excitation in plan.excitations]
+    assert amplitudes == [0.25, 0.25, 0.25, 0.125]
+    assert [excitation.repeat for excitation in plan.excitations] == [0, 1, 2, 0]
 
 
 @pytest.mark.parametrize(

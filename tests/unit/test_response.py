@@ -97,15 +97,15 @@ KINDS: dict[str, tuple[Any, float, float, int]] = {
 
 
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("signal", KINDS)
 @pytest.mark.parametrize("name", JOINTS)
-def test_the_analytic_response_is_found(name: str, kind: str, rate: float) -> None:
-    make, gain_limit, phase_limit, expected = KINDS[kind]
+def test_the_analytic_response_is_found(name: str, signal: str, rate: float) -> None:
+    make, gain_limit, phase_limit, expected = KINDS[signal]
     (response,) = estimate_response(make(linear_joint(**JOINTS[name]), rate), "knee")
     gain, phase, bins = errors(response, JOINTS[name])
     assert (gain < gain_limit, phase < phase_limit, bins) == (True, True, expected)
     # One for each excitation; for each block of periods where there are fewer than three.
-    assert len(response.repeats) == (2 if kind == "sine_steps" else 3)
+    assert len(response.repeats) == (2 if signal == "sine_steps" else 3)
 
 
 @pytest.mark.parametrize("jitter", [0.05, 0.9])

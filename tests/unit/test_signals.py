@@ -35,7 +35,9 @@ def test_begins_and_ends_at_rest_and_reaches_its_peak(signal: Signal, rate: floa
 
 def test_the_default_chirp_is_the_papers() -> None:
     chirp = Chirp()
-    assert (chirp.band_hz, chirp.amplitude, chirp.duration_s()) == ((0.1, 25.0), 0.25, 20.0)
+    assert chirp.band_hz == (0.1, 25.0)
+    assert chirp.amplitude == 0.25
+    assert chirp.duration_s() == 20.0
 
 
 @pytest.mark.parametrize("chirp", [Chirp(), LogChirp()])
@@ -51,7 +53,8 @@ def test_a_chirp_turns_at_the_frequency_it_names(chirp: Chirp) -> None:
 def test_multisine_holds_odd_harmonics_and_nothing_else() -> None:
     signal = Multisine(length_s=10.0, periods=3)
     period = signal.one_period()
-    spectrum, lines = np.abs(np.fft.rfft(period)), np.array(signal.harmonic_numbers)
+    spectrum = np.abs(np.fft.rfft(period))
+    lines = np.array(signal.harmonic_numbers)
     assert (lines % 2 == 1).all()
     assert np.delete(spectrum, lines).max() < 1e-12 * spectrum[lines].max()
     # What is sent repeats that period exactly between the ramps.
@@ -68,19 +71,24 @@ def test_multisine_tilt_is_the_slope_of_its_lines() -> None:
 
 
 def test_more_draws_give_a_smaller_crest_factor() -> None:
-    one, best = (Multisine(draws=draws).one_period() for draws in (1, 200))
-    assert np.abs(best).max() / best.std() < min(2.2, np.abs(one).max() / one.std())
-    third, again, fourth = (Multisine(seed=seed).samples() for seed in (3, 3, 4))
-    assert np.array_equal(third, again)
-    assert not np.array_equal(third, fourth)
+    first_draw = Multisine(draws=1).one_period()
+    best_draw = Multisine(draws=200).one_period()
+    first_crest = np.abs(first_draw).max() / first_draw.std()
+    best_crest = np.abs(best_draw).max() / best_draw.std()
+    assert best_crest < first_crest
+    assert best_crest < 2.2
+    third_seed = Multisine(seed=3).samples()
+    assert np.array_equal(third_seed, Multisine(seed=3).samples())
+    assert not np.array_equal(third_seed, Multisine(seed=4).samples())
 
 
 def test_sine_steps_measure_whole_cycles_of_one_frequency() -> None:
     signal = SineSteps(frequencies_hz=(0.5, 3.3, 12.0))
-    offsets, frequency = signal.samples(), signal.frequency()
+    offsets = signal.samples()
+    frequency = signal.frequency()
     windows = signal.windows()
-    for (first, stop, exact), wanted in zip(windows, signal.frequencies_hz, strict=True):
-        assert exact == pytest.approx(wanted, rel=0.02)
+    for (first, stop, exact), stated_hz in zip(windows, signal.frequencies_hz, strict=True):
+        assert exact == pytest.approx(stated_hz, rel=0.02)
         assert set(frequency[first:stop]) == {exact}
         cycles = (stop - first) * exact / 50.0
         assert cycles == pytest.approx(round(cycles), abs=1e-9)
@@ -127,7 +135,8 @@ def test_impossible_signals_are_refused(make: object, words: str) -> None:
 
 
 def test_commands_correlate_with_a_shifted_copy_and_not_with_noise_or_rest() -> None:
-    time, turn = np.arange(6000) / 50.0, 2.0 * np.pi * np.arange(6000) / 50.0
+    time = np.arange(6000) / 50.0
+    turn = 2.0 * np.pi * time
     shifted = np.stack([np.sin(turn), np.cos(turn)], axis=1)
     assert abs(np.corrcoef(shifted.T)[0, 1]) < 1e-3
     note = correlation_note(time, shifted, ["pan", "lift"])
