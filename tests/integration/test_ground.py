@@ -197,7 +197,8 @@ def test_energy_is_conserved_without_drives_and_contacts(step: float) -> None:
     plant = Plant(ROBOT, sim_params, legs_of(ROBOT), step, Ground())
     physics = Physics(plant, sim_params.machine, pose=POSE, first_step=0)
     physics.apply(Command(position=POSE, **gains(0.0, 0.0)))
-    model, data = plant.model, physics.data
+    model = plant.model
+    data = physics.data
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     rng = np.random.default_rng(5)
     data.qpos[2] = 2.0

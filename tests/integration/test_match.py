@@ -67,9 +67,9 @@ def matched() -> MatchResult:
 def test_known_gains_are_inside_their_intervals(matched: MatchResult) -> None:
     # The robot's order, not that of the logs.
     assert list(matched.joints) == ["FR_hip_roll", "FR_knee", "FL_hip_roll"]
-    for joint, known in KNOWN.items():
+    for joint, true_gains in KNOWN.items():
         gains = matched.gains.joints[joint]
-        assert (gains.stiffness.value, gains.damping.value) == pytest.approx(known, rel=5e-3)
+        assert (gains.stiffness.value, gains.damping.value) == pytest.approx(true_gains, rel=5e-3)
         for fitted in (gains.stiffness, gains.damping):
             assert fitted.repeat95[0] < fitted.value < fitted.repeat95[1]
         assert gains.quality.error_db < 0.05

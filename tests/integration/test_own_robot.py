@@ -39,26 +39,26 @@ LINKS = LINK.format(**SHOULDER) + LINK.format(**ELBOW)
 ARM = f'<robot name="arm"><link name="base"/>{LINKS}</robot>'
 
 
-def model_of(kind: str, folder: Path) -> Path:
+def model_of(model: str, folder: Path) -> Path:
     """Write a model file as a user has it."""
-    path = folder / ("arm.urdf" if kind == "arm" else f"{kind}.xml")
+    path = folder / ("arm.urdf" if model == "arm" else f"{model}.xml")
     cheetah = Path(pronk.robots.__file__).parent / "mini_cheetah" / "mini_cheetah.xml"
     texts = {"arm": ARM, "pendulum": PENDULUM, "cheetah": cheetah.read_text()}
-    path.write_text(texts[kind])
+    path.write_text(texts[model])
     return path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "joint"), [("pendulum", "swing"), ("arm", "elbow"), ("cheetah", "FR_knee")]
+    ("model", "joint"), [("pendulum", "swing"), ("arm", "elbow"), ("cheetah", "FR_knee")]
 )
-def test_sweep_match_predict_export(kind: str, joint: str, tmp_path: Path) -> None:
+def test_sweep_match_predict_export(model: str, joint: str, tmp_path: Path) -> None:
     robot = tmp_path / "robot.yaml"
     gains = tmp_path / "gains.yaml"
     logs = tmp_path / "logs"
     matched = tmp_path / "matched.xml"
     sweep = ("--amplitude", "0.15", "--repeats", "1", "--joints", joint)
-    accepted("robot", "new", model_of(kind, tmp_path))
+    accepted("robot", "new", model_of(model, tmp_path))
     accepted("robot", "check", robot)
     accepted("sweep", robot, "--out", logs, *sweep)
     accepted("match", logs, "--robot", robot, "--out", gains, "--method", "paper")
@@ -70,13 +70,13 @@ def test_sweep_match_predict_export(kind: str, joint: str, tmp_path: Path) -> No
     assert 0.7 < share < 1.6
 
 
-@pytest.mark.parametrize("kind", ["pendulum", "arm", "cheetah"])
-def test_bare_model_is_a_robot(kind: str, tmp_path: Path) -> None:
-    bare = load_robot(model_of(kind, tmp_path))
+@pytest.mark.parametrize("model", ["pendulum", "arm", "cheetah"])
+def test_bare_model_is_a_robot(model: str, tmp_path: Path) -> None:
+    bare = load_robot(model_of(model, tmp_path))
     for joint in bare.joints:
         assert joint.name in joint.chain
         assert joint.stiffness > 0.0
-    if kind == "cheetah":
+    if model == "cheetah":
         assert bare.joint_names == load_robot("mini_cheetah").joint_names
 
 

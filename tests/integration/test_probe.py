@@ -40,19 +40,19 @@ def probed(truth: Truth) -> Probe:
 
 
 @pytest.mark.parametrize(
-    ("kind", "law"),
+    ("engine", "law"),
     [
         ("mujoco", DriveLaw()),
         ("numpy", DriveLaw(kind="implicit_damping")),
         ("numpy", DriveLaw(kind="implicit")),
     ],
 )
-def test_law_and_parameters(kind: str, law: DriveLaw) -> None:
-    truth = replace(FAULTLESS, law=law, stated=law, kind=kind)
+def test_law_and_parameters(engine: str, law: DriveLaw) -> None:
+    truth = replace(FAULTLESS, law=law, stated=law, kind=engine)
     probe = probed(truth)
     assert probe.law.drive == law
     assert not probe.law.beside_explicit
-    assert probe.law.soft_friction == (kind == "mujoco")
+    assert probe.law.soft_friction == (engine == "mujoco")
     assert probe.hold == 1
     assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
     assert probe.frictionloss == pytest.approx(0.1, rel=1e-2)
@@ -95,13 +95,13 @@ def test_a_joint_that_does_not_move_is_refused() -> None:
 
 @pytest.mark.slow
 def test_random_simulators_are_named() -> None:
-    kinds = ["numpy", "mujoco"]
+    engines = ["numpy", "mujoco"]
     for name, engine in ENGINES.items():
         if importlib.util.find_spec(engine.module):
-            kinds.append(name)
+            engines.append(name)
     generator = np.random.default_rng(7)
-    for kind in kinds:
-        assert_named_as_drawn(draw_truth(generator, kind, ""))
+    for engine_name in engines:
+        assert_named_as_drawn(draw_truth(generator, engine_name, ""))
 
 
 def test_the_command_names_law_and_faults(tmp_path: Path) -> None:

@@ -209,11 +209,11 @@ def test_mirror_claim_by_simulation(robot: RobotSpec, name: str) -> None:
     offset = held_chirp(robot, 2.0, 0.25)
     model = bench_spec(robot, name).compile()
     mirrored = bench_spec(robot, original).compile()
-    here = simulate(model, commands(model, name, offset))
-    there = simulate(mirrored, commands(mirrored, original, sign * offset))
+    position = simulate(model, commands(model, name, offset))
+    mirrored_position = simulate(mirrored, commands(mirrored, original, sign * offset))
     column = robot.joint(name).chain.index(name)
-    assert np.ptp(here[:, column]) > 0.1
-    np.testing.assert_allclose(here[:, column], sign * there[:, column], atol=1e-9)
+    assert np.ptp(position[:, column]) > 0.1
+    np.testing.assert_allclose(position[:, column], sign * mirrored_position[:, column], atol=1e-9)
 
 
 @pytest.mark.train

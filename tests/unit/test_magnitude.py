@@ -305,9 +305,9 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
             interval = gain_interval(fit)
             assert interval.flags == ()
             stiffness.append(fit.stiffness)
-            for name, known in zip(GAINS, PITCH_GAINS, strict=True):
+            for name, true_gain in zip(GAINS, PITCH_GAINS, strict=True):
                 low, high = interval.ci95[name]
-                covered[name] += low <= known <= high
+                covered[name] += low <= true_gain <= high
     for name in GAINS:
         assert 0.90 * trials <= covered[name] <= 0.99 * trials
     # No bias beside the scatter of the mean.
@@ -332,13 +332,13 @@ def test_each_repeat_is_fitted_by_itself() -> None:
 def test_few_repeats_are_flagged() -> None:
     noise = 0.002 * np.random.default_rng(3).standard_normal((2, 6000))
     two = short_targets(PITCH, PITCH_GAINS, repeats=2, noise=list(noise))[0]
-    one = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
-    pair, single = intervals([two, one])
+    single_repeat = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
+    pair, single = intervals([two, single_repeat])
     assert "two repeats" in pair.flags[0]
     assert "one repeat" in single.flags[0]
     low, high = single.ci95["stiffness"]
     assert low < PITCH_GAINS[0] < high < low + 1.0
-    assert 0.0 < one.measurement_error_db() < 1.0
+    assert 0.0 < single_repeat.measurement_error_db() < 1.0
 
 
 @pytest.mark.parametrize(("friction", "flagged"), [(0.2, False), (0.8, True)])

@@ -185,10 +185,12 @@ def test_a_measurement_that_is_not_finite_is_refused(changes: dict[str, Any], ma
         measurement(**changes)
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
-def test_finite_numbers_of_any_size_and_type_are_read(kind: type) -> None:
-    largest = 2**62 if kind is np.int64 else kind(3.4e38)  # its square overflows a float32
-    value = np.array([largest, 1, -largest], kind)
+@pytest.mark.parametrize("number_type", [np.float32, np.float64, np.int64])
+def test_finite_numbers_of_any_size_and_type_are_read(number_type: type) -> None:
+    largest = (
+        2**62 if number_type is np.int64 else number_type(3.4e38)
+    )  # its square overflows a float32
+    value = np.array([largest, 1, -largest], number_type)
     np.testing.assert_array_equal(finite("it", value, (3,)), value.astype(np.float32))
     for bad in (math.nan, -math.inf, 1e39):
         with pytest.raises(ArtefactError, match=r"it is (nan|-?inf) at \[1\]"):
@@ -301,9 +303,9 @@ def test_inputs_and_outputs_that_are_not_finite_are_refused(jumper: Policy) -> N
 
 
 def test_files_that_hold_no_policy_are_refused(tmp_path: Path) -> None:
-    whole = write_policy(tmp_path).read_bytes()
-    damaged = {"half": whole[: len(whole) // 2], "text": b"not a network", "empty": b""}
-    damaged["metadata"] = whole.replace(b"mini_cheetah", b"mini_cheeta\xff")
+    sound = write_policy(tmp_path).read_bytes()
+    damaged = {"half": sound[: len(sound) // 2], "text": b"not a network", "empty": b""}
+    damaged["metadata"] = sound.replace(b"mini_cheetah", b"mini_cheeta\xff")
     for name, content in damaged.items():
         (tmp_path / f"{name}.onnx").write_bytes(content)
     write_network(tmp_path / "foreign.onnx", {"author": "someone"}, jump=False)

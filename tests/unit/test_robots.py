@@ -188,6 +188,6 @@ def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_p
 
 
 def test_a_robot_is_shown_in_one_line() -> None:
-    shown = repr(load_robot("so101"))
-    assert "so101" in shown
-    assert len(shown) < 100
+    text = repr(load_robot("so101"))
+    assert "so101" in text
+    assert len(text) < 100
