@@ -17,6 +17,8 @@ TOLERANCE = 1e-3
 """Relative change of the cost or of the parameters that ends a search: far below the intervals."""
 EVALUATIONS = 15
 """Most evaluations of one search; four to six are usual."""
+OUT_OF_EVALUATIONS = 0
+"""Status with which `scipy.optimize.least_squares` says that it ran out of evaluations."""
 AT_BOUND = 1e-3
 """Distance from a bound, as a share of the range of the search, from which on a fit is at it."""
 
@@ -89,6 +91,8 @@ class Residuals:
         self._samples = samples
         self._last_x: Array | None = None
         self._last_residual = np.empty(0)
+        self._last_jacobian_x: Array | None = None
+        self._last_jacobian = np.empty((0, 0))
         numbers = []
         commands = []
         blocks = []
@@ -147,6 +151,13 @@ class Residuals:
         A residual depends on the parameters of its own joint. One simulation serves a parameter of
         all joints.
         """
+        if self._last_jacobian_x is None or not np.array_equal(x, self._last_jacobian_x):
+            self._last_jacobian = self._differences(x)
+            self._last_jacobian_x = x.copy()
+        return self._last_jacobian
+
+    def _differences(self, x: Array) -> Array:
+        """Simulate with each parameter changed, and return the derivatives, shape (m, p)."""
         vector = self.vector
         step = np.empty(len(x))
         for column, name in enumerate(vector.names):
@@ -242,6 +253,19 @@ def minimize_residuals(
         return Optimum(
             residuals=residuals, x=nothing, residual=residual, jacobian=jacobian, settled=True
         )
+
+    def stop_at_optimum(x: Array) -> None:
+        """End the search where another step promises less than the tolerance.
+
+        The search itself would simulate that step and its derivatives to find out.
+        """
+        residual = residuals.residual(x)
+        jacobian = residuals.jacobian(x)
+        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+        promised = float(np.sum((jacobian @ step) ** 2))
+        if promised < tolerance * float(residual @ residual):
+            raise StopIteration
+
     result = least_squares(
         residuals.residual,
         vector.begin,
@@ -251,11 +275,12 @@ def minimize_residuals(
         xtol=tolerance,
         ftol=tolerance,
         max_nfev=evaluations,
+        callback=stop_at_optimum,
     )
     return Optimum(
         residuals=residuals,
         x=np.asarray(result.x),
         residual=np.asarray(result.fun),
         jacobian=np.asarray(result.jac),
-        settled=bool(result.success),
+        settled=result.status != OUT_OF_EVALUATIONS,
     )
