@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -84,15 +83,6 @@ _RC = {
     "svg.fonttype": "path",
     "image.composite_image": False,
 }
-
-
-def rms_of_finite(values: Any, axis: int | None = None) -> Any:
-    """Return the root mean square of the finite values; NaN without any."""
-    numbers = np.asarray(values, dtype=float)
-    finite = np.isfinite(numbers)
-    squares = np.where(finite, numbers, 0.0) ** 2
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(squares.sum(axis) / finite.sum(axis))
 
 
 def joint_words(name: str) -> str:

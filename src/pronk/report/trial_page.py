@@ -27,7 +27,7 @@ from pronk.jump.virtual import capture as capture_file
 from pronk.report import style
 from pronk.report.page import Part, page
 from pronk.report.paper import published_jumps
-from pronk.report.style import picture, rms_of_finite
+from pronk.report.style import picture
 from pronk.report.trial_figures import JumpPanel, Values, draw_jumps, draw_traces
 from pronk.tables import Cell, Column, Table
 
@@ -123,10 +123,10 @@ def _cut(time: Array, value: Array, start: float, end: float) -> Array:
 
 def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
     """Return the RMS of a rate over all runs with the command `RATES`; NaN without any."""
-    rates = [np.array([np.nan])]
-    for run in runs.get(RATES.name, ()):
-        rates.append(run[1])
-    return float(rms_of_finite(np.concatenate(rates)))
+    rates = [run[1] for run in runs.get(RATES.name, ())]
+    if not rates:
+        return float("nan")
+    return float(np.sqrt(np.nanmean(np.square(np.concatenate(rates)))))
 
 
 # ---- films ----
