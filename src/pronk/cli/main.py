@@ -221,6 +221,9 @@ def _sentence(box: str, program: str) -> str:
 def main() -> None:
     """Entry point of the `pronk` command."""
     keep_opengl_out()
+    # Matrices are small here, and threads of the linear algebra would take the cores from those of
+    # the simulations: a match of twelve joints takes 6.8 s in place of 9.2 s on two cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:]))
 
 
