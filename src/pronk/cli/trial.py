@@ -125,7 +125,7 @@ def _trial_of_jumps(
     study: StudyOptions,
     output: OutputOptions,
 ) -> console.Outcome:
-    """Jump, film, walk and cross as asked for; print tables and write the page."""
+    """Jump, film, walk and cross by the options; print tables and write the page."""
     from pronk.jump.trial import tables
     from pronk.jump.trial.criteria import trial_checks
     from pronk.jump.trial.crossing import CrossingPlan, add_crossings
