@@ -1,7 +1,7 @@
 """How long targets may be held or limited: rules of the safety filter over several ticks.
 
 One tick that holds the last target, or limits it by torque, is no fault; a second of them is. The
-rules are functions at the end of this module, in the order in which they are asked.
+rules are functions at the end of this module, in the order in which they are applied.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The safety filter: judges every command before it is sent, and keeps the fault that lasts.
 
-The rules are asked in one order; the first that is met gives the reason:
+The rules are applied in one order; the first that is met gives the reason:
 
 1. `rules.apply_rules`: the states and the command of this tick against the limits. Without a fault
    it moves or holds the target where a limit asks for it.
@@ -141,7 +141,7 @@ class SafetyFilter:
         decision: Decision,
         limits: Limits,
     ) -> Decision:
-        """Ask the rules over several ticks; return their first fault, else `decision`."""
+        """Apply the rules over several ticks; return their first fault, else `decision`."""
         for state in states:
             self.sensors.observe(state)
             contradiction = find_contradiction(self.sensors, limits)
