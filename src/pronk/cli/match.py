@@ -187,18 +187,7 @@ def print_summary(result: MatchResult) -> None:
 def summary(result: MatchResult) -> dict[str, Any]:
     """Return the figures of a match for `--json`."""
     figures = result.to_dict()
-    return {
-        "robot": result.robot,
-        "virtual": result.virtual,
-        "joints": len(result.joints),
-        "matched": len(result.matched_joints),
-        "nominal_error_db": result.nominal_error_db,
-        "error_db": result.error_db,
-        "worst": result.worst_joint,
-        "flags": result.flags,
-        "gains": figures["joints"],
-        "groups": figures["groups"],
-    }
+    return result.summary() | {"gains": figures["joints"], "groups": figures["groups"]}
 
 
 def profiles() -> console.Outcome:

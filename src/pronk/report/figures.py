@@ -15,10 +15,10 @@ from matplotlib.patches import Ellipse, Patch, Rectangle
 from matplotlib.ticker import LogLocator, NullLocator
 from scipy import stats
 
-from pronk.arrays import Array, ComplexArray, Mask
+from pronk.arrays import Array, ComplexArray
 from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import MatchedGains
-from pronk.identify.match.plot import decibel
+from pronk.identify.match.plot import coherent_frequencies, decibel
 from pronk.identify.match.predict import JointPrediction
 from pronk.identify.match.result import JointResult, MatchResult
 from pronk.identify.response.response import FrequencyResponse
@@ -28,8 +28,6 @@ from pronk.report.style import Look, drawing, key, legend
 
 _LOWEST_HZ = 0.1
 """Lowest frequency that is drawn [Hz]."""
-_MIN_COHERENCE = 0.5
-"""Coherence below which a measured point is not drawn: it is mostly noise."""
 _CHI2_95 = float(stats.chi2.ppf(0.95, 2))
 """Squared radius of the 95 % ellipse of a bivariate normal distribution."""
 _AMPLITUDE_COLOURS = (style.MEASURED, style.MATCHED, style.NAIVE, style.ZERO_ARMATURE)
@@ -69,16 +67,9 @@ def compared_responses(joint: JointResult) -> ComparedResponses:
     return joint.responses
 
 
-def _drawn_frequencies(response: FrequencyResponse) -> Mask:
-    """Return which frequencies are drawn, shape (f,): all where none is coherent."""
-    positive = response.frequency_hz > 0.0
-    coherent = positive & (response.coherence >= _MIN_COHERENCE)
-    return coherent if coherent.any() else positive
-
-
 def _frequency_limits_hz(responses: Sequence[FrequencyResponse]) -> tuple[float, float]:
     """Return the lowest and the highest frequency that is drawn of some responses [Hz]."""
-    drawn_hz = [response.frequency_hz[_drawn_frequencies(response)] for response in responses]
+    drawn_hz = [response.frequency_hz[coherent_frequencies(response)] for response in responses]
     frequencies_hz = np.concatenate(drawn_hz)
     return max(_LOWEST_HZ, float(frequencies_hz.min())), float(frequencies_hz.max())
 
@@ -87,7 +78,7 @@ def _draw_measured(
     axes: Axes, response: FrequencyResponse, look: Look, *, shade: float, phase: bool
 ) -> None:
     """Draw the measured gain [dB] or phase [deg], and its 95 % interval shaded."""
-    drawn = _drawn_frequencies(response)
+    drawn = coherent_frequencies(response)
     if phase:
         lower, upper = np.degrees(response.phase_interval())
         middle = np.degrees(response.phase)
@@ -113,7 +104,7 @@ def _draw_panel(
     axes.axvspan(*responses.band_hz, color=style.BAND, zorder=0, linewidth=0)
     style.frequency_axis(axes, *_frequency_limits_hz([measured]))
     _draw_measured(axes, measured, style.MEASURED_LINE, shade=0.35, phase=phase)
-    drawn = _drawn_frequencies(measured)
+    drawn = coherent_frequencies(measured)
     for curve in curves:
         if phase:
             values = np.degrees(np.unwrap(np.angle(curve.response)))

@@ -49,7 +49,7 @@ def match_part(path: Path) -> Part:
         summary=summary,
         warning=matched < len(result.joints) or bool(result.flags),
         content=_content(result, compared, gains_path),
-        figures=_summary_figures(result),
+        figures=result.summary(),
     )
 
 
@@ -74,20 +74,6 @@ def find_gains(folder: Path) -> Path:
         return candidates[0]
     what = "several gains files and none is called" if candidates else "no"
     raise ArtefactError(f"{folder}: {what} gains.yaml; `pronk match LOG... --out` writes one.")
-
-
-def _summary_figures(result: MatchResult) -> dict[str, Any]:
-    """Return the numbers that `--json` writes of the page."""
-    return {
-        "robot": result.robot,
-        "virtual": result.virtual,
-        "joints": len(result.joints),
-        "matched": len(result.matched_joints),
-        "nominal_error_db": result.nominal_error_db,
-        "error_db": result.error_db,
-        "worst": result.worst_joint,
-        "flags": result.flags,
-    }
 
 
 def _content(

@@ -74,7 +74,7 @@ def plot_all_gains(responses: Mapping[str, ComparedResponses]) -> Figure:
 def draw_gain(axes: Axes, responses: ComparedResponses) -> None:
     """Draw measured gain with its 95 % interval and both simulated gains [dB]."""
     measured = responses.measured[0]
-    coherent = _coherent_frequencies(measured)
+    coherent = coherent_frequencies(measured)
     low, high = measured.gain_interval()
     shown_low = np.where(coherent, decibel(low), np.nan)
     shown_high = np.where(coherent, decibel(high), np.nan)
@@ -97,7 +97,7 @@ def draw_phase(axes: Axes, responses: ComparedResponses) -> None:
         "nominal gains": np.degrees(np.unwrap(np.angle(responses.nominal))),
         "matched gains": np.degrees(np.unwrap(np.angle(responses.matched))),
     }
-    _draw_curves(axes, responses, curves, _coherent_frequencies(measured))
+    _draw_curves(axes, responses, curves, coherent_frequencies(measured))
 
 
 def decibel(gain: Array | ComplexArray) -> Array:
@@ -120,7 +120,7 @@ def _draw_curves(
     axes.grid(color="#e3e3e3", linewidth=0.7)
 
 
-def _coherent_frequencies(response: FrequencyResponse) -> Mask:
+def coherent_frequencies(response: FrequencyResponse) -> Mask:
     """Return the frequencies that are drawn, shape (f,): all where none is coherent."""
     positive = response.frequency_hz > 0.0
     coherent = positive & (response.coherence >= MIN_COHERENCE)

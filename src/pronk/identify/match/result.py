@@ -266,6 +266,19 @@ class MatchResult:
                 errors[name] = joint.gains.quality.error_db
         return max(errors, key=errors.__getitem__, default="")
 
+    def summary(self) -> dict[str, Any]:
+        """Return how many joints were matched, the errors over all joints, and every flag."""
+        return {
+            "robot": self.robot,
+            "virtual": self.virtual,
+            "joints": len(self.joints),
+            "matched": len(self.matched_joints),
+            "nominal_error_db": self.nominal_error_db,
+            "error_db": self.error_db,
+            "worst": self.worst_joint,
+            "flags": self.flags,
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the match as a dictionary of numbers, text and dictionaries.
 
