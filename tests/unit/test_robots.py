@@ -64,7 +64,7 @@ def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
         ("mini_cheetah", "FR_hip_pitch", (0.0026, 17.0, 62.4, 40.0)),
         ("mini_cheetah", "FR_knee", (0.0063, 26.4, 97.1, 25.7)),
         ("go2", "FR_hip_pitch", (0.01, 23.7, 23.7, 30.1)),
-        ("go2", "FR_knee", (0.0225, 35.55, 35.55, 20.07)),
+        ("go2", "FR_knee", (0.036749, 45.43, 45.43, 15.70)),
     ],
 )
 def test_drives_have_the_published_figures(
