@@ -59,6 +59,20 @@ def check_size(path: Path, size: int, kind: type[PronkError]) -> None:
         )
 
 
+def check_regular(path: Path, kind: type[PronkError]) -> None:
+    """Refuse a pipe, a socket or a device, from which reading might never return.
+
+    Args:
+        path: The file; a folder and a path without a file pass.
+        kind: Class of the error.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise kind(
+            f"{path}: a pipe or a device and no regular file; write the data to a file and name "
+            "that."
+        )
+
+
 def check_archive(path: Path, kind: type[PronkError]) -> None:
     """Refuse a zip archive that claims to unpack to more than `max_bytes`.
 
@@ -94,6 +108,7 @@ def read_yaml(path: Path, kind: type[PronkError] = ArtefactError, missing: str =
         kind: Class of the error where it is missing or cannot be read.
         missing: What to do where there is no such file, for the message.
     """
+    check_regular(path, kind)
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_YAML_BYTES + 1)

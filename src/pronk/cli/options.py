@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
@@ -28,7 +28,8 @@ class Reading:
     time_unit: str | None = None
     """Unit of the timestamps: s, ms, us or ns."""
     columns: tuple[str, ...] = ()
-    """CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."""
+    """CSV: OURS=THEIRS, as in position.FR_knee=q3; a name or a number from 0; with commas between
+    several, or repeat it. Three columns without names are time, command, position of one joint."""
     joint_names: tuple[str, ...] = ()
     """THEIRS=OURS for joints of other names; repeat it."""
     joint_order: str | None = None
@@ -64,7 +65,7 @@ class Reading:
             joint_order=self.joint_order,
             drop_duplicates=self.drop_duplicates,
             scale=named_values("--scale", self.scale, float),
-            columns=named_values("--columns", self.columns, str),
+            columns=_columns(self.columns),
             measured_topic=self.measured_topic,
             command_topic=self.command_topic,
             command_field=self.command_field,
@@ -73,10 +74,27 @@ class Reading:
         return read_logs(paths, robot=robot, options=options, processes=os.cpu_count() or 1)
 
 
+def _columns(entries: Sequence[str]) -> Mapping[str, str] | Sequence[str]:
+    """Return the names of CSV columns by those of pronk, or names that stand alone."""
+    text = ",".join(entries)
+    if "=" not in text and text:
+        columns = [name.strip() for name in text.split(",")]
+        if not all(columns) or len(columns) < 2:
+            raise PronkError(
+                f"--columns {text!r}: expected NAME=VALUE, as in position.FR_knee=q3, or the "
+                "columns of time, command and position, as in 0,1,2."
+            )
+        return columns
+    return named_values("--columns", entries, str)
+
+
 def named_values(
     option: str, entries: Sequence[str], convert: Callable[[str], Value]
 ) -> dict[str, Value]:
-    """Return the values of a repeated option NAME=VALUE by name.
+    """Return the values of an option NAME=VALUE by name.
+
+    The option is repeated, or has commas between its values; a piece without an equals sign belongs
+    to the value before it.
 
     Args:
         option: The option, for the message.
@@ -86,8 +104,15 @@ def named_values(
     Raises:
         PronkError: An entry is not NAME=VALUE, or its value is impossible.
     """
-    values = {}
+    pieces: list[str] = []
     for entry in entries:
+        for position, piece in enumerate(entry.split(",")):
+            if position and "=" not in piece:
+                pieces[-1] += f",{piece}"
+            else:
+                pieces.append(piece)
+    values = {}
+    for entry in pieces:
         name, _, text = entry.partition("=")
         if not name or not text:
             raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")

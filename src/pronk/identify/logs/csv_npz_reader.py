@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,26 +14,15 @@ from pronk.arrays import Array
 from pronk.errors import LogError, printable
 from pronk.files import check_archive, check_size, sha256
 from pronk.identify.logs.columns import Columns, import_columns
+from pronk.identify.logs.csv_table import MAX_COLUMNS, CsvTable, read_table, read_text
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.options import ReadOptions
 from pronk.robots.robot import RobotSpec
 
 QUANTITIES = ("command", "position", "velocity", "torque")
 """Quantities of a joint: beginnings of column names, and names of arrays."""
-_MOST_COLUMNS = 4096
 _CELL_BYTES = 64
 """Memory that a cell of a CSV file takes, about [bytes]."""
-
-
-def read_text(path: Path) -> str:
-    """Read a text file, UTF-8 with or without byte order mark; a LogError if it is none."""
-    try:
-        check_size(path, path.stat().st_size, LogError)
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
-    except UnicodeDecodeError as error:
-        raise LogError(f"{path}: not text (byte {error.start} is not UTF-8).") from None
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -56,8 +45,8 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     if len(rows) < 2:
         raise LogError(f"{path}: {len(rows)} rows; expected a header and samples below it.")
     header = [name.strip() for name in rows[0]]
-    if len(header) > _MOST_COLUMNS:
-        raise LogError(f"{path}: {len(header)} columns; expected {_MOST_COLUMNS} at most.")
+    if len(header) > MAX_COLUMNS:
+        raise LogError(f"{path}: {len(header)} columns; expected {MAX_COLUMNS} at most.")
     for i, row in enumerate(rows[1:]):
         if len(row) != len(header):
             raise LogError(
@@ -68,18 +57,19 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
-    """Read a CSV file.
+    """Read a CSV file; `csv_table` says which forms of it are read.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
     [angle/s] and `torque.JOINT` [N m]; with torques, commands need not be there. A file with other
     names is read by `options.columns`, for instance
-    `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
+    `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`, and one without a header
+    by the numbers of its columns, from 0, as in `{"time": "0", "position.FR_knee": "2"}`.
 
     Raises:
-        LogError: A column is missing or a cell is no number; the message names column and row.
+        LogError: Columns are missing or a cell is no number; the message names columns and row.
     """
-    header, rows = read_rows(path)
-    names = _column_names(path, header, options)
+    table = read_table(path)
+    names = _column_names(table, robot, options)
     joints = []
     for name in names:
         quantity, _, joint = name.partition(".")
@@ -95,77 +85,99 @@ def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
             needed.append(f"command.{joint}")
     missing = [name for name in needed if name not in names]
     if missing:
-        raise LogError(
-            f"{path}: no column called {', '.join(missing)}; the header is {', '.join(header)}; "
-            f"say which it is with --columns {missing[0]}=NAME."
+        example = ",".join(
+            f"{name}={k if not table.header else 'NAME'}" for k, name in enumerate(missing)
         )
+        raise LogError(
+            f"{path}: no column called {', '.join(missing)}; {table.names}; say which they are "
+            f"with --columns {example} (a name, or the number of a column from 0), or "
+            f"`pronk log inspect {path}` guesses them."
+        )
+    indices: dict[str, int] = {}
+    absent = []
     for name, file_name in names.items():
-        if header.count(file_name) != 1:
-            count = "several columns" if file_name in header else "no column"
-            raise LogError(
-                f"{path}: {count} called {file_name!r} (for {name}); it has {', '.join(header)}."
-            )
+        index = table.index(file_name)
+        if index is None:
+            absent.append(f"{file_name!r} (for {name})")
+        else:
+            indices[name] = index
+    if absent:
+        raise LogError(
+            f"{path}: no column called {', '.join(absent)}; {table.names}, and the columns have "
+            f"the numbers 0 to {table.width - 1}; `pronk log inspect {path}` guesses which is "
+            "which."
+        )
     arrays: dict[str, Array] = {}
     for quantity in QUANTITIES:
         column_names = [f"{quantity}.{joint}" for joint in joints]
         if names.keys() >= set(column_names):
-            columns = [_column(path, header, rows, names[name]) for name in column_names]
+            columns = [table.numbers(indices[name]) for name in column_names]
             arrays[quantity] = np.stack(columns, axis=1)
+    time, is_date = table.timestamps(indices["time"])
+    if is_date and options.time_unit not in (None, "s"):
+        raise LogError(
+            f"{path}: --time-unit {options.time_unit}, but the times are dates or times of day; "
+            "leave the option out."
+        )
     columns_of_file = Columns(
         origin=LogOrigin(source=str(path), sha256=sha256(path)),
         joints=tuple(joints),
-        time=_column(path, header, rows, names["time"]),
+        time=time,
         command=arrays.get("command"),
         position=arrays["position"],
         velocity=arrays.get("velocity"),
         torque=arrays.get("torque"),
-        row=lambda sample: f"row {sample + 2}",
+        row=lambda sample: f"row {table.lines[sample]}",
+        notes=table.notes,
     )
     return import_columns(columns_of_file, robot, options)
 
 
-def _column_names(path: Path, header: list[str], options: ReadOptions) -> dict[str, str]:
+def _column_names(table: CsvTable, robot: RobotSpec | None, options: ReadOptions) -> dict[str, str]:
     """Names of the columns in the file by those of pronk: stated ones, or their own."""
     stated = options.columns or {}
+    if not isinstance(stated, Mapping):
+        stated = _columns_of_one_joint(table.path, stated, robot, options)
     for name in stated:
         if not _is_column_name(name):
             raise LogError(
-                f"{path}: --columns names {name!r}; expected time, or a quantity and a joint, for "
-                f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
+                f"{table.path}: --columns names {name!r}; expected time, or a quantity and a "
+                f"joint, for instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
             )
     names = {}
-    for name in header:
+    for name in table.header:
         if _is_column_name(name) and name not in stated.values():
             names[name] = name
     names.update(stated)
     return names
 
 
+def _columns_of_one_joint(
+    path: Path, columns: Sequence[str], robot: RobotSpec | None, options: ReadOptions
+) -> dict[str, str]:
+    """Names by those of pronk for columns that are given in the order time, command, position."""
+    order = options.joint_order
+    joints = list(robot.joint_names) if robot is not None else ["joint"]
+    if order not in (None, "default"):
+        joints = order.split(",") if isinstance(order, str) else list(order or ())
+    if len(columns) != 3 or len(joints) != 1:
+        example = ",".join(f"position.{joint}=NAME" for joint in joints[:2])
+        raise LogError(
+            f"{path}: --columns {','.join(columns)} without names; expected the three columns "
+            "time, command and position of one joint, which --joint-order NAME names; otherwise "
+            f"name each of them, as in --columns time=NAME,command.{joints[0]}=NAME,{example}."
+        )
+    return {
+        "time": columns[0],
+        f"command.{joints[0]}": columns[1],
+        f"position.{joints[0]}": columns[2],
+    }
+
+
 def _is_column_name(name: str) -> bool:
     """Return True for `time`, and for a quantity and a joint with a dot between them."""
     quantity, _, joint = name.partition(".")
     return name == "time" or (quantity in QUANTITIES and bool(joint))
-
-
-def _column(path: Path, header: list[str], rows: list[list[str]], name: str) -> Array:
-    """Numbers of one column, shape (n,)."""
-    index = header.index(name)
-    values = np.array([_number(row[index]) for row in rows])
-    bad_rows = np.flatnonzero(~np.isfinite(values))
-    if len(bad_rows):
-        cell = rows[bad_rows[0]][index]
-        raise LogError(
-            f"{path}: row {bad_rows[0] + 2} holds {cell[:40]!r} in column {name!r}; expected a "
-            "finite number; repair or remove that row."
-        )
-    return values
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
 
 
 def read_npz(path: Path, robot: RobotSpec | None, options: ReadOptions) -> JointLog:
@@ -245,8 +257,8 @@ def _load_arrays(path: Path) -> tuple[dict[str, NDArray[np.generic]], list[str]]
 
 def _text(path: Path, array: NDArray[np.generic]) -> tuple[str, ...]:
     """Names in an array of text."""
-    if array.size > _MOST_COLUMNS:
-        raise LogError(f"{path}: {array.size} joints; expected {_MOST_COLUMNS} at most.")
+    if array.size > MAX_COLUMNS:
+        raise LogError(f"{path}: {array.size} joints; expected {MAX_COLUMNS} at most.")
     try:
         names = np.ascontiguousarray(array.reshape(-1), dtype=str)
     except (TypeError, ValueError):

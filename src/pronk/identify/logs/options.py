@@ -46,8 +46,9 @@ class ReadOptions:
     scale: Mapping[str, float] | None = None
     """Radians per unit of the joints whose position is on another scale, by (new) joint name. It
     holds for the command and the position; the velocity is left as it is."""
-    columns: Mapping[str, str] | None = None
-    """The CSV file's own column names by those of pronk, as in `{"position.FR_knee": "q3"}`."""
+    columns: Mapping[str, str] | Sequence[str] | None = None
+    """The CSV file's own column names, or numbers from 0, by those of pronk, as in
+    `{"position.FR_knee": "q3"}`; or those of time, command and position of a single joint."""
     measured_topic: str | None = None
     """Topic of the measured JointStates in a rosbag2; `/joint_states` if None."""
     command_topic: str | None = None

@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from pronk.errors import LogError, PronkError
+from pronk.files import check_regular
 from pronk.identify.logs.checks import (
     check_radians,
     check_rate,
@@ -58,7 +59,12 @@ _BUILT_IN = (
         read=read_mcap,
         options=("measured_topic", "command_topic", "command_field", "joint_order"),
     ),
-    Reader(name="csv", suffixes=(".csv",), read=read_csv, options=("columns", *COLUMN_OPTIONS)),
+    Reader(
+        name="csv",
+        suffixes=(".csv", ".csv.gz"),
+        read=read_csv,
+        options=("columns", *COLUMN_OPTIONS),
+    ),
     Reader(name="sage", suffixes=(), read=read_sage, options=COLUMN_OPTIONS),
     Reader(name="pace", suffixes=(".pt",), read=read_pace, options=COLUMN_OPTIONS),
     Reader(name="npz", suffixes=(".npz",), read=read_npz, options=COLUMN_OPTIONS),
@@ -118,6 +124,7 @@ def read_log(
         RobotError: The robot has no such joint; the message lists those it has.
     """
     path = Path(path)
+    check_regular(path, LogError)
     stated = ReadOptions() if options is None else options
     by_format = readers()
     format_name = stated.format or _format_of(path, by_format)
@@ -128,6 +135,7 @@ def read_log(
         if len(files) != 1:
             raise LogError(f"{path}: {len(files)} MCAP files in it; name the one to read.")
         path = files[0]
+        check_regular(path, LogError)
     reader = by_format[format_name]
     foreign_options = [name for name in stated.stated() if name not in reader.options]
     if foreign_options:
@@ -216,7 +224,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
         logs_inside = []
         for entry in sorted(path.iterdir()):
             is_artefact = f"/{entry.name}".endswith(_ARTEFACT_ENDINGS)
-            if is_sage(entry) or (entry.suffix.lower() in suffixes and not is_artefact):
+            if is_sage(entry) or (_ending(entry) in suffixes and not is_artefact):
                 logs_inside.append(entry)
         if not logs_inside:
             raise LogError(
@@ -251,10 +259,16 @@ def _format_of(path: Path, by_format: Mapping[str, Reader]) -> str:
             "joint_list.txt) and no MCAP file in it."
         )
     formats = _formats_by_suffix(by_format)
-    suffix = path.suffix.lower()
+    suffix = _ending(path)
     if suffix not in formats:
         raise LogError(
-            f"{path}: the ending {path.suffix!r} names no known format; expected "
+            f"{path}: the ending {suffix!r} names no known format; expected "
             f"{', '.join(formats)} or a SAGE folder, or a format, one of {', '.join(by_format)}."
         )
     return formats[suffix]
+
+
+def _ending(path: Path) -> str:
+    """Ending of a file's name in lower case, with what stands before `.gz`."""
+    endings = [suffix.lower() for suffix in path.suffixes]
+    return "".join(endings[-2:] if endings[-1:] == [".gz"] else endings[-1:])

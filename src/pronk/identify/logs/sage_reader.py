@@ -17,7 +17,8 @@ from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.identify.logs.columns import Columns, command_index, import_columns
-from pronk.identify.logs.csv_npz_reader import read_rows, read_text
+from pronk.identify.logs.csv_npz_reader import read_rows
+from pronk.identify.logs.csv_table import read_text
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.options import ReadOptions
 from pronk.robots.robot import RobotSpec
