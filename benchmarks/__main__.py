@@ -14,6 +14,7 @@ SUMMARIES = {
     "engine": "The same drive at 0.25 ms and at 5 ms.",
     "coverage": "How often the 95 % intervals hold.",
     "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
+    "plan": "The forecast of a sweep beside plain MuJoCo.",
     "latency": "Lateness of the control loop, and policy latency.",
     "supervision": "False alarms and detection times of the sensors' supervision.",
     "sensor-faults": "From a sensor's fault to damping, over LCM and DDS in real time.",

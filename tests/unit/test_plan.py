@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from plain_mujoco import peaks_in_mujoco
 from pronk.errors import PlanError, RobotError
 from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp, Signal
 from pronk.identify.excitation.worst_case import Forecast, Uncertainty, forecast
 from pronk.robots import load_robot
+from sized_joint import JOINT, SIZES, Size, sized_robot
 
 ROBOT = load_robot("mini_cheetah")
 SHORT = Chirp(length_s=4.0, stop_hz=15.0)
@@ -22,7 +25,7 @@ DAMPING = {joint.name: joint.damping for joint in ROBOT.joints}
 
 
 def forecasts(joint: str, signal: Signal, **options: Any) -> dict[str, Forecast]:
-    chain_forecasts = forecast(
+    chain_forecasts, _ = forecast(
         ROBOT,
         joint,
         signal.samples(50.0),
@@ -165,3 +168,57 @@ def test_impossible_plans_are_refused(
 ) -> None:
     with pytest.raises(error, match=words):
         make_plan(ROBOT, joints, **options)
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_the_forecast_has_the_peaks_of_plain_mujoco(name: str, tmp_path: Path) -> None:
+    robot = sized_robot(SIZES[name], tmp_path)
+    # Commands at 60 Hz: a tick is no whole number of milliseconds.
+    for rate_hz in (50.0, 60.0):
+        robot = replace(robot, policy_rate_hz=rate_hz)
+        plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.05,), repeats=1)
+        plan.check()
+        (row,) = plan.rows()
+        peaks = peaks_in_mujoco(robot, JOINT, replace(SHORT, amplitude=0.05).samples(rate_hz))
+        pose = robot.joint(JOINT).default_position
+        highest = float(row["nominal_highest_rad"])
+        lowest = float(row["nominal_lowest_rad"])
+        assert row["nominal_torque_nm"] == pytest.approx(peaks.torque, rel=0.05)
+        assert row["nominal_speed_rad_s"] == pytest.approx(peaks.speed, rel=0.05)
+        assert max(highest - pose, pose - lowest) == pytest.approx(peaks.reach, rel=0.05)
+        # The worst case holds what the model does.
+        assert row["torque_nm"] >= row["nominal_torque_nm"]
+        assert row["highest_rad"] >= highest
+
+
+def test_a_held_joint_stays_still_beside_a_stiff_one(tmp_path: Path) -> None:
+    robot = sized_robot(SIZES["wrist of a stiff arm"], tmp_path)
+    plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.005,), repeats=1)
+    plan.check()
+    (held,) = [worst for worst in plan.forecasts if worst.joint != JOINT]
+    assert held.excited == JOINT
+    assert held.speed < 0.5
+    assert held.highest - held.lowest < 0.01
+
+
+@pytest.mark.parametrize("effort_limit", [30.0, 1.5])
+def test_small_amplitudes_that_fit_are_found(effort_limit: float, tmp_path: Path) -> None:
+    """Of a step of the command the drive needs nearly the stiffness times its height."""
+    size = replace(SIZES["wrist of a stiff arm"], effort_limit=effort_limit)
+    robot = sized_robot(size, tmp_path)
+    plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.25,), repeats=1)
+    fitting = plan.fitting_amplitude(JOINT)
+    assert 0.1 * effort_limit / size.stiffness < fitting < effort_limit / size.stiffness
+    with pytest.raises(PlanError, match=f"{fitting:.3g} rad fits"):
+        plan.check()
+    make_plan(robot, [JOINT], SHORT, amplitudes=(fitting,), repeats=1).check()
+    with pytest.raises(PlanError):
+        make_plan(robot, [JOINT], SHORT, amplitudes=(1.1 * fitting,), repeats=1).check()
+
+
+def test_gains_that_no_step_can_follow_are_said_to_be_so(tmp_path: Path) -> None:
+    undamped = Size(mass=0.001, length=0.01, stiffness=2000.0, damping=0.0001, effort_limit=1e4)
+    robot = sized_robot(undamped, tmp_path)
+    with pytest.raises(PlanError, match="cannot be forecast") as caught:
+        make_plan(robot, [JOINT], Chirp(length_s=1.0, stop_hz=15.0), repeats=1)
+    assert "2000 / 0.0001" in str(caught.value)

@@ -7,7 +7,7 @@ robot in any corner of the robot's uncertainty, and names the amplitude that wou
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,9 +19,12 @@ from pronk.robots.robot import RobotSpec
 
 POSE_RAMP_S = 2.0
 """Time to move softly to the pose before the excitations of a joint [s]."""
-_BISECTIONS = 6
-"""Halvings of the interval in which an amplitude that fits is searched: to 1.6 % of the amplitude
-that is too large."""
+_STILL = 1e-6
+"""Share of an amplitude that stands for none: the joints are held in their pose."""
+_CLOSE = 1.04
+"""Ratio of an amplitude that is too large to one that fits at which the search for it ends."""
+_MOST_FORECASTS = 25
+"""Forecasts of the search for an amplitude, at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +69,8 @@ class SweepPlan:
     forecasts: tuple[Forecast, ...] = ()
     """Worst case of the loudest excitation of each joint, for it and its neighbours, over every
     corner of the uncertainty; quieter ones of the same signal stay inside."""
+    timestep_s: Mapping[str, float] = field(default_factory=dict)
+    """Physics step of the forecast of each excited joint [s]."""
 
     @property
     def pose(self) -> Array:
@@ -88,11 +93,15 @@ class SweepPlan:
         return excited_s + len(self.joints) * (POSE_RAMP_S + 2.0 * self.settle_s)
 
     def rows(self) -> list[dict[str, str | float]]:
-        """Return the worst case of each excited joint, one row a joint, for JSON."""
+        """Return the worst case of each excited joint, one row a joint, for JSON.
+
+        Entries with `nominal` are of the model as it is, without uncertainty.
+        """
         rows: list[dict[str, str | float]] = []
         for worst in self.forecasts:
             if worst.amplitude == 0.0:
                 continue
+            nominal = worst.nominal or worst
             rows.append(
                 {
                     "joint": worst.joint,
@@ -109,6 +118,11 @@ class SweepPlan:
                     "mechanical_power_w": worst.mechanical_power,
                     "electrical_power_w": worst.electrical_power,
                     "bus_current_a": worst.bus_current,
+                    "nominal_lowest_rad": nominal.lowest,
+                    "nominal_highest_rad": nominal.highest,
+                    "nominal_speed_rad_s": nominal.speed,
+                    "nominal_torque_nm": nominal.torque,
+                    "timestep_s": self.timestep_s[worst.joint],
                 }
             )
         return rows
@@ -124,14 +138,12 @@ class SweepPlan:
             breach = next(worst.breaches(), "")
             if not breach:
                 continue
-            # The forecasts are of the largest amplitude, which comes first.
-            loudest = next(
-                excitation for excitation in self.excitations if excitation.joint == worst.excited
-            )
-            fitting_rad = self._fitting_amplitude(loudest)
-            way_out = "no amplitude fits, so choose other joints or another pose"
+            loudest = self._loudest(worst.excited)
+            fitting_rad = self.fitting_amplitude(worst.excited)
             if fitting_rad > 0.0:
                 way_out = f"an amplitude of {fitting_rad:.3g} rad fits"
+            else:
+                way_out = "no amplitude fits, so choose other joints or another pose"
             raise PlanError(
                 f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
                 f"could {breach} (inertia, gains and friction uncertain by "
@@ -139,33 +151,75 @@ class SweepPlan:
                 f"{100 * self.uncertainty.friction:.0f} %); {way_out}."
             )
 
-    def _fitting_amplitude(self, excitation: PlannedExcitation) -> float:
-        """Find the largest amplitude that fits by bisection [rad]; 0 if none does."""
-        fitting = 0.0
+    def fitting_amplitude(self, joint: str) -> float:
+        """Find the largest amplitude of a joint's signal that exceeds no limit.
+
+        Args:
+            joint: Name of an excited joint.
+
+        Returns:
+            The amplitude [rad], at most that of the plan, with three digits and within 5 % of the
+            largest; 0 where the joints exceed a limit even as they hold their pose.
+        """
+        excitation = self._loudest(joint)
+        forecasts = [worst for worst in self.forecasts if worst.excited == joint]
+        if not _exceeds(forecasts):
+            return excitation.signal.amplitude
+        if _exceeds(self._at_share(excitation, _STILL)):
+            return 0.0
+        fitting = _STILL
         too_large = 1.0
-        for _ in range(_BISECTIONS):
-            share = 0.5 * (fitting + too_large)
-            signal = replace(excitation.signal, amplitude=share * excitation.signal.amplitude)
-            if self._exceeds(replace(excitation, signal=signal)):
+        # Motion grows about as the amplitude does.
+        share = 0.98 / max(_linear_share(worst) for worst in forecasts)
+        for _ in range(_MOST_FORECASTS):
+            if not fitting < share < too_large:
+                share = (fitting * too_large) ** 0.5
+            forecasts = self._at_share(excitation, share)
+            if _exceeds(forecasts):
                 too_large = share
+                share = 0.9 * share
             else:
                 fitting = share
+                share = share / max(_linear_share(worst) for worst in forecasts)
+                share = min(max(share, _CLOSE * fitting), 0.5 * (fitting + too_large))
+            if too_large <= _CLOSE * fitting:
+                break
         amplitude = fitting * excitation.signal.amplitude
         # Three significant digits.
-        scale = 10.0 ** (np.floor(np.log10(amplitude or 1.0)) - 2)
+        scale = 10.0 ** (np.floor(np.log10(amplitude)) - 2)
         return float(np.floor(amplitude / scale * (1.0 + 1e-12)) * scale)
 
-    def _exceeds(self, excitation: PlannedExcitation) -> bool:
-        """Return True if a joint could exceed a limit during an excitation."""
-        breaches: list[str] = []
-        for worst in self._worst(excitation, {}):
-            breaches += worst.breaches()
-        return len(breaches) > 0
+    def _loudest(self, joint: str) -> PlannedExcitation:
+        """Return the excitation of a joint that is forecast: its first one."""
+        for excitation in self.excitations:
+            if excitation.joint == joint:
+                return excitation
+        raise PlanError(f"the plan does not excite {joint}; it excites {', '.join(self.joints)}.")
+
+    def _at_share(self, excitation: PlannedExcitation, share: float) -> list[Forecast]:
+        """Forecast a share of an excitation."""
+        signal = replace(excitation.signal, amplitude=share * excitation.signal.amplitude)
+        forecasts, _ = self._worst(
+            replace(excitation, signal=signal), {}, self.timestep_s[excitation.joint]
+        )
+        return forecasts
 
     def _worst(
-        self, excitation: PlannedExcitation, cache: dict[tuple[object, ...], list[Forecast]]
-    ) -> list[Forecast]:
-        """Forecast every joint of the chain; mirror-image legs are simulated once."""
+        self,
+        excitation: PlannedExcitation,
+        cache: dict[tuple[object, ...], tuple[list[Forecast], float]],
+        timestep_s: float | None = None,
+    ) -> tuple[list[Forecast], float]:
+        """Forecast every joint of the chain; mirror-image legs are simulated once.
+
+        Args:
+            excitation: The excitation.
+            cache: Forecasts that were made, which is added to.
+            timestep_s: Physics step [s]; one at which the peaks have converged if None.
+
+        Returns:
+            The forecasts, and the physics step [s].
+        """
         robot = self.robot
         excited = robot.joint(excitation.joint)
         original_name, sign = excited.original
@@ -191,12 +245,27 @@ class SweepPlan:
                 stiffness=stiffness,
                 damping=damping,
                 uncertainty=self.uncertainty,
+                timestep_s=timestep_s,
             )
+        simulated_forecasts, timestep_s = cache[key]
         forecasts = []
-        for simulated in cache[key]:
+        for simulated in simulated_forecasts:
             mirrored = simulated.mirrored(robot, names[simulated.joint])
-            forecasts.append(replace(mirrored, excited=excitation.joint))
-        return forecasts
+            forecasts.append(mirrored.of_excitation(excitation.joint))
+        return forecasts, timestep_s
+
+
+def _exceeds(forecasts: Sequence[Forecast]) -> bool:
+    """Tell whether a joint could exceed a limit."""
+    breaches: list[str] = []
+    for worst in forecasts:
+        breaches += worst.breaches()
+    return len(breaches) > 0
+
+
+def _linear_share(worst: Forecast) -> float:
+    """Return the share of the limits of torque and speed that a joint uses, at standstill."""
+    return max(worst.torque / worst.effort_limit, worst.speed / worst.no_load_speed, 1e-9)
 
 
 def make_plan(
@@ -280,9 +349,12 @@ def make_plan(
         damping=damping,
         uncertainty=Uncertainty() if uncertainty is None else uncertainty,
     )
-    cache: dict[tuple[object, ...], list[Forecast]] = {}
+    cache: dict[tuple[object, ...], tuple[list[Forecast], float]] = {}
     forecasts: list[Forecast] = []
+    timestep_by_joint = {}
     for excitation in excitations:
         if excitation.repeat == 0 and excitation.signal.amplitude == max(amplitudes):
-            forecasts += plan._worst(excitation, cache)
-    return replace(plan, forecasts=tuple(forecasts))
+            joint_forecasts, timestep_s = plan._worst(excitation, cache)
+            forecasts += joint_forecasts
+            timestep_by_joint[excitation.joint] = timestep_s
+    return replace(plan, forecasts=tuple(forecasts), timestep_s=timestep_by_joint)
