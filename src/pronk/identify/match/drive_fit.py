@@ -43,11 +43,18 @@ from pronk.identify.match.least_squares import (
     EVALUATIONS,
     DriveVector,
     Optimum,
+    Ranges,
     Residuals,
     minimize_residuals,
 )
 from pronk.identify.match.nominal_gains import gains_on_drive
-from pronk.identify.match.parameters import GAINS, PARAMETERS, checked_names
+from pronk.identify.match.parameters import (
+    GAINS,
+    PARAMETERS,
+    SearchRange,
+    checked_names,
+    search_range,
+)
 from pronk.identify.match.recordings import training_samples
 from pronk.identify.match.replay import Replay
 from pronk.identify.match.result import HELD_OUT, DriveFit, amplitude_flags, held_out_flags
@@ -79,6 +86,12 @@ BLIND_RATIO = 0.07
 together. Finite differences of 2 to 3 % leave about as much of a direction without any effect: on
 sweeps of the virtual robot it is 0.02 where stiffness, damping and armature are fitted together,
 and 0.1 to 0.3 where one of them is known."""
+NEGLIGIBLE_FRICTION = 0.05
+"""Dry friction, over stiffness times amplitude, below which it need not be known any better: a
+relay of that share changes the response outside of the resonance by less than 0.3 dB."""
+NOT_WORSE = 0.01
+"""Error on the held-out samples that a match may have beside that of less fitting, as a share of
+the amplitude of the command: 0.1 dB, a tenth of what counts as no match."""
 BLIND_SHARE = 0.3
 """Component of such a direction from which on a parameter takes part in it."""
 
@@ -121,7 +134,8 @@ def fit_drives(
     held_names: dict[str, tuple[str, ...]] = dict.fromkeys(replay.joints, ())
     everything = [np.ones(len(recording.time), dtype=bool) for recording in replay.recordings]
 
-    best = _fit_from_nominal(replay, everything, free, nominal)
+    ranges = search_ranges(replay, nominal)
+    best = _fit_from_nominal(replay, everything, free, nominal, ranges)
     while True:
         estimates = _estimates(best)
         not_known = _parameters_to_hold(best, estimates, held_names, unidentified)
@@ -133,9 +147,10 @@ def fit_drives(
             held_names[joint] = (*held_names[joint], name)
             start[joint][name] = nominal[joint][name]
             fitted[joint] = tuple(other for other in fitted[joint] if other != name)
-        best = minimize_residuals(Residuals(replay, everything, DriveVector(fitted, start)))
+        vector = DriveVector(fitted, start, ranges)
+        best = minimize_residuals(Residuals(replay, everything, vector))
 
-    held_out = _held_out_errors(replay, best, nominal)
+    held_out = _held_out_errors(replay, best, nominal, ranges)
     fits = {}
     for joint in replay.joints:
         fits[joint] = _drive_fit(
@@ -154,6 +169,32 @@ def nominal_drives(
         stiffness, damping = gains_on_drive(log, joint, robot)
         drives[joint] = published(robot, joint) | {"stiffness": stiffness, "damping": damping}
     return drives
+
+
+def search_ranges(replay: Replay, nominal: DriveValues) -> dict[str, dict[str, SearchRange]]:
+    """Return where the parameters of each joint are searched, by the size of the joint.
+
+    Args:
+        replay: Recordings, whose largest amplitude counts. Where joints moved together, half of
+            the largest travel of the position stands for it.
+        nominal: All parameters of each joint.
+    """
+    ranges: dict[str, dict[str, SearchRange]] = {}
+    for joint in replay.joints:
+        amplitude = 0.0
+        for recording in replay.recordings:
+            if recording.joint != joint:
+                continue
+            size = recording.amplitude
+            if np.isnan(size):
+                size = 0.5 * float(np.ptp(recording.position))
+            amplitude = max(amplitude, size)
+        torque_scale = nominal[joint]["stiffness"] * amplitude
+        ranges[joint] = {}
+        for name in PARAMETERS:
+            if name in nominal[joint]:
+                ranges[joint][name] = search_range(name, nominal[joint][name], torque_scale)
+    return ranges
 
 
 class CountedReplay(Replay):
@@ -189,6 +230,7 @@ def _fit_from_nominal(
     samples: Sequence[Mask],
     fitted: Mapping[str, Sequence[str]],
     nominal: DriveValues,
+    ranges: Ranges,
 ) -> Optimum:
     """Fit from the nominal drive with the best delay, and again where that settles badly.
 
@@ -197,11 +239,11 @@ def _fit_from_nominal(
     `OTHER_STARTS` too, and the best counts.
     """
     delay = _restricted(fitted, ["delay"])
-    vector = DriveVector(delay, _raised(nominal, delay))
+    vector = DriveVector(delay, _raised(nominal, delay, ranges), ranges)
     delayed = minimize_residuals(Residuals(replay, samples, vector))
     undelayed = _restricted(fitted, [name for name in PARAMETERS if name != "delay"])
-    start = _raised(delayed.drives(), undelayed)
-    best = minimize_residuals(Residuals(replay, samples, DriveVector(fitted, start)))
+    start = _raised(delayed.drives(), undelayed, ranges)
+    best = minimize_residuals(Residuals(replay, samples, DriveVector(fitted, start, ranges)))
     at_bound = any(best.at_bound(joint) for joint in fitted)
     if best.settled and not at_bound and best.cost < SETTLED_WELL**2 * delayed.cost:
         return best
@@ -210,7 +252,7 @@ def _fit_from_nominal(
         for joint, names in _restricted(fitted, GAINS).items():
             for name in names:
                 other_start[joint][name] *= factor
-        vector = DriveVector(fitted, other_start)
+        vector = DriveVector(fitted, other_start, ranges)
         optimum = minimize_residuals(Residuals(replay, samples, vector))
         if optimum.cost < best.cost:
             best = optimum
@@ -228,14 +270,14 @@ def _restricted(
 
 
 def _raised(
-    drives: DriveValues, fitted: Mapping[str, Sequence[str]]
+    drives: DriveValues, fitted: Mapping[str, Sequence[str]], ranges: Ranges
 ) -> dict[str, dict[str, float]]:
-    """Raise fitted parameters to `Parameter.start` where they are smaller (step 1)."""
+    """Raise fitted parameters to where their search begins where they are smaller (step 1)."""
     raised = {}
     for joint, values in drives.items():
         raised[joint] = dict(values)
         for name in fitted.get(joint, ()):
-            raised[joint][name] = max(raised[joint][name], PARAMETERS[name].start)
+            raised[joint][name] = max(raised[joint][name], ranges[joint][name].start)
     return raised
 
 
@@ -292,6 +334,8 @@ def _parameters_to_hold(
     early = False
     for joint, joint_estimate in estimates.items():
         names = list(joint_estimate.unidentified)
+        if "frictionloss" in names and negligible_friction(optimum, joint, joint_estimate):
+            names.remove("frictionloss")
         if unidentified == "refuse":
             for name in _confused_parameters(optimum, joint):
                 if name not in names:
@@ -359,7 +403,7 @@ def _confused_parameters(optimum: Optimum, joint: str) -> list[str]:
 
 
 def _held_out_errors(
-    replay: Replay, best: Optimum, nominal: DriveValues
+    replay: Replay, best: Optimum, nominal: DriveValues, ranges: Ranges
 ) -> dict[str, dict[str, float]]:
     """Errors of each joint on the samples that are kept out of the fit [rad], by `HELD_OUT`.
 
@@ -377,7 +421,7 @@ def _held_out_errors(
             start[joint] = dict(nominal[joint])
             for name in names:
                 start[joint][name] = best_drives[joint][name]
-        residuals = Residuals(replay, training, DriveVector(chosen, start))
+        residuals = Residuals(replay, training, DriveVector(chosen, start, ranges))
         drives.append(minimize_residuals(residuals).drives())
     judge = Residuals(replay, judging, best.vector)
     errors: dict[str, dict[str, float]] = {}
@@ -417,12 +461,27 @@ def _drive_fit(
         nominal_rmse=residuals.rmse(nominal_residual, joint),
         settled=best.settled,
         flags=(
-            *held_out_flags(held_out),
+            *worse_than_less_fitting(held_out, float(np.max(residuals.amplitude))),
             *_parameter_flags(joint, best, joint_estimate, held_names),
             *residuals.replay.remarks(joint),
             *amplitude_flags(by_amplitude),
         ),
     )
+
+
+def worse_than_less_fitting(held_out: Mapping[str, float], amplitude: float) -> tuple[str, ...]:
+    """Warn of a match that is worse on what was held out than less fitting, where it matters.
+
+    Args:
+        held_out: Error of each of `HELD_OUT` [rad]; empty where nothing was held out.
+        amplitude: Largest amplitude of the command [rad]; NaN where joints moved together.
+    """
+    if held_out and not np.isnan(amplitude):
+        best = min(held_out.values())
+        excess = np.sqrt(held_out["matched"] ** 2 - best**2)
+        if excess < NOT_WORSE * amplitude:
+            return ()
+    return held_out_flags(held_out)
 
 
 def _parameter_flags(
@@ -437,11 +496,12 @@ def _parameter_flags(
             f"{PARAMETERS[name].remedy}"
         )
     at_bound = best.at_bound(joint)
+    negligible = negligible_friction(best, joint, joint_estimate)
     for name in at_bound:
         unit = PARAMETERS[name].unit
         flags.append(f"{name} at the bound of the search, {values[name]:.3g} {unit}")
     for name in joint_estimate.unidentified:
-        if name not in at_bound:
+        if name not in at_bound and not (name == "frictionloss" and negligible):
             flags.append(
                 f"{name} is not identified (deviation {joint_estimate.sd[name]:.2g}); "
                 f"{PARAMETERS[name].remedy}"
@@ -454,6 +514,21 @@ def _parameter_flags(
     if not best.settled:
         flags.append("the fit in time did not settle")
     return flags
+
+
+def negligible_friction(best: Optimum, joint: str, joint_estimate: Estimate) -> bool:
+    """Tell whether the dry friction of a joint that moved alone is too little to matter.
+
+    Its relative deviation says nothing then: of a joint without friction it is large, although the
+    friction is known to be next to nothing. Its value and two deviations are compared with the
+    torque that the largest command asks for.
+    """
+    amplitude = float(np.max(best.residuals.amplitude))
+    if "frictionloss" not in joint_estimate.sd or np.isnan(amplitude):
+        return False
+    values = joint_estimate.values
+    largest = values["frictionloss"] * (1.0 + 2.0 * joint_estimate.sd["frictionloss"])
+    return largest < NEGLIGIBLE_FRICTION * values["stiffness"] * amplitude
 
 
 def _gains_by_amplitude(joint: str, best: Optimum) -> Array:

@@ -9,9 +9,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pronk.arrays import Array, Mask
-from pronk.identify.match.parameters import PARAMETERS
+from pronk.identify.match.parameters import PARAMETERS, SearchRange
 from pronk.identify.match.replay import Replay
 from pronk.identify.simulators.chain import DriveValues
+
+Ranges = Mapping[str, Mapping[str, SearchRange]]
+"""Where each parameter of each joint is searched."""
 
 TOLERANCE = 1e-3
 """Relative change of the cost or of the parameters that ends a search: far below the intervals."""
@@ -26,12 +29,19 @@ AT_BOUND = 1e-3
 class DriveVector:
     """The numbers that a search moves, and the drives that they stand for."""
 
-    def __init__(self, fitted: Mapping[str, Sequence[str]], start: DriveValues) -> None:
+    def __init__(
+        self,
+        fitted: Mapping[str, Sequence[str]],
+        start: DriveValues,
+        ranges: Ranges | None = None,
+    ) -> None:
         """Choose what is searched.
 
         Args:
             fitted: Names of the fitted parameters of each joint. The delay is one for all joints.
             start: All parameters of each joint; the fitted ones where the search begins.
+            ranges: Where the parameters of each joint are searched; the bounds of `PARAMETERS`
+                where a joint is missing.
         """
         self.fitted = fitted
         self.start = start
@@ -51,9 +61,14 @@ class DriveVector:
                 self.columns[joint].append(len(self.names))
                 self.names.append(name)
                 parameter = PARAMETERS[name]
-                begin.append(parameter.scaled(max(start[joint][name], parameter.low)))
-                low.append(parameter.scaled(parameter.low))
-                high.append(parameter.scaled(parameter.high))
+                lowest = parameter.low
+                highest = parameter.high
+                if ranges is not None and joint in ranges:
+                    lowest = ranges[joint][name].low
+                    highest = ranges[joint][name].high
+                begin.append(parameter.scaled(max(start[joint][name], lowest)))
+                low.append(parameter.scaled(lowest))
+                high.append(parameter.scaled(highest))
         self.low = np.array(low)
         """Lower bounds, shape (p,)."""
         self.high = np.array(high)

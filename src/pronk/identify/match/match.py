@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -44,10 +45,12 @@ from pronk.identify.match.result import (
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
+from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.progress import Progress, no_progress
+from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
 Method = Literal["time", "paper"]
@@ -141,12 +144,13 @@ def match(
             if method == "paper":
                 fits[name] = fit_magnitude(rigs, responses, grids[name])
             else:
-                fits |= fit_drives(
+                joint_fits = fit_drives(
                     JointReplay(rigs, excitations_of(sources[name], name)),
                     parameters=parameters,
                     nominal={name: nominal[name]},
                     unidentified="refuse" if mode == "drive" else "flag",
                 )
+                fits[name] = with_step_uncertainty(joint_fits[name], rigs.robot)
             progress("fit", len(fits) / len(measured))
 
         joints: dict[str, JointResult] = {}
@@ -177,6 +181,13 @@ def match(
             )
             progress("responses", len(joints) / len(fits))
         return match_result(simulation, simulation.info(rigs), joints, logs)
+
+
+def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
+    """Widen the total intervals of the gains by what the simulator's step leaves open."""
+    inertia, _ = bench_inertia(robot, robot.joint(fit.joint).original[0])
+    step_share = fit.values["damping"] * robot.timestep_s / (2.0 * inertia)
+    return replace(fit, total95=widen_by_step(fit.total95, fit.values, step_share))
 
 
 def check_choices(method: str, mode: str, settings: MatchSettings, simulation: Simulation) -> None:

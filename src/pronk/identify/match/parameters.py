@@ -17,11 +17,12 @@ class Parameter:
 
     unit: str
     low: float
-    """Lower bound of the search. Bounds are far from what servos of small robots have."""
+    """Lower bound of the search for the joints of small robots; `search_range` widens it."""
     high: float
-    """Upper bound of the search."""
+    """Upper bound of the search for the joints of small robots; `search_range` widens it."""
     start: float
-    """Where the search begins if the nominal value is smaller (`drive_fit`, step 1)."""
+    """Where the search begins if the nominal value is smaller (`drive_fit`, step 1). Of the dry
+    friction it is a share of the torque scale (`SearchRange`)."""
     step: float
     """Finite difference, of the logarithm or of the parameter itself. Far above the chatter of dry
     friction, and small against the curvature of the error."""
@@ -77,8 +78,9 @@ PARAMETERS: Mapping[str, Parameter] = {
         unit="N m",
         low=1e-3,
         high=3.0,
-        # From too little friction the search sees no sticking and does not find it.
-        start=0.2,
+        # From too little friction the search sees no sticking and does not find it, from too much
+        # the joint stands. It is 0.2 N m for a leg of 17 N m/rad at 0.25 rad.
+        start=0.05,
         step=0.03,
         remedy="a second, smaller amplitude gives the dry friction",
         may_vanish=True,
@@ -121,6 +123,50 @@ PARAMETERS: Mapping[str, Parameter] = {
         acts_on="reading",
     ),
 }
+
+WIDEST_FACTOR = 100.0
+"""Largest factor between the nominal value of a parameter and a bound of its search: beyond any
+error of a robot's file by a unit, a gear or a torque constant but degrees for radians twice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchRange:
+    """Where one parameter of one joint is searched."""
+
+    low: float
+    high: float
+    start: float
+    """Where the search begins if the nominal value is smaller."""
+
+
+def search_range(name: str, nominal: float, torque_scale: float) -> SearchRange:
+    """Return where a parameter of a joint is searched, by the size of the joint.
+
+    The bounds of `PARAMETERS` are those of joints of some 20 N m/rad. Those of gains and inertia
+    are widened to `WIDEST_FACTOR` about the nominal value, those of the dry friction to the torque
+    scale and a thousandth of it.
+
+    Args:
+        name: Name of the parameter.
+        nominal: Nominal value.
+        torque_scale: Nominal stiffness times the largest amplitude of the command [N m].
+    """
+    parameter = PARAMETERS[name]
+    if name == "frictionloss":
+        return SearchRange(
+            low=min(parameter.low, 1e-3 * torque_scale),
+            high=max(parameter.high, torque_scale),
+            start=parameter.start * torque_scale,
+        )
+    if parameter.log and nominal > 0.0:
+        low = min(parameter.low, nominal / WIDEST_FACTOR)
+        return SearchRange(
+            low=low,
+            high=max(parameter.high, nominal * WIDEST_FACTOR),
+            start=min(parameter.start, nominal),
+        )
+    return SearchRange(low=parameter.low, high=parameter.high, start=parameter.start)
+
 
 GAINS = ("stiffness", "damping")
 FREE = ("stiffness", "damping", "armature", "frictionloss", "delay")

@@ -423,8 +423,8 @@ def amplitude_flags(gains: Array) -> tuple[str, ...]:
     largest = gains[:, 0].max()
     smallest = gains[:, 0].min()
     return (
-        f"friction: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
-        f"{largest:.3g} rad; give the simulator the joint's dry friction, or match at the "
+        f"amplitude: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
+        f"{largest:.3g} rad, which this model of dry friction does not explain; match at the "
         "amplitude that the policy will use",
     )
 

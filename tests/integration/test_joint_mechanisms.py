@@ -1,0 +1,70 @@
+"""Joints that pronk does not ship, of any size: right gains, no false flag, no wrong cause.
+
+The logs are those of `joint_mechanisms`, whose integrator shares nothing with the match.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from joint_mechanisms import (
+    Mechanism,
+    chirp_commands,
+    draw_mechanism,
+    equivalent_gains,
+    mechanism_log,
+    mechanism_robot,
+    simulate_mechanisms,
+)
+from pronk.identify.match.gains import JointGains
+from pronk.identify.match.match import match
+
+
+def drawn(seed: int, faults: tuple[str, ...]) -> list[Mechanism]:
+    """One joint for each fault, an honest one where it is empty."""
+    rng = np.random.default_rng(seed)
+    return [draw_mechanism(rng, fault) for fault in faults]
+
+
+def matched(mechanisms: list[Mechanism], folder: Path, seed: int = 0) -> list[JointGains]:
+    """The gains that a match finds from the log of each joint."""
+    rng = np.random.default_rng(seed)
+    command = chirp_commands(mechanisms)
+    reading = simulate_mechanisms(mechanisms, command)
+    gains = []
+    for number, joint in enumerate(mechanisms):
+        robot = mechanism_robot(joint, folder / str(number))
+        log = mechanism_log(joint, command[:, number], reading[:, number], rng)
+        gains.append(match([log.segmented()], robot).gains.joints["j"])
+    return gains
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Mechanism, JointGains]]:
+    mechanisms = drawn(3, ("",) * 12)
+    gains = matched(mechanisms, tmp_path_factory.mktemp("honest"))
+    return list(zip(mechanisms, gains, strict=True))
+
+
+def test_joints_of_any_size_are_not_flagged(honest: list[tuple[Mechanism, JointGains]]) -> None:
+    for mechanism, gains in honest:
+        assert gains.flags == (), mechanism
+
+
+def test_their_true_gains_are_in_the_total_interval(
+    honest: list[tuple[Mechanism, JointGains]],
+) -> None:
+    stiffnesses = [mechanism.stiffness for mechanism, _ in honest]
+    assert max(stiffnesses) > 50.0 * min(stiffnesses)
+    inside = 0
+    for mechanism, gains in honest:
+        stiffness, damping = equivalent_gains(mechanism)
+        low, high = gains.stiffness.total95
+        inside += low <= stiffness <= high
+        low, high = gains.damping.total95
+        inside += low <= damping <= high
+        assert high < 1.5 * low
+    assert inside >= 0.9 * 2 * len(honest)
