@@ -204,6 +204,7 @@ class CountedReplay(Replay):
         self.joints = replay.joints
         self.recordings = replay.recordings
         self.delay_step_s = replay.delay_step_s
+        self.uncertain_s = replay.uncertain_s
         self._replay = replay
         self._expected = expected
         self._progress = progress
@@ -567,10 +568,15 @@ def _total95(
         return dict(joint_estimate.ci95)
     columns = best.vector.columns[joint]
     moves = block_moves(best.jacobian, best.residual, residuals.block)
-    return total_intervals(
+    intervals = total_intervals(
         best.vector.fitted[joint],
         best.x[columns],
         joint_estimate.ci95,
         moves[:, columns],
         by_amplitude,
     )
+    if "delay" in intervals:
+        low, high = intervals["delay"]
+        earlier, later = residuals.replay.uncertain_s
+        intervals["delay"] = (low - later, high + earlier)
+    return intervals

@@ -332,10 +332,6 @@ def fit_magnitude(
         )
     if not fit.settled:
         flags.append("the refinement did not settle; take the gains of the grid")
-    if not fit.target.trace.policy_held:
-        flags.append(
-            "the command does not change at the policy's rate; each physics step holds its own"
-        )
     flags.extend(interval.flags)
     flags.extend(amplitude_flags(amplitude_gains))
     values = {

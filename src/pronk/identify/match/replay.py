@@ -31,6 +31,9 @@ class Replay(ABC):
     recordings: Sequence[Recording]
     delay_step_s = PARAMETERS["delay"].step
     """Finite difference of the delay [s]."""
+    uncertain_s: tuple[float, float] = (0.0, 0.0)
+    """How much earlier and later the commands may have been sent than they are simulated [s]: the
+    delay of the drive is then longer or shorter."""
 
     @abstractmethod
     def fittable(self, joint: str, parameters: Sequence[str]) -> tuple[str, ...]:
@@ -84,6 +87,9 @@ class JointReplay(Replay):
                 sorted_traces.append(trace)
                 commands.append(command)
         self.recordings = joint_recordings(sorted_excitations, sorted_traces, commands)
+        earlier = max(trace.uncertain_s[0] for trace in sorted_traces)
+        later = max(trace.uncertain_s[1] for trace in sorted_traces)
+        self.uncertain_s = (earlier, later)
         self._names = []
         for name, parameter in PARAMETERS.items():
             if parameter.acts_on == "drive" and name in rigs.parameters:
