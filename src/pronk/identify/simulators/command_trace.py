@@ -230,6 +230,8 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
     sample_s = float(np.median(np.diff(time)))
     clock = command_clock(time, changed)
     whole_steps = 0
+    sent = time
+    values = command
     if clock is not None:
         whole_steps = _steps_of_a_tick(time[changed], clock, timestep)
     if clock is not None and whole_steps:
@@ -240,15 +242,13 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
         ticks_to_end = math.ceil((float(time[-1]) - start) / clock.period - 1e-6)
         stop = start + max(ticks_to_end, 1) * clock.period
         first = min(start, float(clock.instants[0]) - clock.period)
-        sent = np.asarray(np.append(first, clock.instants), dtype=np.float64)
+        sent = np.append(first, clock.instants)
         between = clock.period
         early = clock.early
         late = clock.late
     else:
         start = float(time[0])
         stop = float(time[-1])
-        sent = time
-        values = command
         between = sample_s
         if len(changed) > 1:
             between = float(np.median(np.diff(time[changed])))
@@ -256,7 +256,7 @@ def command_trace(excitation: Excitation, robot: RobotSpec) -> CommandTrace:
         early = sample_s if between > 1.5 * sample_s else 0.0
         late = 0.0
     count = max(math.ceil((stop - start) / timestep - 1e-6), 2)
-    edges = start + timestep * np.arange(count + 1)
+    edges = np.asarray(start + timestep * np.arange(count + 1), dtype=np.float64)
     if whole_steps:
         steps = values[np.maximum(command_index(sent, edges[:-1] + 0.5 * timestep), 0)]
         inside_step = 0.0
