@@ -35,6 +35,7 @@ from pronk.deploy.runtime.deploy_log import is_deploy_log, read_deploy_log
 from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.run import Deployment
 from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
 from pronk.files import read_yaml
 from pronk.identify.logs.readers import read_log
 from pronk.identify.match.result import load_match
@@ -399,4 +400,7 @@ def kills(
         if row["faults"]:
             console.say(json.dumps(row))
     failed = sum(bool(row["faults"]) for row in rows)
-    return console.Outcome(figures={"rows": counts, "faults": failed}, status=1 if failed else 0)
+    return console.Outcome(
+        figures={"rows": counts, "faults": failed},
+        status=ExitStatus.DEFECT if failed else ExitStatus.DONE,
+    )

@@ -44,6 +44,7 @@ from pronk.deploy.runtime.log import DeployLogWriter
 from pronk.deploy.runtime.modes import Mode
 from pronk.deploy.runtime.records import STEP, TICK
 from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
 from pronk.files import write_text
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import Record, records
@@ -615,4 +616,4 @@ def _outcome(read_files: list[dict[str, Any]], seed: int) -> console.Outcome:
     for row in faults[:60]:
         console.say(f"{row['i']} {row['kind']}: {row['why']}")
     figures = {"count": len(read_files), "faults": len(faults), "kinds": counts}
-    return console.Outcome(figures=figures, status=1 if faults else 0)
+    return console.Outcome(figures=figures, status=ExitStatus.DEFECT if faults else ExitStatus.DONE)

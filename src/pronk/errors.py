@@ -1,6 +1,6 @@
 """Errors of bad input: what was given, what was expected, and the way out, in one sentence.
 
-The command line prints them and ends with exit status 2.
+The command line prints them and ends with exit status 2 (`pronk.exit_status`).
 """
 
 from __future__ import annotations
@@ -43,6 +43,10 @@ class PlanError(PronkError):
 
 class IdentifiabilityError(PronkError):
     """The data cannot separate the parameters; the message names the missing experiment."""
+
+
+class UnmatchedError(PronkError):
+    """Gains have joints that are no match, and were to be used as if they were."""
 
 
 class ArtefactError(PronkError):

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from hopper import write_hopper
+from pronk.exit_status import ExitStatus
 
 pytestmark = pytest.mark.live
 
@@ -43,7 +44,7 @@ def test_a_log_that_ends_on_a_full_disk_is_a_failure(tmp_path: Path) -> None:
     done = deployed_with(
         str(folder), "256k", tmp_path, "--log", str(log), "--seconds", "0.5", "--base", "bench"
     )
-    assert done.returncode == 1, done.stdout + done.stderr
+    assert done.returncode == ExitStatus.RUN_FAULT, done.stdout + done.stderr
     assert f"{log} ends" in " ".join(done.stderr.split())
     assert "No space left" in done.stderr
     assert "Traceback" not in done.stderr

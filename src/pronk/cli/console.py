@@ -23,6 +23,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from pronk.errors import HardwareError
+from pronk.exit_status import ExitStatus
 from pronk.files import write_text
 from pronk.tables import Table
 
@@ -77,7 +78,7 @@ class Outcome:
     """Artefacts whose pages are written when the command has ended, for instance `match.npz`."""
     following: Sequence[str] = ()
     """Commands to run next."""
-    status: int = 0
+    status: ExitStatus = ExitStatus.DONE
     """Exit status."""
 
     def end(self, json_file: Path | None) -> int:

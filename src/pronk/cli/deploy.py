@@ -12,6 +12,7 @@ from pronk.cli import console
 from pronk.cli.link_options import Base, LinkOptions
 from pronk.deploy.runtime.poses import RunTiming
 from pronk.errors import HardwareError, PronkError
+from pronk.exit_status import ExitStatus
 from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
@@ -20,10 +21,6 @@ if TYPE_CHECKING:
     from pronk.deploy.runtime.teleop import Operator
     from pronk.policy.contract import Contract
     from pronk.policy.script import Script
-
-
-_INTERRUPTED = 130
-"""Exit status of a run that was interrupted."""
 
 
 def deploy_command(
@@ -120,11 +117,11 @@ def deploy_command(
         next_command = (
             f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
         )
-    status = 0
+    status = ExitStatus.DONE
     if summary.faults or summary.refusals or capture_lost or summary.log_error:
-        status = 1
+        status = ExitStatus.RUN_FAULT
     elif summary.interrupted:
-        status = _INTERRUPTED
+        status = ExitStatus.INTERRUPTED
     return console.Outcome(
         figures=summary.figures(), wrote=wrote, following=[next_command], status=status
     )

@@ -24,6 +24,7 @@ def evaluate_command(
     before: Path | None = None,
     seed: int = 0,
     device: Literal["auto", "cpu", "cuda"] = "auto",
+    allow_unmatched: bool = False,
 ) -> None:
     """Walk and jump with many robots at once; errors, heights, falls, acceptance criteria.
 
@@ -39,6 +40,7 @@ def evaluate_command(
         before: Evaluation of the policy before the jump phases, to compare the walk.
         seed: Seed of all draws.
         device: auto: a GPU if there is one. On the CPU take a few robots.
+        allow_unmatched: Also take a gains.yaml with joints that are no match.
     """
     from pronk.jump.train.devices import find_devices, require_extra
     from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, EvaluationPlan
@@ -69,7 +71,7 @@ def evaluate_command(
     )
     if plan.jumps and not evaluated_policy.jump:
         raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
-    simulated_gains = training_gains(gains, robot, like=like)
+    simulated_gains = training_gains(gains, robot, like=like, allow_unmatched=allow_unmatched)
     if not evaluated_policy.knows(simulated_gains):
         console.warn(
             f"{policy} was not trained with these gains; it is evaluated with "

@@ -35,6 +35,7 @@ def export_gains(
     out: Path,
     robot: str | None = None,
     per: Literal["group", "joint"] = "group",
+    allow_unmatched: bool = False,
 ) -> console.Outcome:
     """Write matched gains as actuator configuration of a simulator.
 
@@ -44,12 +45,16 @@ def export_gains(
         out: The file to write.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
         per: One actuator per joint group, with the group's gains, or per joint, with its own.
+        allow_unmatched: Also export joints that are no match; the header of the file names them.
     """
     from pronk.files import write_text
     from pronk.identify.match.export.targets import export
-    from pronk.identify.match.gains import load_gains
+    from pronk.identify.match.gains import load_gains, require_matched
     from pronk.robots import load_robot
 
     robot_spec = load_robot(robot) if robot else None
-    write_text(out, export(load_gains(gains), to, robot_spec, per=per))
+    matched_gains = load_gains(gains)
+    require_matched(matched_gains, allow_unmatched, str(gains))
+    text = export(matched_gains, to, robot_spec, per=per, allow_unmatched=allow_unmatched)
+    write_text(out, text)
     return console.Outcome(figures={"written": out, "to": to}, wrote=[out])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,6 +11,7 @@ import tyro
 from pronk.cli import console, options
 from pronk.cli.options import Reading
 from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
 
 if TYPE_CHECKING:
     from pronk.identify.match.result import MatchResult
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
 
 Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
-WARNING_STATUS = 3
-"""Exit status of a match that is no better than less fitting on what was held out of the fit."""
 
 
 def match_command(
@@ -58,7 +58,7 @@ def match_command(
     from pronk.identify.match import gains as gains_file
     from pronk.identify.match import tables
     from pronk.identify.match.match import match as match_logs
-    from pronk.identify.match.result import NOT_BETTER, save_match
+    from pronk.identify.match.result import save_match
     from pronk.identify.match.settings import MatchSettings
     from pronk.identify.simulators.profiles import profile
     from pronk.robots import load_robot
@@ -133,21 +133,35 @@ def match_command(
         console.show(comparison)
         headings = [column.heading for column in comparison.columns]
         figures["frameworks"] = [dict(zip(headings, row, strict=True)) for row in comparison.rows]
-    flags: list[str] = []
-    for framework_result in results.values():
-        for joint_flags in framework_result.flags.values():
-            flags.extend(joint_flags)
-    not_better = any(flag.startswith(NOT_BETTER) for flag in flags)
     return console.Outcome(
         figures=figures,
         wrote=written,
         pages_of=result_paths,
-        following=[
-            f"pronk predict FRESH_LOG --robot {robot} --gains {out}",
-            f"pronk export {out} --to mjlab --out actuators.py",
-        ],
-        status=WARNING_STATUS if not_better else 0,
+        following=next_commands(result, out),
+        status=match_status(results.values()),
     )
+
+
+def match_status(results: Iterable[MatchResult]) -> ExitStatus:
+    """Return the exit status of matches of the same logs for several simulators."""
+    status = ExitStatus.DONE
+    for result in results:
+        if result.gains.unmatched:
+            return ExitStatus.NO_MATCH
+        if result.not_better:
+            status = ExitStatus.NOT_BETTER
+    return status
+
+
+def next_commands(result: MatchResult, out: Path) -> list[str]:
+    """Return the commands that may follow a match, or what to do about joints that are none."""
+    if result.gains.unmatched:
+        joints = ", ".join(result.gains.unmatched)
+        return [f"record {joints} again; --allow-unmatched exports these gains all the same"]
+    return [
+        f"pronk predict FRESH_LOG --gains {out}",
+        f"pronk export {out} --to mjlab --out actuators.py",
+    ]
 
 
 def joints_of_groups(robot: RobotSpec, result: MatchResult) -> dict[str, list[str]]:
@@ -168,6 +182,8 @@ def has_compared_responses(result: MatchResult) -> bool:
 
 def print_summary(result: MatchResult) -> None:
     """Print how many joints were matched, the errors, and every flag."""
+    from pronk.identify.match.result import NO_MATCH
+
     matched = len(result.matched_joints)
     count = len(result.joints)
     if has_compared_responses(result):
@@ -180,8 +196,12 @@ def print_summary(result: MatchResult) -> None:
         console.say(f"Drives of {count} joints fitted by torque.")
     else:
         console.say(f"{matched} of {count} joints matched.")
+    for name, reasons in result.gains.unmatched.items():
+        console.say(f"{name} is no match: {'; '.join(reasons)}")
     for name, flags in result.flags.items():
-        console.say(f"{name}: {'; '.join(flags)}")
+        others = [flag for flag in flags if not flag.startswith(NO_MATCH)]
+        if others:
+            console.say(f"{name}: {'; '.join(others)}")
 
 
 def summary(result: MatchResult) -> dict[str, Any]:

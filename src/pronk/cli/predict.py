@@ -21,32 +21,36 @@ if TYPE_CHECKING:
 
 def predict_logs(
     paths: tyro.conf.Positional[tuple[Path, ...]],
-    robot: str,
     gains: Path,
+    robot: str | None = None,
     out: Path | None = None,
     drive_gains: tuple[str, ...] = (),
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
+    allow_unmatched: bool = False,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Replay logs in the simulator with nominal and with matched gains; RMSE and R2 per joint.
 
     Args:
         paths: Logs, or folders of logs.
-        robot: A name, or a path to a robot.yaml, MJCF or URDF.
         gains: gains.yaml of `pronk match`.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
         out: Folder for replays and figures; beside the gains.
         drive_gains: As of `pronk match`.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
+        allow_unmatched: Also replay joints whose gains are no match.
         reading: How logs are read.
     """
-    from pronk.identify.match.gains import load_gains
+    from pronk.identify.match.export.actuators import robot_of
+    from pronk.identify.match.gains import load_gains, require_matched
     from pronk.identify.match.predict import predict, save_prediction
     from pronk.robots import load_robot
 
-    robot_spec = load_robot(robot)
     matched_gains = load_gains(gains)
+    require_matched(matched_gains, allow_unmatched, str(gains))
+    robot_spec = load_robot(robot) if robot else robot_of(matched_gains)
     stated_gains = options.drive_gains(drive_gains)
     logs = reading.read(paths, robot_spec)
     folder = out if out is not None else gains.parent
@@ -64,6 +68,7 @@ def predict_logs(
                 drive_gains=stated_gains,
                 simulator=simulator,
                 simulator_python=simulator_python,
+                allow_unmatched=allow_unmatched,
             )
             excluded |= prediction.excluded
             path = folder / f"{_stem(log)}.prediction.npz"
@@ -80,6 +85,8 @@ def predict_logs(
     console.show(prediction_table(rows, virtual=virtual))
     for source in fitted_logs:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
+    for name, reasons in matched_gains.unmatched.items():
+        console.warn(f"{name} is no match: {'; '.join(reasons)}")
     for reason in excluded.values():
         console.say(f"left out: {reason}")
     following = []

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pronk.cli import console
+from pronk.exit_status import ExitStatus
 from pronk.jump.train.settings import TrainSettings
 from pronk.tables import Column, Table
 
@@ -36,7 +37,9 @@ def train_command(settings: TrainSettings) -> console.Outcome:
         console.say(f"stopped: {session['stopped']}")
     if record["finished"]:
         return console.Outcome(figures=record, following=_next_steps(settings, record))
-    status = 130 if session["stopped"].startswith("SIG") else 0
+    status = ExitStatus.DONE
+    if session["stopped"].startswith("SIG"):
+        status = ExitStatus.INTERRUPTED
     return console.Outcome(figures=record, following=[resume], status=status)
 
 

@@ -41,6 +41,7 @@ def translate_gains(
     robot: str | None = None,
     drive_gains: tuple[str, ...] = (),
     out: Path = Path("translated.yaml"),
+    allow_unmatched: bool = False,
 ) -> console.Outcome:
     """Translate gains for a framework of another drive law, in which the joints respond alike.
 
@@ -53,9 +54,10 @@ def translate_gains(
         drive_gains: Gains in the first framework, without a gains file: JOINT=STIFFNESS,DAMPING or
             GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         out: The gains file to write.
+        allow_unmatched: Also translate joints that are no match; they stay marked.
     """
     from pronk.identify.match.export.actuators import profile_held
-    from pronk.identify.match.gains import save_gains
+    from pronk.identify.match.gains import require_matched, save_gains
     from pronk.identify.match.translate import translate
     from pronk.identify.simulators.profiles import profile
 
@@ -63,6 +65,7 @@ def translate_gains(
         first, robot_spec = _stated_gains(robot, begin, drive_gains)
     else:
         first, robot_spec = _gains_of_file(gains, robot, begin, drive_gains)
+        require_matched(first, allow_unmatched, str(gains))
     first_profile = profile_held(first)
     names = _framework_names(to)
     rows: list[tuple[Cell, ...]] = []
@@ -70,7 +73,9 @@ def translate_gains(
     figures: dict[str, dict[str, Any]] = {}
     for name in names:
         target_profile = profile(name)
-        translated, translations = translate(first, robot_spec, target_profile)
+        translated, translations = translate(
+            first, robot_spec, target_profile, allow_unmatched=allow_unmatched
+        )
         path = out if len(names) == 1 else out.parent / name / out.name
         save_gains(path, translated)
         wrote.append(path)

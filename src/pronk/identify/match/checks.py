@@ -77,6 +77,10 @@ LIMITED_SHARE = 0.01
 linear only as long as the torque is; at 1 % of the time its first harmonic changes by less than
 0.1 dB."""
 
+EXPLAINED_MIN = 0.8
+"""Least share of a joint's motion that a match explains. An error of `match.NO_MATCH_DB` at every
+frequency, 12 % of the amplitude, with a phase error of 0.4 rad leaves 0.8."""
+
 TORQUE_COMPUTED = "computed"
 """Value of a log's metadata `torque` where the column was computed from the command."""
 
@@ -457,4 +461,35 @@ def check_response(
         f"{limit_db:.2g} dB; from {hz[third[0]]:.2g} to {hz[third[-1]]:.2g} Hz, where the error is "
         f"largest, the real joint moves {direction} than the simulated one. So would look: "
         f"{causes[largest]}",
+    )
+
+
+def check_explained_motion(
+    measured: Sequence[Array], simulated: Sequence[Array]
+) -> tuple[str, ...]:
+    """Check the motion of a joint of which no response could be estimated.
+
+    The explained share is `1 - mean((simulated - measured)^2) / var(measured)`, each recording
+    about its mean, so that an encoder's offset does not count.
+
+    Args:
+        measured: Measured positions of the joint [rad], shape (n,) a recording.
+        simulated: Simulated positions with the matched gains [rad], shape (n,) a recording.
+
+    Returns:
+        A flag that begins with `NO_MATCH` if less than `EXPLAINED_MIN` is explained.
+    """
+    error = 0.0
+    motion = 0.0
+    for measured_position, simulated_position in zip(measured, simulated, strict=True):
+        difference = simulated_position - measured_position
+        error += float(np.sum((difference - difference.mean()) ** 2))
+        motion += float(np.sum((measured_position - measured_position.mean()) ** 2))
+    explained = 1.0 - error / motion if motion > 0.0 else 0.0
+    if explained >= EXPLAINED_MIN:
+        return ()
+    return (
+        f"{NO_MATCH}the simulation explains {100.0 * max(explained, 0.0):.0f} % of the joint's "
+        f"motion, less than {100.0 * EXPLAINED_MIN:.0f} %, and no frequency of it is coherent with "
+        "its command; record a motion in which this joint moves more",
     )

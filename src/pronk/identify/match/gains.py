@@ -7,14 +7,15 @@ its parameters, the training gains and ranges of each joint group, and the hashe
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from pronk.errors import ArtefactError
+from pronk.errors import ArtefactError, UnmatchedError
 from pronk.files import converted, read_yaml, write_text
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.names import check_names
@@ -129,6 +130,12 @@ class JointGains:
     """Warnings about this match, one sentence each: of its excitations and response (`checks`), of
     amplitudes and frequencies left out (`measured`, `match`), and of its fit (`drive_fit` or
     `magnitude`, `result`, `torque_fit`)."""
+    matched: bool = True
+    """False if these gains are no match: the simulated response is not the measured one, or the
+    logs do not identify a gain. Files of earlier versions have only joints that count as
+    matched."""
+    reasons: tuple[str, ...] = ()
+    """Why the gains are no match; empty if they are one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,11 +175,46 @@ class MatchedGains:
     """SHA-256 of every log that went in, by its file name."""
     virtual: bool = False
     """True if any log came from pronk's virtual robot."""
+    robot_path: str = ""
+    """File of the robot, so that no command needs `--robot`; empty for a robot that ships with
+    pronk. In `gains.yaml` it is relative to the folder of that file."""
+
+    @property
+    def unmatched(self) -> dict[str, tuple[str, ...]]:
+        """Reasons by joint of the joints that are no match."""
+        unmatched = {}
+        for name, joint in self.joints.items():
+            if not joint.matched:
+                unmatched[name] = joint.reasons or ("it is marked as no match",)
+        return unmatched
 
     def __repr__(self) -> str:
         """Name the robot, the simulator and the number of matched joints."""
         where = self.simulator.profile or self.simulator.engine
         return f"<MatchedGains of {self.robot} for {where}: {len(self.joints)} joints>"
+
+
+def require_matched(gains: MatchedGains, allow_unmatched: bool, source: str = "") -> None:
+    """Refuse gains with joints that are no match.
+
+    Args:
+        gains: Matched gains.
+        allow_unmatched: True to accept them; what is made of them then carries the mark.
+        source: File of the gains, for the message.
+
+    Raises:
+        UnmatchedError: A joint is no match; the message names each with its reasons.
+    """
+    if allow_unmatched or not gains.unmatched:
+        return
+    joints = []
+    for name, reasons in gains.unmatched.items():
+        joints.append(f"{name} ({'; '.join(reasons)})")
+    place = f"{source}: " if source else ""
+    raise UnmatchedError(
+        f"{place}no match of {', '.join(joints)}. Record and match these joints again, or give "
+        "--allow-unmatched (allow_unmatched=True in Python) to use their gains all the same."
+    )
 
 
 def save_gains(path: Path, gains: MatchedGains) -> None:
@@ -191,9 +233,10 @@ def save_gains(path: Path, gains: MatchedGains) -> None:
     groups = {}
     for name, group in gains.groups.items():
         groups[name] = _group_entry(group)
-    body = {
-        "schema": SCHEMA,
-        "robot": gains.robot,
+    body: dict[str, Any] = {"schema": SCHEMA, "robot": gains.robot}
+    if gains.robot_path:
+        body["robot_path"] = _relative_path(gains.robot_path, path.parent)
+    body |= {
         "virtual": gains.virtual,
         "simulator": _simulator_entry(gains.simulator),
         "joints": joints,
@@ -234,6 +277,9 @@ def load_gains(path: Path) -> MatchedGains:
         _check_joint(joint, f"{path}: joints.{name}")
     for name, group in gains.groups.items():
         _check_group(group, f"{path}: groups.{name}")
+    if gains.robot_path:
+        robot_path = (path.resolve().parent / gains.robot_path).resolve()
+        gains = replace(gains, robot_path=str(robot_path))
     return gains
 
 
@@ -311,13 +357,22 @@ def _simulator_entry(simulator: SimulatorInfo) -> _OneLine:
     return entry
 
 
+def _relative_path(path: str, folder: Path) -> str:
+    """Return a path relative to a folder; an absolute one where no relative one leads there."""
+    try:
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    except ValueError:
+        return Path(path).as_posix()
+
+
 def _joint_entry(joint: JointGains) -> dict[str, Any]:
     """Return the entry of a joint: a line for each parameter; what is not known is left out."""
-    entry: dict[str, Any] = {
-        "stiffness": _value_entry(joint.stiffness),
-        "damping": _value_entry(joint.damping),
-        "armature": _value_entry(joint.armature),
-    }
+    entry: dict[str, Any] = {"matched": joint.matched}
+    if joint.reasons:
+        entry["reasons"] = list(joint.reasons)
+    entry["stiffness"] = _value_entry(joint.stiffness)
+    entry["damping"] = _value_entry(joint.damping)
+    entry["armature"] = _value_entry(joint.armature)
     if not math.isnan(joint.frictionloss.value):
         entry["frictionloss"] = _value_entry(joint.frictionloss)
     if joint.stribeck.value != 0.0:

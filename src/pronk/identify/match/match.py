@@ -10,8 +10,13 @@ from typing import Literal, get_args
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.match.checks import check_excitations, check_response
-from pronk.identify.match.compared import ComparedResponses, compare, compare_recordings
+from pronk.identify.match.checks import check_excitations, check_explained_motion, check_response
+from pronk.identify.match.compared import (
+    COHERENCE_MIN,
+    ComparedResponses,
+    compare,
+    compare_recordings,
+)
 from pronk.identify.match.drive_fit import fit_drives, nominal_drives
 from pronk.identify.match.magnitude import (
     fit_magnitude,
@@ -20,9 +25,11 @@ from pronk.identify.match.magnitude import (
     search_without_armature,
 )
 from pronk.identify.match.measured import (
+    DB,
     MeasuredJoint,
     logs_by_joint,
     measured_joints,
+    rms,
     simulated_response,
 )
 from pronk.identify.match.nominal_gains import DriveGains, with_drive_gains
@@ -50,6 +57,7 @@ from pronk.identify.simulators.chain import ChainSimulation, branches, moves_tog
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.progress import Progress, no_progress
+from pronk.robots import ROBOT_NAMES
 from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
@@ -122,6 +130,12 @@ def match(
     if torque_fits and not excited_logs:
         return match_by_torque(logs, simulation, torque_fits)
     if any(moves_together(log) for log in excited_logs):
+        if method == "paper":
+            raise PronkError(
+                "method paper with logs in which several joints move at once; the paper's method "
+                "compares magnitudes of one joint at a time: leave the method out, and the leg or "
+                "arm is fitted in time."
+            )
         return match_chains(logs, simulation, parameters, torque_fits, settings, progress)
 
     with simulation.open_rigs(settings.threads, settings.simulator_python) as rigs:
@@ -156,7 +170,7 @@ def match(
         joints: dict[str, JointResult] = {}
         for name, fit in with_torque(fits, torque_fits, robot).items():
             if name not in measured:
-                joints[name] = JointResult(joint=name, gains=joint_gains(fit), fit=fit)
+                joints[name] = JointResult(joint=name, gains=joint_gains(fit, robot), fit=fit)
                 continue
             target = measured[name][0]
             compared = compare(
@@ -173,7 +187,7 @@ def match(
             flags = (*response_flags(target, compared, robot), *excitation_flags[name])
             joints[name] = JointResult(
                 joint=name,
-                gains=joint_gains(fit, compared, flags),
+                gains=joint_gains(fit, robot, compared, flags),
                 fit=fit,
                 responses=compared,
                 grid=grids.get(name),
@@ -278,15 +292,15 @@ def match_chains(
     With a fixed base chains do not move each other. The steps are those of `match` in another
     order, and some of its choices do not apply:
 
-    - The fit comes first, always in time, whatever the method. The response of a joint is estimated
-      afterwards, from the recording with the most coherent frequencies (`compare_recordings`): it
-      judges the fit and takes no part in it.
+    - The fit comes first, always in time; method `paper` is refused. The response of a joint is
+      estimated afterwards, from the recording with the most coherent frequencies
+      (`compare_recordings`): it judges the fit and takes no part in it.
     - Parameters of a joint that the logs do not identify are held at their nominal value, where
       `match` flags them (mode `gains`) or refuses them (mode `drive`).
     - Of the settings, `estimator` and `coherence_min` are not used: responses come from the default
       estimator, and frequencies of a coherence below `compared.COHERENCE_MIN` are not compared.
-    - An incoherent band is no error, and the joint then has no response. No response is checked
-      (`check_response`), so that every joint counts as matched.
+    - An incoherent band is no error. The joint then has no response, and the share of its motion
+      that the simulation explains says whether it is a match (`check_explained_motion`).
 
     Args:
         logs: Logs of one robot, in some of which several joints move at once.
@@ -308,6 +322,7 @@ def match_chains(
         excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
     fits: dict[str, DriveFit] = {}
     responses: dict[str, ComparedResponses] = {}
+    motion_flags: dict[str, tuple[str, ...]] = {}
     excluded: dict[str, str] = {}
     chains = branches(logs_in_motion, robot)
     for number, joint_names in enumerate(chains):
@@ -330,23 +345,38 @@ def match_chains(
             matched = {name: fit.values for name, fit in chain_fits.items()}
             matched_positions, nominal_positions = chain.run([matched, nominal])
             for column, name in enumerate(chain.joints):
+                joint_matched = joint_positions(matched_positions, column)
                 compared = compare_recordings(
                     robot,
                     name,
                     chain.logs,
-                    matched=joint_positions(matched_positions, column),
+                    matched=joint_matched,
                     nominal=joint_positions(nominal_positions, column),
                     highest_hz=replay.trusted_hz[name],
                 )
                 if compared is not None:
                     responses[name] = compared
+                    motion_flags[name] = compared_flags(compared)
+                else:
+                    measured = [log.position[:, log.column(name)] for log in chain.logs]
+                    motion_flags[name] = check_explained_motion(measured, joint_matched)
             fits.update(chain_fits)
             excluded.update(chain.excluded)
     joints = {}
     for name, fit in with_torque(fits, torque_fits, robot).items():
-        gains = joint_gains(fit, responses.get(name), excitation_flags.get(name, ()))
+        flags = (*motion_flags.get(name, ()), *excitation_flags.get(name, ()))
+        gains = joint_gains(fit, robot, responses.get(name), flags)
         joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
     return match_result(simulation, simulation.info(), joints, logs, excluded)
+
+
+def compared_flags(compared: ComparedResponses) -> tuple[str, ...]:
+    """Check the response of a joint that moved together with others, as `response_flags` does."""
+    measured = compared.measured[0]
+    used = measured.band(*compared.band_hz, COHERENCE_MIN)
+    relative = measured.relative_error(0.95)[used]
+    limit_db = max(NO_MATCH_DB, NO_MATCH_INTERVALS * DB * rms(relative))
+    return check_response(measured, compared.matched, used, limit_db)
 
 
 def joint_positions(positions: Sequence[Array], column: int) -> list[Array]:
@@ -393,8 +423,9 @@ def match_by_torque(
         IdentifiabilityError: The torques identify no drive.
     """
     joints = {}
-    for name, fit in with_torque({}, torque_fits, simulation.robot).items():
-        joints[name] = JointResult(joint=name, gains=joint_gains(fit), fit=fit)
+    robot = simulation.robot
+    for name, fit in with_torque({}, torque_fits, robot).items():
+        joints[name] = JointResult(joint=name, gains=joint_gains(fit, robot), fit=fit)
     if not joints:
         reasons: dict[str, None] = {}
         for fit in torque_fits.values():
@@ -440,4 +471,12 @@ def match_result(
         logs=hashes,
         virtual=virtual,
         excluded=excluded or {},
+        robot_path=robot_path(simulation.robot),
     )
+
+
+def robot_path(robot: RobotSpec) -> str:
+    """Return the file of a robot; empty for one that ships with pronk or has no file."""
+    if robot.source in ROBOT_NAMES or not Path(robot.source).is_file():
+        return ""
+    return robot.source

@@ -20,7 +20,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.match.measured import rms
 from pronk.identify.match.nominal_gains import DriveGains, gains_on_drive, with_drive_gains
 from pronk.identify.response.grid import held_mean
@@ -107,6 +107,8 @@ class Prediction:
     """True if the log came from pronk's virtual robot."""
     excluded: Mapping[str, str] = field(default_factory=dict)
     """Joints that moved and were not predicted, with the reason for each."""
+    unmatched: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Joints whose gains are no match, with the reasons."""
 
     def __repr__(self) -> str:
         """Name the log and the errors of its joints."""
@@ -149,6 +151,7 @@ def predict(
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
     threads: int = 2,
+    allow_unmatched: bool = False,
 ) -> Prediction:
     """Simulate a log with nominal and with matched gains.
 
@@ -165,11 +168,13 @@ def predict(
             the drive law of the framework that the gains hold for.
         simulator_python: Python that the simulator runs in, if it is another.
         threads: Simulations at once.
+        allow_unmatched: Also replay joints whose gains are no match; they are marked.
 
     Returns:
         Measured and simulated position of every excited joint that has matched gains.
 
     Raises:
+        UnmatchedError: A joint is no match.
         LogError: The log excites no joint that has matched gains, or is of another robot.
         PronkError: The simulator is unknown, or cannot replay joints that move together.
 
@@ -182,6 +187,7 @@ def predict(
     """
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    require_matched(gains, allow_unmatched)
     if simulator == "mujoco" and gains.simulator.profile:
         robot = profile_of(gains.simulator).robot(robot)
     (log,) = with_drive_gains([log], robot, drive_gains)
@@ -199,7 +205,11 @@ def predict(
         reasons = " ".join(excluded.values()) or "no joint is excited in it."
         raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
     return Prediction(
-        joints=tuple(joints), source=log.source, virtual=log.virtual, excluded=excluded
+        joints=tuple(joints),
+        source=log.source,
+        virtual=log.virtual,
+        excluded=excluded,
+        unmatched=gains.unmatched,
     )
 
 

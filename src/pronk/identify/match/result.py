@@ -26,7 +26,10 @@ from pronk.identify.match.gains import (
     MatchQuality,
     TorqueParameter,
 )
+from pronk.identify.match.parameters import GAINS, PARAMETERS
 from pronk.identify.simulators.info import SimulatorInfo
+from pronk.robots.model import bench_inertia
+from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,6 +50,10 @@ _LESS_FITTING = {
 }
 HELD_OUT = (*_LESS_FITTING, "matched")
 """Drives whose errors on what was held out are compared."""
+DAMPING_RATIO_SD_MAX = 0.025
+"""Standard deviation of a damping over the critical damping up to which it counts as identified
+however small it is. At 95 % the damping ratio is then known to 0.05, a tenth of what servos of
+legged robots have."""
 SPREAD_MAX = 0.05
 """Relative change of stiffness between amplitudes that is worth a flag; the paper's own
 randomization is 2 N m/rad on 20 (D3), twice that."""
@@ -210,6 +217,8 @@ class MatchResult:
     """True if a log came from pronk's virtual robot."""
     excluded: Mapping[str, str] = field(default_factory=dict)
     """Reasons by joint for joints that moved and were not matched."""
+    robot_path: str = ""
+    """File of the robot; empty for a robot that ships with pronk."""
 
     @property
     def gains(self) -> MatchedGains:
@@ -221,6 +230,7 @@ class MatchResult:
             groups=self.groups,
             logs=self.logs,
             virtual=self.virtual,
+            robot_path=self.robot_path,
         )
 
     @property
@@ -234,12 +244,20 @@ class MatchResult:
 
     @property
     def matched_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose simulated response is the measured one."""
+        """Names of the joints that are a match (`JointGains.matched`)."""
         matched = []
         for name, joint in self.joints.items():
-            if not any(flag.startswith(NO_MATCH) for flag in joint.gains.flags):
+            if joint.gains.matched:
                 matched.append(name)
         return tuple(matched)
+
+    @property
+    def not_better(self) -> bool:
+        """True if a joint is no better than less fitting on what was held out of its fit."""
+        for flags in self.flags.values():
+            if any(flag.startswith(NOT_BETTER) for flag in flags):
+                return True
+        return False
 
     @property
     def error_db(self) -> float:
@@ -358,12 +376,19 @@ def load_match(path: Path) -> MatchResult:
 
 
 def joint_gains(
-    fit: DriveFit, responses: ComparedResponses | None = None, flags: Sequence[str] = ()
+    fit: DriveFit,
+    robot: RobotSpec,
+    responses: ComparedResponses | None = None,
+    flags: Sequence[str] = (),
 ) -> JointGains:
-    """Return the part of a joint's result that training needs.
+    """Return the part of a joint's result that training needs, and whether it is a match.
+
+    A joint is no match if a flag says so (`NO_MATCH`), or if the logs do not identify one of its
+    gains (`unidentified_gains`).
 
     Args:
         fit: The fit of the drive.
+        robot: The robot.
         responses: Compared responses, if there are any.
         flags: Sentences that warn of this joint beside those of the fit.
     """
@@ -377,6 +402,13 @@ def joint_gains(
             coherence_min=responses.coherence_min,
             amplitude_spread=spread,
         )
+    all_flags = (*fit.flags, *flags)
+    reasons = []
+    for flag in all_flags:
+        if flag.startswith(NO_MATCH):
+            reasons.append(flag.removeprefix(NO_MATCH))
+    for name in unidentified_gains(fit, robot):
+        reasons.append(f"the logs do not identify its {name}")
     stiffness_row, damping_row = fit.covariance.tolist()
     return JointGains(
         stiffness=_fitted_value(fit, "stiffness"),
@@ -388,8 +420,37 @@ def joint_gains(
         covariance=(tuple(stiffness_row), tuple(damping_row)),
         quality=quality,
         torque=fit.torque,
-        flags=(*fit.flags, *flags),
+        flags=all_flags,
+        matched=not reasons,
+        reasons=tuple(reasons),
     )
+
+
+def unidentified_gains(fit: DriveFit, robot: RobotSpec) -> list[str]:
+    """Name the fitted gains of a joint that its logs do not identify.
+
+    A gain is identified if its relative standard deviation is no more than `Parameter.sd_max`. A
+    damping is also identified if its deviation is small beside that of a critically damped joint,
+    `2 sqrt(stiffness inertia)`: a drive may have no damping of its own.
+
+    Args:
+        fit: The fit of the drive, with the covariance of its gains.
+        robot: The robot, which has the inertia of the joint.
+    """
+    unidentified = []
+    for index, name in enumerate(GAINS):
+        if name not in fit.ci95:
+            continue
+        deviation = float(np.sqrt(fit.covariance[index, index]))
+        if np.isnan(deviation) or deviation <= PARAMETERS[name].sd_max * fit.values[name]:
+            continue
+        if name == "damping":
+            inertia, _ = bench_inertia(robot, robot.joint(fit.joint).original[0])
+            critical = 2.0 * np.sqrt(fit.values["stiffness"] * inertia)
+            if deviation <= DAMPING_RATIO_SD_MAX * critical:
+                continue
+        unidentified.append(name)
+    return unidentified
 
 
 def _fitted_value(fit: DriveFit, name: str) -> FittedValue:

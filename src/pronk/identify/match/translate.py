@@ -26,6 +26,7 @@ from pronk.identify.match.gains import (
     Interval,
     JointGains,
     MatchedGains,
+    require_matched,
 )
 from pronk.identify.match.measured import DB, rms
 from pronk.identify.match.nominal_gains import Pair
@@ -65,7 +66,7 @@ class JointTranslation:
 
 
 def translate(
-    gains: MatchedGains, robot: RobotSpec, to: Profile
+    gains: MatchedGains, robot: RobotSpec, to: Profile, *, allow_unmatched: bool = False
 ) -> tuple[MatchedGains, dict[str, JointTranslation]]:
     """Translate gains for another framework.
 
@@ -73,16 +74,19 @@ def translate(
         gains: Matched gains, which hold for a framework with a profile.
         robot: The robot that they were matched for.
         to: Profile of the other framework.
+        allow_unmatched: Also translate joints that are no match; they stay marked.
 
     Returns:
         The gains for the other framework, and what changed by joint.
 
     Raises:
+        UnmatchedError: A joint is no match.
         PronkError: The gains hold for no profile, are of another robot or not stable in the other
             framework, or the robot cannot be commanded at the profile's step.
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    require_matched(gains, allow_unmatched)
     begin = profile_held(gains)
     source = begin.robot(robot)
     target = to.robot(robot)

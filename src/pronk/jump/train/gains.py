@@ -9,13 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
-from pronk.identify.match.gains import GroupGains, MatchedGains, load_gains
+from pronk.identify.match.gains import (
+    GroupGains,
+    MatchedGains,
+    load_gains,
+    require_matched,
+)
 from pronk.identify.simulators.info import SimulatorInfo, mujoco_info
 from pronk.robots.robot import RobotSpec
 
@@ -43,6 +48,8 @@ class TrainingGains:
     """Hash of the `gains.yaml` that nominals or ranges come from; empty without one."""
     virtual: bool = False
     """True if that file rests on pronk's virtual robot."""
+    unmatched: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Joints of that file that are no match, with the reasons."""
 
     def __post_init__(self) -> None:
         """Refuse ranges that reach zero, and a negative delay."""
@@ -63,7 +70,11 @@ def _check_range(gain: str, nominal: float, half_width: float) -> None:
 
 
 def training_gains(
-    choice: str | Path, robot: RobotSpec, *, like: Path | None = None
+    choice: str | Path,
+    robot: RobotSpec,
+    *,
+    like: Path | None = None,
+    allow_unmatched: bool = False,
 ) -> TrainingGains:
     """Return the gains to train with.
 
@@ -73,8 +84,10 @@ def training_gains(
         like: A `gains.yaml` whose ranges and delay are used about the nominal gains, its
             ellipsoids moved along (reading A20). Without it their ranges are the paper's (D3, D4)
             and the delay is 0.
+        allow_unmatched: Accept a file with joints that are no match.
 
     Raises:
+        UnmatchedError: A joint of the file is no match.
         ArtefactError: A file that is missing, or of another robot or simulator.
         PronkError: Impossible gains, or ranges given beside those of a file.
     """
@@ -92,6 +105,7 @@ def training_gains(
         return TrainingGains(name="naive", robot=robot.name, groups=nominal_groups)
     path = like or Path(choice)
     matched = _matched_gains(path, robot)
+    require_matched(matched, allow_unmatched, str(path))
     groups = {}
     for group in robot.groups:
         groups[group] = matched.groups[group]
@@ -105,6 +119,7 @@ def training_gains(
         delay_s=math.fsum(delays) / len(delays),
         sha256=sha256(path),
         virtual=matched.virtual,
+        unmatched=matched.unmatched,
     )
 
 

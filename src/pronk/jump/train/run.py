@@ -72,7 +72,12 @@ def run_training(
 def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     """Make the folder of a new run; returns its provenance."""
     task = load_task(str(settings.robot))
-    gains = training_gains(settings.gains or NAIVE, task.robot, like=settings.ranges_from)
+    gains = training_gains(
+        settings.gains or NAIVE,
+        task.robot,
+        like=settings.ranges_from,
+        allow_unmatched=bool(settings.allow_unmatched),
+    )
     start = None
     if settings.init_checkpoint is not None:
         start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
@@ -94,6 +99,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
             "file": None if gains_file is None else gains_file.name,
             "sha256": gains.sha256,
             "virtual": gains.virtual,
+            "unmatched": dict(gains.unmatched),
         },
         "start_sha256": start_sha256,
         "phases": {},
@@ -148,9 +154,10 @@ def run_gains(folder: RunFolder, robot: RobotSpec) -> TrainingGains:
             f"{folder.gains}: missing or changed since the run began; put the file with SHA-256 "
             f"{recorded['sha256'][:12]}... back, or begin a new run."
         )
+    # What the run began with was accepted then; its hash says that this is the same file.
     if recorded["name"] == NAIVE:
-        return training_gains(NAIVE, robot, like=folder.gains)
-    return training_gains(folder.gains, robot)
+        return training_gains(NAIVE, robot, like=folder.gains, allow_unmatched=True)
+    return training_gains(folder.gains, robot, allow_unmatched=True)
 
 
 def _env_cfg(task: Task, gains: TrainingGains, settings: TrainSettings) -> Any:
@@ -178,6 +185,8 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
         gains_text += f" {ranges_text}of {gains['file']}"
         if gains["virtual"]:
             gains_text += " (of the virtual robot)"
+        if gains.get("unmatched"):
+            gains_text += f" (NO MATCH of {', '.join(gains['unmatched'])})"
     device_text = "cpu"
     if len(gpus) == 1:
         device_text = "cuda"
@@ -239,13 +248,13 @@ def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
             f"rl_cfg of {settings.robot} gives a {type(agent).__name__}; expected the "
             "JumpRunnerCfg of jump_rl_cfg, changed as needed."
         )
-    agent.save_interval = settings.save_interval
-    agent.logger = settings.logger
+    agent.save_interval = settings.session.save_interval
+    agent.logger = settings.session.logger
     agent.wandb_project = "pronk"
     agent.show_progress = True
     agent.start_sha256 = folder.read()["start_sha256"]
-    if settings.minutes is not None:
-        agent.stop_at = time.time() + 60.0 * settings.minutes
+    if settings.session.minutes is not None:
+        agent.stop_at = time.time() + 60.0 * settings.session.minutes
     if checkpoint.latest_checkpoint(folder.path) is not None:
         agent.resume = True
         agent.load_run = f"^{re.escape(folder.path.resolve().name)}$"

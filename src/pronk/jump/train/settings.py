@@ -24,6 +24,18 @@ class DeviceSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SessionSettings:
+    """Settings of one session, which do not decide the result of a run."""
+
+    save_interval: int = 50
+    """Iterations between checkpoints."""
+    minutes: float | None = None
+    """Stop at a checkpoint after so long; --resume goes on from there."""
+    logger: Literal["tensorboard", "wandb"] = "tensorboard"
+    """Where the curves go."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainSettings:
     """Settings of a run. None: left out, so the default or, with `resume`, that of the run."""
 
@@ -38,6 +50,8 @@ class TrainSettings:
     """gains.yaml of `pronk match`, or naive: the nominal gains of the real drives."""
     ranges_from: Path | None = None
     """With naive gains: the gains.yaml whose ranges and delay are used."""
+    allow_unmatched: bool | None = None
+    """Train with gains of joints that are no match too; the policy is marked."""
     init_checkpoint: Path | None = None
     """jump: folder of a walking run, or one of its checkpoints."""
     envs: int | None = None
@@ -53,20 +67,18 @@ class TrainSettings:
     )
     resume: bool = False
     """Continue the run in --out; options left out are those of the run."""
-    save_interval: int = 50
-    """Iterations between checkpoints."""
-    minutes: float | None = None
-    """Stop at a checkpoint after so long; --resume goes on from there."""
-    logger: Literal["tensorboard", "wandb"] = "tensorboard"
-    """Where the curves go."""
+    session: Annotated[SessionSettings, tyro.conf.arg(name="")] = field(
+        default_factory=SessionSettings
+    )
 
     def __post_init__(self) -> None:
         """Refuse values out of range and options that do not go together."""
         self._check_whole_number("envs", self.envs, minimum=2)
         self._check_whole_number("seed", self.seed, minimum=0)
-        self._check_whole_number("save-interval", self.save_interval, minimum=1)
-        if self.minutes is not None and not self.minutes > 0.0:
-            raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
+        self._check_whole_number("save-interval", self.session.save_interval, minimum=1)
+        minutes = self.session.minutes
+        if minutes is not None and not minutes > 0.0:
+            raise PronkError(f"--minutes is {minutes:g}; expected more than 0.")
         if self.ranges_from is not None and self.gains not in (None, "naive"):
             raise PronkError(
                 f"--ranges-from {self.ranges_from} goes with --gains naive; {self.gains} has its "
@@ -137,6 +149,7 @@ class TrainSettings:
             envs=4096 if self.envs is None else self.envs,
             seed=1 if self.seed is None else self.seed,
             ellipsoid=False if self.ellipsoid is None else self.ellipsoid,
+            allow_unmatched=bool(self.allow_unmatched),
         )
 
     def resumed(self, stored: Mapping[str, Any]) -> Self:
@@ -150,8 +163,9 @@ class TrainSettings:
         """
         for name, value in self.stored_values().items():
             is_given = value is not None and value != []
-            if is_given and value != stored[name]:
-                stored_text = "none" if stored[name] is None else stored[name]
+            stored_value = stored.get(name)
+            if is_given and value != stored_value:
+                stored_text = "none" if stored_value is None else stored_value
                 raise PronkError(
                     f"--resume: --{name.replace('_', '-')} is {value}, but the run in {self.out} "
                     f"has {stored_text}; leave it out to continue that run, or give a new --out."
@@ -166,6 +180,8 @@ class TrainSettings:
             envs=stored["envs"],
             seed=stored["seed"],
             ellipsoid=stored["ellipsoid"],
+            # Runs of earlier versions had no joints that are no match.
+            allow_unmatched=stored.get("allow_unmatched", False),
             phase=tuple(stored["phase"]),
         )
 
@@ -180,6 +196,7 @@ class TrainSettings:
             "envs": self.envs,
             "seed": self.seed,
             "ellipsoid": self.ellipsoid,
+            "allow_unmatched": self.allow_unmatched,
             "phase": list(self.phase),
         }
 

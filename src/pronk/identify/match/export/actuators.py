@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -31,6 +32,8 @@ class Actuator:
     """Names of the same joints in the models of the robot's maker."""
     unmatched: tuple[str, ...]
     """Joints without a match of their own, which have the gains of their group."""
+    no_match: Mapping[str, tuple[str, ...]]
+    """Joints that are no match, with the reasons."""
     stiffness: float
     """Stiffness [N m/rad]."""
     damping: float
@@ -149,11 +152,14 @@ def _actuator(
     names = []
     maker_names = []
     unmatched = []
+    no_match = {}
     for joint in joints:
         names.append(joint.name)
         maker_names.append(joint.own_name or joint.name)
         if joint.name not in gains.joints:
             unmatched.append(joint.name)
+        elif joint.name in gains.unmatched:
+            no_match[joint.name] = gains.unmatched[joint.name]
     armatures = []
     frictions = []
     stribecks = []
@@ -169,6 +175,7 @@ def _actuator(
         joints=tuple(names),
         maker_joints=tuple(maker_names),
         unmatched=tuple(unmatched),
+        no_match=no_match,
         stiffness=stiffness,
         damping=damping,
         stiffness_range=_range_about(stiffness, group_gains.stiffness_range),
@@ -207,11 +214,19 @@ def profile_held(gains: MatchedGains) -> Profile:
 
 
 def robot_of(gains: MatchedGains) -> RobotSpec:
-    """Load the robot of some gains by its name.
+    """Load the robot of some gains, from its file or by its name.
 
     Raises:
-        PronkError: There is no robot of that name.
+        PronkError: The file is not there any more, or there is no robot of that name.
+        RobotError: The file cannot be read.
     """
+    if gains.robot_path:
+        if not Path(gains.robot_path).is_file():
+            raise PronkError(
+                f"the robot of the gains was {gains.robot_path}, which is not there; give "
+                "--robot PATH, the robot.yaml or model that they were matched with."
+            )
+        return load_robot(gains.robot_path)
     try:
         return load_robot(gains.robot)
     except RobotError:

@@ -9,7 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pronk.identify.match.export.actuators import Actuator
-from pronk.identify.match.export.target import ExportTarget, argument_text, delay_steps
+from pronk.identify.match.export.target import (
+    ExportTarget,
+    argument_text,
+    delay_steps,
+    no_match_text,
+)
 from pronk.identify.simulators.profiles import Profile
 from pronk.robots.robot import RobotSpec
 
@@ -44,11 +49,15 @@ def newton_layer(
                 f"{argument_text(actuator, PASSIVE_ARGUMENTS, form)}"
                 "        }\n"
             )
+            mark = no_match_text(actuator, "            # ")
+            if mark:
+                mark += "\n"
             prims += (
                 f'        def NewtonActuator "{name}_actuator" (\n'
                 f"            prepend apiSchemas = [{schemas}]\n"
                 "        )\n"
                 "        {\n"
+                f"{mark}"
                 f"            rel newton:targets = </Robot/joints/{name}>\n"
                 f"{argument_text(actuator, target.arguments, form)}"
                 f"{delay}"

@@ -9,6 +9,7 @@ from pronk.identify.match.export.target import (
     ExportTarget,
     argument_text,
     delay_steps,
+    no_match_text,
     number_text,
 )
 from pronk.identify.simulators.profiles import Profile
@@ -26,7 +27,7 @@ def mjlab_config(
     events = ""
     for index, actuator in enumerate(actuators):
         entries += (
-            f"    {target.config_class}(  # {actuator.name}\n"
+            f"    {target.config_class}(  # {actuator.name}{no_match_text(actuator, ', ')}\n"
             f"        target_names_expr={_names_text(actuator.maker_joints)},\n"
             f"{_argument_lines(target, actuator, profile)}"
             "    ),\n"
@@ -66,7 +67,8 @@ def isaaclab_config(
             f"        joint_names_expr={list(actuator.maker_joints)!r},\n"
             f"{_argument_lines(target, actuator, profile)}"
             f"    ),  # draw stiffness from {_range_text(actuator.stiffness_range)}, "
-            f"damping from {_range_text(actuator.damping_range)}\n"
+            f"damping from {_range_text(actuator.damping_range)}"
+            f"{no_match_text(actuator, '; ')}\n"
         )
     return f"from isaaclab.actuators import {target.config_class}\n\nACTUATORS = {{\n{entries}}}\n"
 
@@ -136,7 +138,8 @@ def _joints_dict(target: ExportTarget, actuators: Sequence[Actuator]) -> str:
     for actuator in actuators:
         arguments = argument_text(actuator, target.arguments, "{}={}, ").strip()
         for name in actuator.maker_joints:
-            lines += f'    "{name}": dict({arguments}),\n'
+            mark = no_match_text(actuator, "  # ")
+            lines += f'    "{name}": dict({arguments}),{mark}\n'
     return f"JOINTS = {{\n{lines}}}\n"
 
 

@@ -59,6 +59,18 @@ def argument_text(actuator: Actuator, arguments: Mapping[str, str], form: str) -
     return text
 
 
+def no_match_text(actuator: Actuator, begin: str = "") -> str:
+    """Return the mark of an actuator with joints that are no match; empty for all others.
+
+    Args:
+        actuator: The actuator.
+        begin: Text before the mark.
+    """
+    if not actuator.no_match:
+        return ""
+    return f"{begin}NO MATCH: {', '.join(actuator.no_match)}"
+
+
 def delay_steps(actuator: Actuator, profile: Profile) -> int:
     """Return the delay of an actuator in physics steps of a framework, to the nearest."""
     return round(actuator.delay_s / profile.timestep_s)

@@ -38,7 +38,7 @@ from pronk.identify.match.export.python_config import (
     playground_config,
 )
 from pronk.identify.match.export.target import ExportTarget
-from pronk.identify.match.gains import MatchedGains
+from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.simulators.profiles import Profile, profile
 from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
@@ -226,7 +226,12 @@ TARGETS: Mapping[str, ExportTarget] = {
 
 
 def export(
-    gains: MatchedGains, target: str, robot: RobotSpec | None = None, *, per: Per = "group"
+    gains: MatchedGains,
+    target: str,
+    robot: RobotSpec | None = None,
+    *,
+    per: Per = "group",
+    allow_unmatched: bool = False,
 ) -> str:
     """Write matched gains as actuator configuration of a simulator.
 
@@ -234,14 +239,17 @@ def export(
         gains: Matched gains, as of `pronk.match` or `gains.yaml`.
         target: What reads the text, a name in `TARGETS`, for instance `mjlab`, `isaaclab-dcmotor`
             or `mjcf`. It must have the drive law and the step that the gains hold for.
-        robot: The robot that the gains were matched for; found by its name if left out.
+        robot: The robot that the gains were matched for; found by the gains if left out.
         per: `group` for one actuator a joint group, with the group's gains; `joint` for one a
             joint, with its own.
+        allow_unmatched: Also export joints that are no match. The header names each of them with
+            its reasons.
 
     Returns:
         Text of a Python, USD or XML file. Its header says what must be set beside it.
 
     Raises:
+        UnmatchedError: A joint is no match.
         PronkError: The target is unknown or has another drive law or step than the gains, the
             gains hold no group or are not stable, or the robot is unknown.
 
@@ -253,6 +261,7 @@ def export(
     """
     if target not in TARGETS:
         raise PronkError(f"no export to {target!r}; expected one of {', '.join(TARGETS)}.")
+    require_matched(gains, allow_unmatched)
     export_target = TARGETS[target]
     gains_profile = profile_held(gains)
     _check_profile(target, gains_profile)
@@ -261,6 +270,7 @@ def export(
     limit_share = require_stable(gains_profile, simulated_robot, actuators)
 
     sentences = [
+        *_no_match(actuators),
         *_conditions(gains, export_target, gains_profile, simulated_robot),
         *_stability(gains_profile, limit_share),
         *_losses(export_target, actuators, gains_profile),
@@ -306,6 +316,16 @@ def _law_text(held_profile: Profile) -> str:
     )
 
 
+def _no_match(actuators: Sequence[Actuator]) -> list[str]:
+    """Name the joints that are no match, one sentence each."""
+    sentences = []
+    for actuator in actuators:
+        for name, reasons in actuator.no_match.items():
+            sentences.append(f"NO MATCH of {name}, whose gains are not to be trusted: ")
+            sentences[-1] += "; ".join(reasons)
+    return sentences
+
+
 def _conditions(
     gains: MatchedGains, target: ExportTarget, gains_profile: Profile, robot: RobotSpec
 ) -> list[str]:
@@ -321,8 +341,9 @@ def _conditions(
         iterations=law.iterations,
         substeps=robot.decimation * law.iterations,
     )
+    made = "fitted but not matched" if gains.unmatched else "matched"
     return [
-        f"Gains of {gains.robot}, matched by pronk for {gains_profile.name} "
+        f"Gains of {gains.robot}, {made} by pronk for {gains_profile.name} "
         f"({gains_profile.framework}).",
         f"They hold for {engine}, {simulator.actuator}, drive law {law.label}, timestep "
         f"{timestep_s:g} s, decimation {robot.decimation}.",

@@ -276,6 +276,10 @@ class PronkRunner(MjlabOnPolicyRunner):
             "ranges_sha256": motion_command(env).cfg.gains.sha256,
             "start_sha256": self.cfg.get("start_sha256", ""),
         }
+        unmatched = motion_command(env).cfg.gains.unmatched
+        if unmatched:
+            # Joints that were no match, with the reasons (`pronk train --allow-unmatched`).
+            provenance["unmatched"] = {joint: list(reasons) for joint, reasons in unmatched.items()}
         contract = contract_for(env.cfg, jump=PHASES[phase].jump, provenance=provenance)
         actor = self.alg.get_policy()
         export_policy(actor, contract, path)
