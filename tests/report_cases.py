@@ -145,7 +145,7 @@ def joint_result(name: str, leg: int = 0, *, virtual: bool = True) -> JointResul
     )
     return JointResult(
         joint=fit.joint,
-        gains=joint_gains(fit, load_robot(ROBOT), compared),
+        gains=joint_gains(fit, ROBOT, compared),
         fit=fit,
         responses=compared,
         grid=GridSearch(

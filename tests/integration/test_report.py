@@ -145,7 +145,8 @@ def test_a_joint_without_a_match_is_a_warning(tmp_path: Path) -> None:
     result = match(legs=1)
     warning = "no match: the best gains miss the measured response by 2 dB RMS"
     knee = result.joints["FR_knee"]
-    bad = replace(knee, gains=replace(knee.gains, flags=(warning,)))
+    marked = replace(knee.gains, flags=(warning,), matched=False, reasons=(warning,))
+    bad = replace(knee, gains=marked)
     write_match(tmp_path, replace(result, joints={**result.joints, "FR_knee": bad}))
     part = match_page.match_part(tmp_path / "match.npz")
     assert part.warning
