@@ -14,6 +14,7 @@ SUMMARIES = {
     "engine": "The same drive at 0.25 ms and at 5 ms.",
     "coverage": "How often the 95 % intervals hold.",
     "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
+    "foreign": "Robots of public packages to an export; honest and faulty logs of their joints.",
     "plan": "The forecast of a sweep beside plain MuJoCo.",
     "latency": "Lateness of the control loop, and policy latency.",
     "supervision": "False alarms and detection times of the sensors' supervision.",
@@ -27,10 +28,13 @@ SUMMARIES = {
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }
+MODULES = {"foreign": "foreign.command"}
+"""Modules whose names are not those of their benchmarks."""
 
 if __name__ == "__main__":
     commands = {}
     for name, summary in SUMMARIES.items():
-        module = name.replace("-", "_")
-        commands[name] = (f"benchmarks.{module}:{module}", summary)
+        function = name.replace("-", "_")
+        module = MODULES.get(name, function)
+        commands[name] = (f"benchmarks.{module}:{function}", summary)
     sys.exit(run(sys.argv[1:], commands, "python -m benchmarks"))
