@@ -68,7 +68,7 @@ from pronk.processes import die_with_parent
 from pronk.report import deploy_run
 from pronk.robots import load_robot
 from pronk.robots.bare import yaml_of_model
-from pronk.robots.load import read_model, read_robot
+from pronk.robots.load import read_robot
 from pronk.robots.robot import RobotSpec
 from pronk.tables import Cell, Column, Table
 
@@ -243,7 +243,6 @@ def _formats() -> dict[str, _Format]:
         return load_match(path)
 
     def model(path: Path) -> None:
-        read_model.cache_clear()
         yaml_of_model(path)
         load_robot(path)
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
 from pronk.cli import console
 from pronk.errors import RobotError
 from pronk.tables import Column, Table
-
-if TYPE_CHECKING:
-    from pronk.robots.robot import Joint
 
 Action = Literal["new", "check"]
 
@@ -48,27 +45,44 @@ def robot(
 
 
 def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
-    """Write the robot.yaml of a model."""
+    """Write the robot.yaml of a model, and say what cannot be used or is assumed."""
     from pronk.files import write_text
-    from pronk.robots.bare import yaml_of_model
+    from pronk.robots.bare import describe_model, yaml_of_model
 
     if target.exists() and not overwrite:
         raise RobotError(f"{target} exists; give another --out, or --overwrite.")
     if target.parent.resolve() != model.parent.resolve():
         raise RobotError(f"--out {target}: the robot.yaml belongs beside its model {model}.")
-    write_text(target, yaml_of_model(model))
-    console.say(f"wrote {target}")
+    text = yaml_of_model(model)
+    write_text(target, text)
+    description = describe_model(model)
+    for note in description.notes:
+        console.warn(note)
+    if description.held_joints:
+        console.say(_held_sentence(tuple(description.held_joints)))
+    assumed = []
+    for name, group in description.file.groups.items():
+        if group.servo != "position":
+            assumed.append(name)
+    if assumed:
+        console.say(f"without a position servo, gains assumed: {', '.join(assumed)}")
+    console.say(f"wrote {target}; {text.count('# CHECK')} of its lines are marked CHECK")
     console.following(f"pronk robot check {target}")
+
+
+def _held_sentence(names: tuple[str, ...]) -> str:
+    """Say which joints are held."""
+    return f"held at the pose, as they are no hinges or have no drive: {', '.join(names)}"
 
 
 def _check_robot(path: Path) -> None:
     """Print the joints of a robot, and what is missing or inconsistent."""
     from pronk.robots import load_robot
+    from pronk.robots.consistency import problems_of
     from pronk.robots.model import bench_spec
 
     robot_spec = load_robot(path)
     rows = []
-    problems = []
     for joint in robot_spec.joints:
         bench_spec(robot_spec, joint.name).compile()
         row = (
@@ -81,22 +95,11 @@ def _check_robot(path: Path) -> None:
             " ".join(joint.clamped),
         )
         rows.append(row)
-        problems.extend(_problems(joint))
+    problems = problems_of(robot_spec)
     title = f"{robot_spec.name}: {len(robot_spec.joints)} joints"
     console.show(Table(title=title, columns=COLUMNS, rows=tuple(rows)))
+    if robot_spec.held_joints:
+        console.say(_held_sentence(robot_spec.held_joints))
     for problem in problems:
         console.warn(problem)
     console.say(f"{len(problems)} to check" if problems else "nothing is inconsistent")
-
-
-def _problems(joint: Joint) -> list[str]:
-    """List what is missing or inconsistent about a joint."""
-    problems = []
-    low, high = joint.range
-    if not low < joint.default_position < high:
-        problems.append(f"poses.default of {joint.name} is outside of its range")
-    if joint.drive.armature <= 0.0:
-        problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
-    if joint.drive.frictionloss <= 0.0:
-        problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
-    return problems

@@ -41,11 +41,21 @@ def load_robot(name: str | Path) -> RobotSpec:
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> robot.joint("FR_knee").drive.effort_limit
     """
-    path = Path(name)
+    path = robot_path(name)
+    try:
+        robot = _read(path.resolve(), path.stat().st_mtime_ns)
+    except OSError:
+        raise RobotError(f"{path}: no such file.") from None
     shipped = str(name) in ROBOT_NAMES
-    if shipped:
-        path = Path(__file__).parent / str(name) / "robot.yaml"
-    elif not path.exists():
+    return replace(robot, source=str(name) if shipped else str(path.resolve()))
+
+
+def robot_path(name: str | Path) -> Path:
+    """Return the robot.yaml or the model of a robot; see `load_robot`."""
+    if str(name) in ROBOT_NAMES:
+        return Path(__file__).parent / str(name) / "robot.yaml"
+    path = Path(name)
+    if not path.exists():
         installed = entry_points(group="pronk.robots")
         if str(name) not in installed.names:
             raise RobotError(
@@ -57,22 +67,19 @@ def load_robot(name: str | Path) -> RobotSpec:
         path = path / "robot.yaml"
     if path.suffix not in ROBOT_SUFFIXES + MODEL_SUFFIXES:
         raise RobotError(f"{path}: expected a robot.yaml, or a model ending in .xml or .urdf.")
-    try:
-        robot = _read(path.resolve(), path.stat().st_mtime_ns)
-    except OSError:
-        raise RobotError(f"{path}: no such file.") from None
-    return replace(robot, source=str(name) if shipped else str(path.resolve()))
+    return path
 
 
 @lru_cache
 def _read(path: Path, _modified_ns: int) -> RobotSpec:
     """Read a robot file or a model once for each time of its last modification."""
     from pronk.robots.bare import file_of_model
-    from pronk.robots.load import make_robot, read_model, read_robot
+    from pronk.robots.load import make_robot, read_robot
+    from pronk.robots.source_model import read_source
 
     if path.suffix in MODEL_SUFFIXES:
-        return make_robot(file_of_model(path), read_model(path), str(path))
+        return make_robot(file_of_model(path), read_source(path), str(path))
     return read_robot(path)
 
 
-__all__ = ["ROBOT_NAMES", "Drive", "Joint", "RobotSpec", "load_robot"]
+__all__ = ["ROBOT_NAMES", "Drive", "Joint", "RobotSpec", "load_robot", "robot_path"]

@@ -1,77 +1,132 @@
-"""A usable robot from a bare MJCF or URDF, and the `robot.yaml` that a user then corrects."""
+"""A usable robot from a bare MJCF or URDF, and the `robot.yaml` that a user then corrects.
+
+Each number has a mark: `read` from the model, `derived` from its numbers by a stated rule, or
+`CHECK` where the model says nothing and the number is an assumption.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
-from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, RobotFile, read_model
+from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, HeldPosition, RobotFile
+from pronk.robots.servos import JointServo, joint_servos
+from pronk.robots.source_model import SourceModel, read_source
 
 NATURAL_HZ = 3.0
-"""Natural frequency of a joint under its nominal gains, where the model has no position servo [Hz]:
-a few times that of a leg that swings freely, so that the joint holds its pose."""
+"""Natural frequency of a joint under assumed gains [Hz]: a few times that of a leg that swings
+freely, so that the joint holds its pose."""
 DAMPING_RATIO = 0.7
 """Damping ratio of such a joint: the step response overshoots by 5 %."""
+SWING = 0.2
+"""Angle at which assumed gains ask for all the torque that gravity leaves of the effort limit
+[rad]."""
 NO_LOAD_SPEED = 30.0
 """No-load speed where the model does not say one [rad/s]; typical of geared robot joints."""
 BAND_HZ = (0.2, 10.0)
 """Band of a joint of which nothing is known [Hz]."""
+STOP_DISTANCE = 0.4
+"""Distance of the pose from a stop, for a sweep of 0.25 rad and its overshoot [rad]."""
+STOP_SHARE = 0.4
+"""Largest distance as a share of the range, so that a small range has room on both sides."""
+DECIMATIONS = (4, 5, 10, 20, 40)
+"""Physics steps of a command at 50 Hz: steps of 5, 4, 2, 1 and 0.5 ms."""
+COMMAND_HZ = 50.0
+"""Rate of the commands [Hz]."""
+JOINT_KINDS = {
+    mujoco.mjtJoint.mjJNT_FREE: "free",
+    mujoco.mjtJoint.mjJNT_BALL: "ball",
+    mujoco.mjtJoint.mjJNT_SLIDE: "slide",
+    mujoco.mjtJoint.mjJNT_HINGE: "hinge",
+}
+"""Names of the kinds of joints."""
+
+Mark = Literal["read", "derived", "CHECK"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Servo:
-    """What the actuators of a model say of one joint."""
+class Remark:
+    """Where a number of a robot.yaml comes from."""
 
-    stiffness: float
-    """Stiffness [N m/rad]."""
-    damping: float
-    """Damping [N m s/rad]."""
-    effort_limit: float
-    """Largest torque [N m]."""
+    mark: Mark
+    """Whether it was read, derived by a rule, or is to be checked because it is assumed."""
+    text: str
+    """The place in the model, or the rule."""
+
+    @property
+    def comment(self) -> str:
+        """The remark as the comment behind a line."""
+        return f"  # {self.mark}: {self.text}"
 
 
-def file_of_model(path: Path) -> RobotFile:
-    """Describe a bare model: each hinge is a group of its own.
+@dataclass(frozen=True, kw_only=True)
+class ModelDescription:
+    """A bare model as a robot file, with a remark on each of its numbers."""
 
-    Gains are those of the model's position servos, else they give the joint a natural frequency of
-    3 Hz and a damping ratio of 0.7 in the default pose. Effort limits come from the actuators or
-    joints, else they are twice the torque of gravity and 0.5 rad of stiffness. The default pose is
-    the keyframe `home` or the first one, else zero, moved into the ranges.
+    file: RobotFile
+    """The robot."""
+    remarks: Mapping[tuple[str, str], Remark]
+    """Joint and name of the number to the remark."""
+    notes: tuple[str, ...]
+    """Sentences on what the model lacks, and on what was left out."""
+    held_joints: Mapping[str, str]
+    """Joint that is held to the reason, in the words of a comment."""
+
+
+def describe_model(path: Path) -> ModelDescription:
+    """Describe a bare model: each hinge that something drives is a group of its own.
+
+    Gains are those of the model's position servos. Joints without one get gains that give a natural
+    frequency of 3 Hz and a damping ratio of 0.7 in the default pose. Effort limits are those of
+    actuators or joints, else twice the torque of gravity and of 0.5 rad of stiffness. The default
+    pose is the keyframe `home` or the first one, else zero, moved away from the stops. Slides, ball
+    joints, joints that follow another one, and hinges without an actuator in a model with
+    actuators are held at that pose.
 
     Args:
         path: MJCF or URDF.
 
     Raises:
-        RobotError: The model has no hinge, or cannot be read.
+        RobotError: The model cannot be read or has no hinge that could be driven.
     """
-    read_model(path)
-    spec = mujoco.MjSpec.from_file(str(path))
-    spec.compiler.fusestatic = False
-    model = spec.compile()
-    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
-    if not len(hinges):
-        raise RobotError(f"{path}: the model has no hinge joint.")
+    source = read_source(path)
+    model = source.model
+    if not source.hinges:
+        raise RobotError(
+            f"{path}: the model has no hinge joint, which is what pronk matches; it has "
+            f"{model.njnt} slides, ball and free joints."
+        )
+    qpos, moves = _default_pose(source)
+    servos = joint_servos(model, qpos)
+    held_joints = _held_joints(source, servos, qpos)
+    hinges = [index for index in source.hinges if source.joint_names[index] not in held_joints]
+    if not hinges:
+        raise RobotError(
+            f"{path}: no hinge joint of the model has an actuator, and all are held: "
+            f"{', '.join(held_joints)}."
+        )
     data = mujoco.MjData(model)
-    data.qpos[:] = _default_pose(model, data, hinges)
+    data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
+    gravity = np.abs(data.qfrc_bias - data.qfrc_passive)
 
     drives = {}
     groups = {}
     pose = {}
-    stiffnesses = []
-    dampings = []
+    remarks: dict[tuple[str, str], Remark] = {}
     for hinge in hinges:
-        name = model.joint(hinge).name
+        name = source.joint_names[hinge]
         dof = model.jnt_dofadr[hinge]
         inertia = float(mass[dof, dof])
         if not 0.0 < inertia < math.inf:
@@ -79,83 +134,257 @@ def file_of_model(path: Path) -> RobotFile:
                 f"{path}: the inertia about joint {name} is {inertia:g} kg m^2; expected a "
                 "positive number. Check its axis and the masses behind it."
             )
-        servo = _servo(model, int(hinge), inertia, abs(float(data.qfrc_bias[dof])))
-        if not servo.effort_limit > 0.0:
-            raise RobotError(
-                f"{path}: the effort limit of {name} is {servo.effort_limit:g} N m; expected a "
-                "positive one (effort in a URDF, forcerange or actuatorfrcrange in MJCF)."
-            )
-        drives[name] = DriveEntry(
-            effort_limit=_short(servo.effort_limit),
-            armature=float(model.dof_armature[dof]),
-            stall_torque=_short(2.0 * servo.effort_limit),
-            no_load_speed=NO_LOAD_SPEED,
-            frictionloss=float(model.dof_frictionloss[dof]),
-            viscous_damping=float(model.dof_damping[dof]),
+        servo = servos[hinge]
+        group, drive, joint_remarks = _joint_entries(
+            source, hinge, servo, inertia, float(gravity[dof])
         )
-        stiffness = _short(servo.stiffness)
-        damping = _short(servo.damping)
-        groups[name] = GroupEntry(drive=name, stiffness=stiffness, damping=damping, band_hz=BAND_HZ)
-        if stiffness:
-            stiffnesses.append(stiffness)
-        if damping:
-            dampings.append(damping)
-        pose[name] = _short(float(data.qpos[model.jnt_qposadr[hinge]]))
-    return RobotFile(
-        schema=SCHEMA,
-        name=path.stem,
-        model=path.name,
-        drives=drives,
-        groups=groups,
-        poses={"default": pose},
-        grid_stiffness=(_short(0.3 * min(stiffnesses)), _short(3.0 * max(stiffnesses))),
-        grid_damping=(_short(0.1 * min(dampings)), _short(4.0 * max(dampings))),
+        groups[name] = group
+        drives[name] = drive
+        for number, remark in joint_remarks.items():
+            remarks[name, number] = remark
+        pose[name] = _short(float(qpos[model.jnt_qposadr[hinge]]))
+        remarks[name, "pose"] = moves[hinge]
+    decimation = _stable_decimation(model, hinges, mass, groups, source.joint_names)
+    held_positions = {}
+    for name in held_joints:
+        held_positions[name] = _held_position(source, source.joint_names.index(name), qpos)
+    return ModelDescription(
+        file=RobotFile(
+            schema=SCHEMA,
+            name=path.stem,
+            model=path.name,
+            drives=drives,
+            groups=groups,
+            poses={"default": pose},
+            held=held_positions,
+            policy_rate_hz=COMMAND_HZ,
+            timestep_s=1.0 / (COMMAND_HZ * decimation),
+            decimation=decimation,
+        ),
+        remarks=remarks,
+        notes=source.notes,
+        held_joints=held_joints,
     )
 
 
-def _default_pose(model: mujoco.MjModel, data: mujoco.MjData, hinges: NDArray[np.int64]) -> Array:
-    """Return the pose of the keyframe `home` or the first one, else zero, inside the ranges."""
-    pose = np.array(data.qpos)
+def file_of_model(path: Path) -> RobotFile:
+    """Describe a bare model as a robot file; see `describe_model`."""
+    return describe_model(path).file
+
+
+def _default_pose(source: SourceModel) -> tuple[Array, dict[int, Remark]]:
+    """Return the pose of the keyframe `home` or the first one, else zero, away from the stops."""
+    model = source.model
+    pose = model.qpos0.copy()
+    origin = Remark(mark="CHECK", text="0, as the model has no keyframe")
     if model.nkey:
         keys = [model.key(index).name for index in range(model.nkey)]
-        pose[:] = model.key_qpos[keys.index("home") if "home" in keys else 0]
-    for hinge in hinges:
-        if model.jnt_limited[hinge]:
-            address = model.jnt_qposadr[hinge]
-            low, high = model.jnt_range[hinge]
-            if not low < pose[address] < high:
-                pose[address] = 0.5 * (low + high)
-    return pose
-
-
-def _servo(model: mujoco.MjModel, hinge: int, inertia: float, gravity: float) -> _Servo:
-    """Return gains and effort limit of a joint, by its actuators or else by its inertia.
-
-    `gravity` is the torque that holds the joint in the default pose [N m].
-    """
-    stiffness = inertia * (2.0 * math.pi * NATURAL_HZ) ** 2
-    damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
-    effort_limit = 2.0 * (gravity + 0.5 * stiffness)
-    if model.jnt_actfrclimited[hinge]:
-        effort_limit = float(model.jnt_actfrcrange[hinge, 1])
-    for index in range(model.nu):
-        moves_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
-        if not moves_joint or model.actuator_trnid[index, 0] != hinge:
+        number = keys.index("home") if "home" in keys else 0
+        pose[:] = model.key_qpos[number]
+        mujoco.mj_normalizeQuat(model, pose)
+        origin = Remark(mark="read", text=f"keyframe {keys[number] or number}")
+    remarks = {}
+    for index in range(model.njnt):
+        remarks[index] = origin
+        joint_type = model.jnt_type[index]
+        moves = joint_type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        if not moves or not model.jnt_limited[index]:
             continue
-        gear = abs(float(model.actuator_gear[index, 0]))
-        is_servo = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
-        if is_servo and gear == 1.0:
-            stiffness = float(model.actuator_gainprm[index, 0]) or stiffness
-            damping = -float(model.actuator_biasprm[index, 2]) or damping
-        elif model.actuator_ctrllimited[index] and not model.actuator_forcelimited[index]:
-            effort_limit = gear * float(model.actuator_ctrlrange[index, 1])
-        if model.actuator_forcelimited[index]:
-            effort_limit = gear * float(model.actuator_forcerange[index, 1])
-    return _Servo(stiffness=stiffness, damping=damping, effort_limit=effort_limit)
+        address = model.jnt_qposadr[index]
+        low, high = model.jnt_range[index]
+        distance = 0.0
+        if joint_type == mujoco.mjtJoint.mjJNT_HINGE:
+            distance = min(STOP_DISTANCE, STOP_SHARE * (high - low))
+        angle = float(np.clip(pose[address], low + distance, high - distance))
+        if angle != pose[address]:
+            remarks[index] = Remark(
+                mark="derived",
+                text=f"moved from {pose[address]:.4g}, away from the stop "
+                f"(range {low:.4g} to {high:.4g})",
+            )
+            pose[address] = angle
+    return pose, remarks
+
+
+def _held_joints(
+    source: SourceModel, servos: tuple[JointServo, ...], qpos: Array
+) -> dict[str, str]:
+    """Return which joints are held at the pose, with the reason."""
+    model = source.model
+    has_actuators = any(servos[index].actuators for index in source.hinges)
+    held_joints = {}
+    for index, name in enumerate(source.joint_names):
+        joint_type = mujoco.mjtJoint(model.jnt_type[index])
+        servo = servos[index]
+        if joint_type == mujoco.mjtJoint.mjJNT_FREE:
+            if index != source.base_joint:
+                held_joints[name] = "a body of its own"
+        elif joint_type == mujoco.mjtJoint.mjJNT_SLIDE:
+            low, high = model.jnt_range[index]
+            held_joints[name] = "slide joint [m]"
+            if model.jnt_limited[index]:
+                held_joints[name] += f", range {low:.4g} to {high:.4g} m"
+            if math.isfinite(servo.effort_limit):
+                held_joints[name] += f", at most {servo.effort_limit:.4g} N"
+        elif joint_type == mujoco.mjtJoint.mjJNT_BALL:
+            held_joints[name] = "ball joint, a quaternion"
+        elif name in source.mimics:
+            held_joints[name] = f"follows {source.mimics[name]} in the URDF"
+        elif not source.has_mass(index):
+            held_joints[name] = "hinge with no mass behind it [rad]"
+        elif has_actuators and not servo.actuators:
+            held_joints[name] = "hinge without an actuator [rad]"
+    return held_joints
+
+
+def _held_position(source: SourceModel, index: int, qpos: Array) -> HeldPosition:
+    """Return the position at which a joint is held: a number, or the list of a quaternion."""
+    model = source.model
+    begin = model.jnt_qposadr[index]
+    joint_type = mujoco.mjtJoint(model.jnt_type[index])
+    if joint_type == mujoco.mjtJoint.mjJNT_FREE:
+        return tuple(float(value) for value in qpos[begin : begin + 7])
+    if joint_type == mujoco.mjtJoint.mjJNT_BALL:
+        return tuple(float(value) for value in qpos[begin : begin + 4])
+    return float(qpos[begin])
+
+
+def _joint_entries(
+    source: SourceModel, hinge: int, servo: JointServo, inertia: float, gravity: float
+) -> tuple[GroupEntry, DriveEntry, dict[str, Remark]]:
+    """Return the entries of a joint, and the remarks on their numbers.
+
+    `inertia` is that about the joint [kg m^2], `gravity` the torque that holds the pose [N m].
+    """
+    model = source.model
+    name = source.joint_names[hinge]
+    dof = model.jnt_dofadr[hinge]
+    remarks = {}
+    has_limit = 0.0 < servo.effort_limit < math.inf
+    names = ", ".join(servo.actuators)
+
+    if servo.servo_type == "position":
+        stiffness = servo.stiffness
+        damping = servo.damping
+        mark: Mark = "derived" if servo.is_shared else "read"
+        remarks["stiffness"] = Remark(mark=mark, text=f"kp x gear^2 of {names}")
+        remarks["damping"] = Remark(mark=mark, text=f"kv x gear^2 of {names}")
+        if servo.has_damper:
+            remarks["damping"] = Remark(
+                mark="derived", text=f"of {names}, the damper at its full control"
+            )
+        elif not damping:
+            remarks["damping"] = Remark(
+                mark="read", text=f"{names} has no kv; the joint has its own in drives"
+            )
+        if servo.is_shared:
+            shared = Remark(mark="CHECK", text=f"{names} moves other joints too; those standing")
+            remarks["stiffness"] = shared
+            remarks["damping"] = shared
+    else:
+        stiffness = inertia * (2.0 * math.pi * NATURAL_HZ) ** 2
+        rule = f"assumed, {NATURAL_HZ:g} Hz with {inertia:.3g} kg m^2"
+        if has_limit:
+            available = max(servo.effort_limit - gravity, 0.2 * servo.effort_limit) / SWING
+            if available < stiffness:
+                stiffness = available
+                rule = f"assumed, the effort limit less gravity at {SWING:g} rad"
+        damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
+        remarks["stiffness"] = Remark(mark="CHECK", text=rule)
+        remarks["damping"] = Remark(mark="CHECK", text=f"assumed, damping ratio {DAMPING_RATIO:g}")
+        if servo.servo_type == "velocity":
+            text = f"velocity servo {names} holds no position and damps by {servo.damping:.4g}"
+        elif servo.servo_type == "motor":
+            text = f"{names} is a motor, its gains are in no model"
+        else:
+            text = "a URDF has no gains" if source.is_urdf else "no actuator moves it"
+        remarks["servo"] = Remark(mark="read", text=text)
+
+    if has_limit:
+        effort_limit = servo.effort_limit
+        place = "effort of the joint's limit" if source.is_urdf else servo.effort_source
+        remarks["effort_limit"] = Remark(mark="read", text=place)
+        if servo.is_uneven or servo.is_shared:
+            reason = "the smaller of two unequal sides" if servo.is_uneven else "moves others too"
+            remarks["effort_limit"] = Remark(mark="CHECK", text=f"{place}; {reason}")
+    else:
+        effort_limit = _short(2.0 * (gravity + 0.5 * stiffness))
+        text = "the model has no limit; twice gravity and 0.5 rad of stiffness"
+        remarks["effort_limit"] = Remark(mark="CHECK", text=text)
+    remarks["stall_torque"] = Remark(mark="CHECK", text="assumed, twice the effort limit")
+    no_load_speed = NO_LOAD_SPEED
+    remarks["no_load_speed"] = Remark(mark="CHECK", text="assumed; the model has no speed limit")
+    if name in source.speed_limits:
+        no_load_speed = source.speed_limits[name]
+        remarks["no_load_speed"] = Remark(
+            mark="read", text="velocity of the joint's limit, as if it were the no-load speed"
+        )
+    passive = {
+        "armature": float(model.dof_armature[dof]) + servo.armature,
+        "frictionloss": float(model.dof_frictionloss[dof]),
+        "viscous_damping": float(model.dof_damping[dof]),
+    }
+    missing = {
+        "armature": "0 in the model; a real rotor has inertia",
+        "frictionloss": "0 in the model; a real gear has dry friction",
+    }
+    for number, value in passive.items():
+        remarks[number] = Remark(mark="read", text="the joint")
+        if not value and number in missing:
+            remarks[number] = Remark(mark="CHECK", text=missing[number])
+    for number in ("bus_voltage", "gear_ratio"):
+        remarks[number] = Remark(mark="CHECK", text="assumed; a model does not say it")
+    remarks["band_hz"] = Remark(mark="CHECK", text="assumed")
+
+    drive = DriveEntry(
+        effort_limit=effort_limit,
+        stall_torque=_short(2.0 * effort_limit),
+        no_load_speed=no_load_speed,
+        armature=passive["armature"],
+        frictionloss=passive["frictionloss"],
+        viscous_damping=passive["viscous_damping"],
+    )
+    if servo.servo_type != "position":
+        stiffness = _short(stiffness)
+        damping = _short(damping)
+    group = GroupEntry(
+        drive=name, stiffness=stiffness, damping=damping, band_hz=BAND_HZ, servo=servo.servo_type
+    )
+    return group, drive, remarks
+
+
+def _stable_decimation(
+    model: mujoco.MjModel,
+    hinges: list[int],
+    mass: Array,
+    groups: Mapping[str, GroupEntry],
+    names: tuple[str, ...],
+) -> int:
+    """Return the fewest physics steps of a command with which the explicit law is stable."""
+    dofs = model.jnt_dofadr[hinges]
+    inertia = mass[np.ix_(dofs, dofs)]
+    stiffness = np.diag([groups[names[hinge]].stiffness or 0.0 for hinge in hinges])
+    damping = np.diag([groups[names[hinge]].damping or 0.0 for hinge in hinges])
+    passive = np.diag(model.dof_damping[dofs])
+    identity = np.eye(len(hinges))
+    for decimation in DECIMATIONS:
+        step = 1.0 / (COMMAND_HZ * decimation)
+        scaled = np.linalg.pinv(inertia + step * passive) * step
+        speed_by_angle = -scaled @ stiffness
+        speed_by_speed = identity - scaled @ (damping + passive)
+        transition = np.block(
+            [
+                [identity + step * speed_by_angle, step * speed_by_speed],
+                [speed_by_angle, speed_by_speed],
+            ]
+        )
+        if np.max(np.abs(np.linalg.eigvals(transition))) < 1.0:
+            return decimation
+    return DECIMATIONS[-1]
 
 
 def yaml_of_model(path: Path) -> str:
-    """Write the `robot.yaml` of a bare model, with comments on what to check.
+    """Write the `robot.yaml` of a bare model, with a comment on each number.
 
     Args:
         path: MJCF or URDF.
@@ -163,53 +392,82 @@ def yaml_of_model(path: Path) -> str:
     Raises:
         RobotError: The model has no hinge, or cannot be read.
     """
-    file = file_of_model(path)
+    description = describe_model(path)
+    file = description.file
     drives = ""
     groups = ""
     pose = ""
     for name, drive in file.drives.items():
         group = file.groups[name]
-        group_entry = {
-            "drive": group.drive,
-            "stiffness": group.stiffness,
-            "damping": group.damping,
-            "band_hz": list(BAND_HZ),
+        numbers = {
+            "effort_limit": drive.effort_limit,
+            "stall_torque": drive.stall_torque,
+            "no_load_speed": drive.no_load_speed,
+            "bus_voltage": drive.bus_voltage,
+            "gear_ratio": drive.gear_ratio,
+            "armature": drive.armature,
+            "frictionloss": drive.frictionloss,
+            "viscous_damping": drive.viscous_damping,
         }
-        drives += f"""\
-  {_yaml(name)}:
-    effort_limit: {_yaml(drive.effort_limit)}
-    stall_torque: {_yaml(drive.stall_torque)}
-    no_load_speed: {_yaml(drive.no_load_speed)}
-    bus_voltage: {_yaml(drive.bus_voltage)}
-    gear_ratio: {_yaml(drive.gear_ratio)}
-    armature: {_yaml(drive.armature)}
-    frictionloss: {_yaml(drive.frictionloss)}
-    viscous_damping: {_yaml(drive.viscous_damping)}
-"""
-        groups += f"  {_yaml(name)}: {_yaml(group_entry)}\n"
-        pose += f"    {_yaml(name)}: {_yaml(file.poses['default'][name])}\n"
+        drives += f"  {_yaml(name)}:\n"
+        drives += _lines(description, name, numbers)
+        entries: dict[str, object] = {"drive": name}
+        if group.servo not in (None, "position"):
+            entries["servo"] = group.servo
+        entries["stiffness"] = group.stiffness
+        entries["damping"] = group.damping
+        entries["band_hz"] = list(BAND_HZ)
+        groups += f"  {_yaml(name)}:\n"
+        groups += _lines(description, name, entries)
+        angle = _yaml(file.poses["default"][name])
+        pose += f"    {_yaml(name)}: {angle}{description.remarks[name, 'pose'].comment}\n"
+    held_lines = ""
+    if description.held_joints:
+        held_lines = "\nheld:  # joints that stand still at these positions, and need no gains\n"
+        for name, reason in description.held_joints.items():
+            position = file.held[name]
+            value = list(position) if isinstance(position, tuple) else position
+            held_lines += f"  {_yaml(name)}: {_yaml(value)}  # {reason}\n"
+    notes = ""
+    for note in description.notes:
+        notes += f"# CHECK: {' '.join(note.split())}.\n"
+    step = "of the simulator that is matched"
+    if file.decimation != DECIMATIONS[0]:
+        step = "derived: the longest at which the explicit drive law is stable with these gains"
     return f"""\
-# Robot of {_yaml(path.name)}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,
-# then run `pronk robot check` on this file.
-schema: {file.schema}
+# Robot of {_yaml(path.name)}. Units: rad, N m, s, kg m^2, V, at the joint. Each number is read from
+# the model, derived from it, or assumed: check every line marked CHECK, then run
+# `pronk robot check` on this file.
+{notes}schema: {file.schema}
 name: {_yaml(file.name)}
 model: {_yaml(file.model)}
-policy_rate_hz: 50.0  # rate of the commands; timestep_s * decimation * rate must be 1
-timestep_s: 0.005     # of the simulator that is matched
-decimation: 4
-grid_stiffness: {_yaml(list(file.grid_stiffness))}  # range of `pronk match`'s search
-grid_damping: {_yaml(list(file.grid_damping))}
+# timestep_s * decimation * policy_rate_hz must be 1.
+policy_rate_hz: {_yaml(file.policy_rate_hz)}  # CHECK: rate of the commands
+timestep_s: {_yaml(file.timestep_s)}  # {step}
+decimation: {file.decimation}
+# grid_stiffness and grid_damping, the ranges of `pronk match --method paper`, follow from the gains
+# below unless they are given here.
 # legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints
 
-drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia
+drives:
 {drives}
-groups:  # CHECK: gains on the real drives; joints built alike may share a group, with
-  # a pattern such as {{joints: "*_knee"}}; `clamped: ["*_hip"]` names joints fixed in the
-  # bench test.
-{groups}
-poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` too
+groups:  # joints built alike may share a group, with a pattern such as {{joints: "*_knee"}};
+  # `clamped: ["*_hip"]` names joints fixed in the bench test. `servo` says what the model has in
+  # place of a position servo; remove it once the gains are those of the real drive.
+{groups}{held_lines}
+poses:  # the pose of the sweep; a robot that stands up needs `folded` too
   default:
 {pose}"""
+
+
+def _lines(description: ModelDescription, name: str, numbers: Mapping[str, object]) -> str:
+    """Write numbers of a joint, a line each with the remark on it."""
+    text = ""
+    for number, value in numbers.items():
+        remark = description.remarks.get((name, number))
+        comment = remark.comment if remark else ""
+        text += f"    {number}: {_yaml(value)}{comment}\n"
+    return text
 
 
 def _short(value: float) -> float:

@@ -3,16 +3,16 @@
 `robot.yaml` (schema `pronk/robot/1`) names the model beside it and holds what a model does not:
 drives, gains, groups, poses, what is clamped in a bench test, and which joints mirror each other.
 Ranges, axes, inertias and kinematic chains come from the model. Joint patterns are those of a shell
-(`*_knee`). A claimed mirror symmetry is verified with the model's mass matrix and bias forces.
+(`*_knee`). Joints that are no hinges, and those named under `held`, stand still. A claimed mirror
+symmetry is verified with the model's mass matrix and bias forces.
 """
 
 from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -23,9 +23,10 @@ from msgspec import Meta
 
 from pronk.errors import RobotError
 from pronk.files import converted, read_yaml
+from pronk.robots.held_model import POSITIONS, held_mjcf
 from pronk.robots.limits import OperatingLimits
-from pronk.robots.model import set_inertia
-from pronk.robots.robot import Drive, Joint, RobotSpec
+from pronk.robots.robot import Drive, Joint, RobotSpec, ServoKind
+from pronk.robots.source_model import MUJOCO_ERRORS, SourceModel, read_source
 
 T = TypeVar("T")
 
@@ -41,6 +42,8 @@ that fits under the bus voltage 2 kt omega."""
 _Positive = Annotated[float, Meta(gt=0.0)]
 _NotNegative = Annotated[float, Meta(ge=0.0)]
 _Band = tuple[_Positive, _Positive]
+HeldPosition = float | tuple[float, ...]
+"""Position of a joint that is held: of a slide [m], of a hinge [rad], or with a quaternion."""
 
 
 class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -116,7 +119,9 @@ class GroupEntry(_Entry, frozen=True):
     """Pattern of joint names; the group's own name if left out."""
     drive: str | None = None
     stiffness: _Positive | None = None
-    damping: _Positive | None = None
+    damping: _NotNegative | None = None
+    servo: ServoKind | None = None
+    """What the model has in place of a position servo, where the gains are assumed."""
     band_hz: _Band | None = None
     clamped: tuple[str, ...] = ()
     """Patterns of joints of the same limb that are fixed while one of these is excited."""
@@ -181,14 +186,16 @@ class RobotFile(_Entry, frozen=True):
     groups: dict[str, GroupEntry]
     poses: dict[str, dict[str, float]] = {}
     defaults: GroupEntry = GroupEntry()
+    held: dict[str, HeldPosition] = {}
+    """Joints that stand still, by name or pattern, and where; all that are no hinges are held."""
     symmetry: SymmetryEntry = SymmetryEntry()
     base_body: str | None = None
     legs: tuple[str, ...] = ()
     policy_rate_hz: _Positive = 50.0
     timestep_s: _Positive = 0.005
     decimation: Annotated[int, Meta(ge=1, le=1000)] = 4
-    grid_stiffness: _Band = (13.0, 27.0)
-    grid_damping: _Band = (0.1, 0.7)
+    grid_stiffness: _Band | None = None
+    grid_damping: _Band | None = None
     about: AboutEntry = AboutEntry()
     limits: LimitsEntry = LimitsEntry()
 
@@ -204,80 +211,26 @@ class Model:
         return mujoco.MjSpec.from_string(self.xml)
 
 
-@lru_cache
-def read_model(path: Path) -> Model:
-    """Read an MJCF or URDF: angles in radians, explicit inertias, no meshes and no drives.
-
-    Args:
-        path: File of the model.
-
-    Raises:
-        RobotError: MuJoCo cannot read the file.
-    """
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        text = path.read_text(encoding="utf-8")
-        if _is_plain(spec, text, path):
-            spec.compile()
-            return Model(text)  # as it is, with all digits of its numbers
-        spec.compiler.fusestatic = False
-        compiled = spec.compile()
-        for body in spec.bodies[1:]:
-            if not body.explicitinertial:
-                set_inertia(body, compiled)
-        _delete_unused(spec)
-        spec.compile()
-        model = Model(spec.to_xml())
-        model().compile()  # MuJoCo writes XML that it cannot read where a number is not finite.
-        return model
-    except (ValueError, OSError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
-
-
-def _is_plain(spec: mujoco.MjSpec, text: str, path: Path) -> bool:
-    """Return whether nothing in an MJCF has to be resolved or removed."""
-    compiler = spec.compiler
-    resolved = path.suffix == ".urdf" or "<include" in text
-    resolved = resolved or compiler.degree or compiler.fusestatic
-    removed = spec.actuators or spec.meshes or spec.frames or spec.sensors
-    return not resolved and not removed
-
-
-def _delete_unused(spec: mujoco.MjSpec) -> None:
-    """Delete meshes and what a model without drives does not need."""
-    for geom in list(spec.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
-            spec.delete(geom)
-    for elements in (
-        spec.pairs,
-        spec.sensors,
-        spec.keys,
-        spec.actuators,
-        spec.skins,
-        spec.meshes,
-        spec.materials,
-        spec.textures,
-    ):
-        for element in list(elements):
-            spec.delete(element)
-
-
 def read_robot(path: Path) -> RobotSpec:
     """Read a `robot.yaml`; a RobotError names what is wrong in it."""
+    file = read_robot_file(path)
+    return make_robot(file, read_source(path.parent / file.model), str(path))
+
+
+def read_robot_file(path: Path) -> RobotFile:
+    """Read the content of a `robot.yaml` without its model."""
     body = read_yaml(path, RobotError)
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise RobotError(f"{path}: not a robot file; its schema must be {SCHEMA!r}.")
-    file = converted(body, RobotFile, path, error=RobotError)
-    return make_robot(file, read_model(path.parent / file.model), str(path))
+    return converted(body, RobotFile, path, error=RobotError)
 
 
-def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
+def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> RobotSpec:
     """Join a robot file with its model.
 
     Args:
         file: Content of the `robot.yaml`.
-        build: The model.
+        source_model: The model.
         source: Name of the file, with which errors begin.
 
     Raises:
@@ -289,7 +242,14 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
             f"{source}: timestep_s * decimation * policy_rate_hz is {ticks:.6g}; expected 1, one "
             "command for `decimation` steps of the simulator."
         )
-    model = build().compile()
+    held_joints = _held_positions(file, source_model, source)
+    build = _model_without(source_model, held_joints)
+    try:
+        model = build().compile()
+    except MUJOCO_ERRORS as error:
+        raise RobotError(
+            f"{source}: the model does not compile with its joints held: {error}."
+        ) from None
     base_body = file.base_body or _floating_body(model)
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base_body) < 0:
         raise RobotError(f"{source}: base_body {base_body!r} is not a body of the model.")
@@ -298,6 +258,8 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
         if model.jnt_type[index] == mujoco.mjtJoint.mjJNT_HINGE:
             body = int(model.jnt_bodyid[index])
             limbs[model.joint(index).name] = _limb(model, body, model.body(base_body).id)
+    if not limbs:
+        raise RobotError(f"{source}: the model has no hinge joint that is not held.")
     groups = _groups(file, limbs, source)
     joints = []
     for name, limb in limbs.items():
@@ -308,16 +270,88 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
         joints=tuple(joints),
         build_spec=build,
         base_body=base_body,
+        held_joints=tuple(source_model.joint_names[index] for index in held_joints),
         legs=file.legs,
         policy_rate_hz=file.policy_rate_hz,
         timestep_s=file.timestep_s,
         decimation=file.decimation,
-        grid_stiffness=file.grid_stiffness,
-        grid_damping=file.grid_damping,
+        grid_stiffness=file.grid_stiffness or _grid(joint.stiffness for joint in joints),
+        grid_damping=file.grid_damping or _grid(joint.damping for joint in joints),
         limits=file.limits.limits(),
     )
     _verify_mirrors(robot, model, source)
     return robot
+
+
+def _grid(gains: Iterable[float]) -> tuple[float, float]:
+    """Return the range of a search about the gains of some joints, from a tenth to four times."""
+    positive = [gain for gain in gains if gain > 0.0]
+    if not positive:
+        return (1e-3, 1.0)
+    return 0.1 * min(positive), 4.0 * max(positive)
+
+
+def _held_positions(
+    file: RobotFile, source_model: SourceModel, source: str
+) -> dict[int, HeldPosition]:
+    """Return the joints that are held_joints, with their positions.
+
+    Joints that are no hinges are held at the position that the model has, unless `held` says one;
+    only the free joint of the base stays.
+    """
+    model = source_model.model
+    names = source_model.joint_names
+    base_joint = source_model.base_joint
+    if file.base_body in source_model.body_names:
+        for free_joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            if source_model.body_names[model.jnt_bodyid[free_joint]] == file.base_body:
+                base_joint = int(free_joint)
+    held_joints: dict[int, HeldPosition] = {}
+    for index in range(model.njnt):
+        joint_type = mujoco.mjtJoint(model.jnt_type[index])
+        if joint_type == mujoco.mjtJoint.mjJNT_HINGE or index == base_joint:
+            continue
+        address = model.jnt_qposadr[index]
+        position = model.qpos0[address : address + POSITIONS[joint_type]]
+        if joint_type == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_limited[index]:
+            position = np.clip(position, *model.jnt_range[index])
+        held_joints[index] = tuple(float(value) for value in position)
+    for pattern, value in file.held.items():
+        members = [pattern] if pattern in names else fnmatch.filter(names, pattern)
+        if not members:
+            raise RobotError(
+                f"{source}: held.{pattern} matches no joint of the model; those are "
+                f"{', '.join(names)}."
+            )
+        for name in members:
+            index = names.index(name)
+            joint_type = mujoco.mjtJoint(model.jnt_type[index])
+            position = np.atleast_1d(np.asarray(value, dtype=np.float64))
+            if len(position) != POSITIONS[joint_type] or not np.all(np.isfinite(position)):
+                raise RobotError(
+                    f"{source}: held.{pattern} is {value} for {name}; expected "
+                    f"{POSITIONS[joint_type]} finite numbers: m of a slide, rad of a hinge, a "
+                    "quaternion of a ball joint, position and quaternion of a free joint."
+                )
+            if len(position) > 1 and not np.linalg.norm(position[-4:]) > 0.5:
+                raise RobotError(f"{source}: held.{pattern} has a quaternion of length 0.")
+            if model.jnt_limited[index] and len(position) == 1:
+                low, high = model.jnt_range[index]
+                if not low - POSE_ROUNDING <= position[0] <= high + POSE_ROUNDING:
+                    raise RobotError(
+                        f"{source}: held.{pattern} puts {name} at {position[0]:g}, outside its "
+                        f"range of {low:g} to {high:g}."
+                    )
+            held_joints[index] = tuple(float(number) for number in position)
+    return held_joints
+
+
+def _model_without(source: SourceModel, held_joints: Mapping[int, HeldPosition]) -> Model:
+    """Return the model of a robot: the file as it is where nothing has to be left out."""
+    text = source.plain_text()
+    if text and not held_joints:
+        return Model(text)  # with all digits of its numbers
+    return Model(held_mjcf(source, held_joints))
 
 
 def _floating_body(model: mujoco.MjModel) -> str:
@@ -329,17 +363,25 @@ def _floating_body(model: mujoco.MjModel) -> str:
 
 
 def _limb(model: mujoco.MjModel, body: int, base: int) -> int:
-    """Return the child of the base under which a body is."""
-    while model.body_parentid[body] not in (base, 0):
+    """Return the topmost moving body above a body: below the base, or below what is fixed."""
+    fixed = (model.body_weldid[base], 0)
+    limb = body
+    while body != 0 and body != base:
+        if model.body_jntnum[body]:
+            limb = body
         body = int(model.body_parentid[body])
-    return int(body)
+        if model.body_weldid[body] in fixed:
+            break
+    return limb
 
 
-def _groups(file: RobotFile, joints: Iterable[str], source: str) -> dict[str, str]:
+def _groups(file: RobotFile, joints: Collection[str], source: str) -> dict[str, str]:
     """Return the group of each hinge joint."""
     groups: dict[str, str] = {}
     for name, group in file.groups.items():
-        members = fnmatch.filter(joints, group.joints or name)
+        members = [name]
+        if group.joints or name not in joints:
+            members = fnmatch.filter(joints, group.joints or name)
         if not members:
             raise RobotError(
                 f"{source}: groups.{name} matches no hinge joint of the model; those are "
@@ -398,6 +440,7 @@ def _joint(
         stiffness=stiffness,
         damping=damping,
         band_hz=band_hz,
+        servo=entry.servo or defaults.servo or "position",
         clamped=tuple(clamped),
         chain=tuple(chain),
         mirror=_mirror(file.symmetry, name),

@@ -108,10 +108,10 @@ def bench_spec(
     # A chain is one island; to look for more takes a tenth of a step.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     remove_geoms(spec)
-    base = spec.body(robot.base_body)
-    for base_joint in list(base.joints):
+    for base_joint in list(spec.body(robot.base_body).joints):
         spec.delete(base_joint)
-    _remove_other_branches(spec, base, {*joint.chain, *joint.clamped}, joint_name)
+    bench_joints = {*joint.chain, *joint.clamped}
+    _remove_other_branches(spec, spec.worldbody, bench_joints, joint_name)
     for name in joint.clamped:
         _weld(spec, name, robot.joint(name).default_position)
     for name in joint.chain:
@@ -315,6 +315,8 @@ def _set_passive(spec: mujoco.MjSpec, joint: Joint) -> None:
     hinge.armature = joint.drive.armature
     hinge.frictionloss = joint.drive.frictionloss
     hinge.damping = [joint.drive.viscous_damping, 0.0, 0.0]
+    # The drive has the effort limit; a limit of the model's own would cut its torque too.
+    hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
 def _remove_other_branches(
@@ -324,8 +326,12 @@ def _remove_other_branches(
     for child in list(body.bodies):
         joints = {joint.name for joint in child.find_all("joint")}
         strangers = joints - bench_joints
-        if joints and not joints & bench_joints:
+        if not joints:
+            continue
+        if not joints & bench_joints:
             spec.delete(child)
+        elif not len(child.joints):
+            _remove_other_branches(spec, child, bench_joints, joint_name)
         elif strangers:
             raise RobotError(
                 f"{', '.join(sorted(strangers))} can move when {joint_name} is excited; name them "
@@ -336,6 +342,7 @@ def _remove_other_branches(
 def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:
     """Fix a hinge at an angle: turn its body about the hinge, then delete the hinge."""
     joint = spec.joint(joint_name)
+    angle -= joint.ref
     body = joint.parent
     rotation = np.zeros(4)
     mujoco.mju_axisAngle2Quat(rotation, joint.axis / np.linalg.norm(joint.axis), angle)

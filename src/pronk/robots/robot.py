@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pronk.errors import RobotError
 from pronk.names import check_names
@@ -13,6 +13,10 @@ from pronk.robots.limits import OperatingLimits
 
 if TYPE_CHECKING:
     import mujoco
+
+ServoKind = Literal["position", "velocity", "motor", "none"]
+"""What drives a joint in a model: a position servo, a velocity servo, a motor whose command is a
+force, or nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +112,8 @@ class Joint:
     """Nominal damping, the derivative gain on the real drive [N m s/rad]."""
     band_hz: tuple[float, float]
     """Lowest and highest frequency at which the match compares magnitudes [Hz]."""
+    servo: ServoKind = "position"
+    """What the model has for this joint; gains of joints without a position servo are assumed."""
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically while this one is excited; the rest are held by their drives."""
     chain: tuple[str, ...] = ()
@@ -149,6 +155,9 @@ class RobotSpec:
     """Function that builds a fresh model without actuators, free-floating or, for an arm, fixed."""
     base_body: str
     """Body that the bench holds still."""
+    held_joints: tuple[str, ...] = ()
+    """Joints of the model that stand still and are none of `joints`: slides, ball joints, followers
+    and hinges that nothing drives."""
     legs: tuple[str, ...] = ()
     """Prefixes of the joints of each leg, from the hip down; empty for a robot without legs."""
     source: str = ""

@@ -1,0 +1,152 @@
+"""What is missing or contradicts itself in a robot: its numbers and those of its model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from pronk.robots import MODEL_SUFFIXES, robot_path
+from pronk.robots.bare import describe_model
+from pronk.robots.load import read_robot_file
+from pronk.robots.model import free_spec
+from pronk.robots.robot import Joint, RobotSpec
+from pronk.robots.servos import JointServo, joint_servos
+from pronk.robots.source_model import SourceModel, read_source
+
+SMALL_ANGLE = 0.1
+"""Angle that a drive should be able to correct with less than its effort limit [rad]."""
+END_OF_RANGE = 1e-3
+"""Distance from a stop within which a pose lies at the end of its range [rad]."""
+SERVOS = {"velocity": "a velocity servo", "motor": "a motor", "none": "no actuator"}
+"""What a model has in place of a position servo, in words."""
+SAME = 0.01
+"""Relative difference up to which two limits are the same."""
+
+
+def problems_of(robot: RobotSpec) -> list[str]:
+    """List what is missing or inconsistent about a robot, a sentence each.
+
+    Compared are each effort limit with 0.1 rad of stiffness, with the torque of gravity in the
+    default pose and with the limit of the model; the speed limit with that of a URDF; the pose
+    with the ranges. Named are the lines of the robot.yaml that are still marked CHECK, rotor
+    inertia and dry friction of 0, and joints without a position servo in the model.
+    """
+    path = robot_path(robot.source)
+    model_path = path
+    problems = []
+    if path.suffix in MODEL_SUFFIXES:
+        problems.extend(_assumed(path))
+    else:
+        model_path = path.parent / read_robot_file(path).model
+        marks = path.read_text(encoding="utf-8").count("# CHECK")
+        if marks:
+            problems.append(
+                f"{marks} lines of {path.name} are marked CHECK; compare their numbers with the "
+                "data sheet and remove the marks"
+            )
+    source = read_source(model_path)
+    problems.extend(source.notes)
+    gravity = _gravity(robot)
+    servos = joint_servos(source.model, source.model.qpos0)
+    for joint in robot.joints:
+        problems.extend(_joint_problems(joint, gravity[joint.name]))
+        if joint.name in source.joint_names:
+            servo = servos[source.joint_names.index(joint.name)]
+            problems.extend(_limit_problems(joint, source, servo))
+    by_type: dict[str, list[str]] = {}
+    for joint in robot.joints:
+        if joint.servo != "position":
+            by_type.setdefault(joint.servo, []).append(joint.name)
+    for servo_type, names in by_type.items():
+        problems.append(
+            f"the model has {SERVOS[servo_type]} and no position servo for {', '.join(names)}: give "
+            "the gains of the real drives and remove `servo`"
+        )
+    return problems
+
+
+def _assumed(path: Path) -> list[str]:
+    """Name the numbers of a bare model that are assumed, by number."""
+    by_number: dict[str, list[str]] = {}
+    for (name, number), remark in describe_model(path).remarks.items():
+        if remark.mark == "CHECK":
+            by_number.setdefault(number, []).append(name)
+    sentences = []
+    for number, names in by_number.items():
+        sentences.append(f"{number} is assumed for {', '.join(names)}")
+    if sentences:
+        sentences.append(f"correct these numbers in the file of `pronk robot new {path}`")
+    return sentences
+
+
+def _gravity(robot: RobotSpec) -> dict[str, float]:
+    """Return the torque that holds each joint in the default pose [N m]."""
+    model = free_spec(robot).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    mujoco.mj_forward(model, data)
+    torque = np.abs(data.qfrc_bias - data.qfrc_passive)
+    gravity = {}
+    for joint in robot.joints:
+        gravity[joint.name] = float(torque[model.joint(joint.name).dofadr[0]])
+    return gravity
+
+
+def _joint_problems(joint: Joint, gravity: float) -> list[str]:
+    """List what is missing or inconsistent about the numbers of a joint."""
+    problems = []
+    drive = joint.drive
+    low, high = joint.range
+    pose = joint.default_position
+    if pose < low - END_OF_RANGE or pose > high + END_OF_RANGE:
+        problems.append(f"poses.default of {joint.name} is outside of its range")
+    elif min(pose - low, high - pose) <= END_OF_RANGE:
+        problems.append(
+            f"poses.default of {joint.name} is at the end of its range; a sweep has no room there"
+        )
+    if drive.armature <= 0.0:
+        problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
+    if drive.frictionloss <= 0.0:
+        problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
+    torque = joint.stiffness * SMALL_ANGLE
+    if torque > drive.effort_limit:
+        problems.append(
+            f"the stiffness of {joint.name}, {joint.stiffness:.4g} N m/rad, asks for {torque:.3g} "
+            f"N m at {SMALL_ANGLE:g} rad, and its effort limit is {drive.effort_limit:.4g} N m: "
+            "the drive would be at its limit nearly always; one of the two is wrong, or of "
+            "another unit"
+        )
+    if gravity > drive.effort_limit:
+        problems.append(
+            f"gravity asks for {gravity:.3g} N m of {joint.name} in the default pose, and its "
+            f"effort limit is {drive.effort_limit:.4g} N m: it cannot hold the pose"
+        )
+    if drive.effort_limit > drive.stall_torque * (1.0 + SAME):
+        problems.append(
+            f"the effort limit of {joint.name}, {drive.effort_limit:.4g} N m, is above its stall "
+            f"torque of {drive.stall_torque:.4g} N m"
+        )
+    return problems
+
+
+def _limit_problems(joint: Joint, source: SourceModel, servo: JointServo) -> list[str]:
+    """Compare the limits of a drive with those of its model."""
+    problems = []
+    effort_limit = joint.drive.effort_limit
+    place = "the URDF" if source.is_urdf else "the model"
+    has_limit = 0.0 < servo.effort_limit < np.inf
+    if has_limit and not np.isclose(effort_limit, servo.effort_limit, rtol=SAME):
+        problems.append(
+            f"the effort limit of {joint.name} is {effort_limit:.4g} N m, and {place} has "
+            f"{servo.effort_limit:.4g} N m"
+        )
+    speed_limit = source.speed_limits.get(joint.name)
+    speed = joint.drive.no_load_speed
+    if speed_limit is not None and speed < speed_limit * (1.0 - SAME):
+        problems.append(
+            f"the no-load speed of {joint.name} is {speed:.4g} rad/s, below the velocity limit of "
+            f"{place}, {speed_limit:.4g} rad/s"
+        )
+    return problems

@@ -1,0 +1,336 @@
+"""An MJCF or URDF as MuJoCo compiles it, with its actuators, and what of it a robot needs."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from pronk.errors import RobotError
+from pronk.robots.urdf import PlainUrdf, plain_urdf
+
+MAX_BYTES = 64_000_000
+"""Largest file of a model; humanoids with all their parts have some 1 MB."""
+MAX_ELEMENTS = 500_000
+"""Largest number of elements of a model with its replicates."""
+MAX_DEPTH = 400
+"""Deepest nesting of elements; MuJoCo's reader calls itself for each level."""
+MAX_SAMPLES = 100_000_000
+"""Largest number of pixels of a texture, points of a height field, or parts of a flexible body."""
+SMALLEST_MASS = 1e-4
+"""Mass of a link of a URDF that moves and has none [kg]."""
+SMALLEST_INERTIA = 1e-8
+"""Moment of inertia of such a link, as of a ball of 0.1 g and 16 mm [kg m^2]."""
+SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample")
+"""Attributes whose product is the number of samples of an element."""
+COMMENT = re.compile("<!--.*?-->", re.DOTALL)
+"""A comment of XML."""
+TAG = re.compile(r"<(/?)([A-Za-z_][\w:.-]*)((?:[^<>\"']|\"[^\"]*\"|'[^']*')*?)(/?)>")
+"""A tag of XML: whether it closes, its name, its attributes, whether it is empty."""
+ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*[\"']([^\"']*)[\"']")
+"""An attribute of XML and its value."""
+MUJOCO_ERRORS = (
+    ValueError,
+    TypeError,
+    RuntimeError,
+    MemoryError,
+    OSError,
+    mujoco.FatalError,
+    mujoco.UnexpectedError,
+)
+"""What MuJoCo raises for files that it cannot read or compile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceModel:
+    """A model as its file has it."""
+
+    path: Path
+    """The file."""
+    model: mujoco.MjModel = field(repr=False)
+    """The compiled model, with its actuators and keyframes."""
+    joint_names: tuple[str, ...]
+    """A name for each joint: its own, or that of its body and a number where it has none."""
+    body_names: tuple[str, ...]
+    """A name for each body: its own, or a number where it has none."""
+    speed_limits: Mapping[str, float] = field(default_factory=dict)
+    """Joint to the speed limit that a URDF states [rad/s]."""
+    mimics: Mapping[str, str] = field(default_factory=dict)
+    """Joint to the joint that it follows."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what was left out or replaced."""
+    is_urdf: bool = False
+    """Whether the file is a URDF."""
+
+    @property
+    def hinges(self) -> tuple[int, ...]:
+        """Indices of the hinge joints."""
+        is_hinge = self.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        return tuple(int(index) for index in np.flatnonzero(is_hinge))
+
+    def has_mass(self, joint: int) -> bool:
+        """Return whether a joint carries more than links without mass."""
+        body = self.model.jnt_bodyid[joint]
+        subtree = [body]
+        for other in range(body + 1, self.model.nbody):
+            if self.model.body_parentid[other] in subtree:
+                subtree.append(other)
+        mass = float(self.model.body_subtreemass[body])
+        has_mass: bool = mass > 1.01 * SMALLEST_MASS * len(subtree)
+        return not self.is_urdf or has_mass
+
+    @property
+    def base_joint(self) -> int:
+        """Index of the free joint of the body with most hinges behind it; -1 if none has any."""
+        model = self.model
+        best = -1
+        most = 0
+        for index in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            root = model.body_rootid[model.jnt_bodyid[index]]
+            count = 0
+            for hinge in self.hinges:
+                if model.body_rootid[model.jnt_bodyid[hinge]] == root:
+                    count += 1
+            if count > most:
+                best = int(index)
+                most = count
+        return best
+
+    def plain_text(self) -> str:
+        """Return the text of an MJCF that has nothing but what a robot needs; else nothing."""
+        model = self.model
+        extras = (model.nu, model.nmesh, model.nsensor, model.nkey, model.ntendon, model.neq)
+        others = (model.ntuple, model.ncam, model.nmat, model.ntex, model.nskin, model.nhfield)
+        if self.is_urdf or any(extras) or any(others) or model.npair or model.nflex:
+            return ""
+        unnamed = [index for index in range(model.njnt) if not model.joint(index).name]
+        unnamed_bodies = [index for index in range(model.nbody) if not model.body(index).name]
+        if unnamed or unnamed_bodies or model.nplugin:
+            return ""
+        text = self.path.read_text(encoding="utf-8")
+        spec = mujoco.MjSpec.from_string(text) if "<include" not in text else None
+        if spec is None or spec.compiler.degree or spec.compiler.fusestatic or spec.frames:
+            return ""
+        if any(light.targetbody for light in spec.lights):
+            return ""
+        return text
+
+
+def read_source(path: Path) -> SourceModel:
+    """Read and compile an MJCF or URDF, once for each time of its last modification.
+
+    Args:
+        path: File of the model.
+
+    Raises:
+        RobotError: MuJoCo cannot read or compile it; the message has MuJoCo's reason.
+    """
+    try:
+        modified_ns = path.stat().st_mtime_ns
+    except OSError:
+        raise RobotError(f"{path}: no such file.") from None
+    return _read_source(path, modified_ns)
+
+
+@lru_cache(maxsize=32)
+def _read_source(path: Path, _modified_ns: int) -> SourceModel:
+    """Read and compile a model; see `read_source`."""
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise RobotError(f"{path}: has {size:,} bytes; expected at most {MAX_BYTES:,}.")
+    try:
+        if _is_urdf(path):
+            return _compiled_urdf(path)
+        _check_size(path)
+        spec = mujoco.MjSpec.from_file(str(path))
+        model, notes = _compiled_mjcf(spec)
+    except MUJOCO_ERRORS as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
+    return _source(path, model, None, notes)
+
+
+def _is_urdf(path: Path) -> bool:
+    """Return whether a file is a URDF, by its ending or its outermost element."""
+    if path.suffix in (".urdf", ".xacro"):
+        return True
+    text = COMMENT.sub("", path.read_text(encoding="utf-8", errors="replace"))
+    first = TAG.search(text)
+    return first is not None and first.group(2) == "robot"
+
+
+def _source(
+    path: Path, model: mujoco.MjModel, urdf: PlainUrdf | None, notes: tuple[str, ...]
+) -> SourceModel:
+    """Name the bodies and joints of a compiled model."""
+    body_names = ["world"]
+    for index in range(1, model.nbody):
+        body_names.append(_unique(model.body(index).name or f"body_{index}", body_names))
+    joint_names: list[str] = []
+    for index in range(model.njnt):
+        name = model.joint(index).name
+        if not name:
+            name = f"{body_names[model.jnt_bodyid[index]]}_joint"
+        joint_names.append(_unique(name, joint_names))
+    return SourceModel(
+        path=path,
+        model=model,
+        joint_names=tuple(joint_names),
+        body_names=tuple(body_names),
+        speed_limits=urdf.speed_limits if urdf else {},
+        mimics=urdf.mimics if urdf else {},
+        notes=notes,
+        is_urdf=urdf is not None,
+    )
+
+
+def _unique(name: str, names: list[str]) -> str:
+    """Return a name that is not among some names, with a number behind it if need be."""
+    number = 2
+    unique = name
+    while unique in names:
+        unique = f"{name}_{number}"
+        number += 1
+    return unique
+
+
+def _compiled_urdf(path: Path) -> SourceModel:
+    """Compile a URDF: as it is, else with what MuJoCo offers for masses that no body has."""
+    urdf = plain_urdf(path)
+    notes = list(urdf.notes)
+    try:
+        return _source(path, _compiled(mujoco.MjSpec.from_string(urdf.text)), urdf, tuple(notes))
+    except MUJOCO_ERRORS as error:
+        first_error = error
+    urdf = plain_urdf(path, with_meshes=False)
+    notes = list(urdf.notes)
+    spec = mujoco.MjSpec.from_string(urdf.text)
+    for _attempt in range(3):
+        try:
+            return _source(path, _compiled(spec), urdf, tuple(notes))
+        except MUJOCO_ERRORS as error:
+            reason = str(error)
+        # A specification that did not compile is read anew.
+        balances = spec.compiler.balanceinertia or "balanceinertia" in reason
+        bounds = spec.compiler.boundmass > 0.0 or "mjMINVAL" in reason
+        spec = mujoco.MjSpec.from_string(urdf.text)
+        spec.compiler.balanceinertia = balances
+        if "balanceinertia" in reason:
+            notes.append(
+                "the principal moments of inertia of a link break A + B >= C, so that MuJoCo took "
+                f"their mean ({' '.join(reason.split())}); correct it in the URDF"
+            )
+        if bounds:
+            spec.compiler.boundmass = SMALLEST_MASS
+            spec.compiler.boundinertia = SMALLEST_INERTIA
+        if "mjMINVAL" in reason:
+            notes.append(
+                f"links that move have no mass, so that they got {SMALLEST_MASS:g} kg and "
+                f"{SMALLEST_INERTIA:g} kg m^2; give them an inertial in the URDF"
+            )
+    raise first_error
+
+
+def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model with every body by itself, and without the lengths of muscles."""
+    spec.compiler.fusestatic = False
+    spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of parts that a robot on the bench does not have
+        return spec.compile()
+
+
+def _compiled_mjcf(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[str, ...]]:
+    """Compile an MJCF; where files of it are missing, without textures, materials and meshes.
+
+    Bodies whose mass comes from meshes that are missing still make it fail.
+    """
+    try:
+        return _compiled(spec.copy()), ()
+    except MUJOCO_ERRORS as error:
+        first_error = error
+    for geom in list(spec.geoms):
+        geom.material = ""
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
+            if not geom.parent.explicitinertial:
+                raise first_error
+            spec.delete(geom)
+        elif geom.meshname:
+            raise first_error
+    for site in spec.sites:
+        site.material = ""
+    for tendon in spec.tendons:
+        tendon.material = ""
+    for elements in (spec.pairs, spec.skins, spec.meshes, spec.materials, spec.textures):
+        for element in list(elements):
+            spec.delete(element)
+    try:
+        model = _compiled(spec)
+    except MUJOCO_ERRORS:
+        raise first_error from None
+    return model, ("meshes or textures that are not there were left out",)
+
+
+def _check_size(path: Path) -> None:
+    """Refuse an MJCF that would take MuJoCo's reader minutes, gigabytes, or its whole stack.
+
+    Tags are found as they stand, so that XML that only MuJoCo's reader accepts is checked too.
+    """
+    pending = [path]
+    seen = set()
+    total = 0
+    while pending:
+        file = pending.pop()
+        if file in seen or not file.is_file():
+            continue
+        seen.add(file)
+        text = COMMENT.sub("", file.read_text(encoding="utf-8", errors="replace"))
+        copies = [1]  # of the elements inside each open element
+        for match in TAG.finditer(text):
+            closing, name, attribute_text, empty = match.groups()
+            if closing:
+                if len(copies) > 1:
+                    copies.pop()
+                continue
+            attributes = dict(ATTRIBUTE.findall(attribute_text))
+            total += copies[-1]
+            inside = copies[-1]
+            samples = 1.0
+            if name == "replicate":
+                inside = min(inside * int(_product(attributes.get("count", "1"))), MAX_SAMPLES)
+            else:
+                for attribute in SIZES:
+                    samples *= _product(attributes.get(attribute, "1"))
+            if name == "include" and "file" in attributes:
+                pending.append(file.parent / attributes["file"])
+                pending.append(path.parent / attributes["file"])
+            if not empty:
+                copies.append(inside)
+            if len(copies) > MAX_DEPTH:
+                raise RobotError(
+                    f"{file}: elements are nested over {MAX_DEPTH} deep; expected a robot."
+                )
+            if samples > MAX_SAMPLES or total > MAX_ELEMENTS:
+                raise RobotError(
+                    f"{file}: element {name} makes the model too large; expected at most "
+                    f"{MAX_ELEMENTS:,} elements and {MAX_SAMPLES:,} samples of an element."
+                )
+
+
+def _product(text: str) -> float:
+    """Return the product of the numbers of an attribute, at least 1; 1 where it holds none."""
+    product = 1.0
+    for word in text.split():
+        try:
+            product *= float(word)
+        except ValueError:
+            return 1.0
+    if not product >= 1.0:
+        return 1.0
+    return min(product, float(MAX_SAMPLES) + 1.0)

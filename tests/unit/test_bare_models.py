@@ -1,0 +1,544 @@
+"""Robots from models that others made: what is left out, what is held, and the numbers read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from command_line import accepted, invoke, refused
+from pronk.errors import RobotError
+from pronk.robots import load_robot
+from pronk.robots.bare import describe_model, yaml_of_model
+from pronk.robots.model import bench_inertia, bench_spec, free_spec
+from pronk.robots.source_model import MAX_DEPTH
+
+LEG = """
+  <body name="{name}" pos="0 {side} 0">
+    <joint name="{name}_knee" axis="0 1 0" range="-1.5 1.2" ref="0.1"/>
+    <inertial pos="0.02 0 -0.15" mass="0.7" diaginertia="2e-3 2e-3 1e-3"/>
+    <geom name="{name}_shank" type="sphere" size="0.03"/>
+    <site name="{name}_foot" pos="0 0 -0.2"/>
+    {inside}
+  </body>
+"""
+SCENE = """
+<mujoco model="scene">
+  <compiler angle="radian"/>
+  <default><joint type="hinge" armature="0.015" frictionloss="0.08"/></default>
+  {assets}
+  <worldbody>
+    <body name="trunk" pos="0 0 1">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="6" diaginertia="0.1 0.1 0.1"/>
+      {legs}
+    </body>
+    {world}
+  </worldbody>
+  {relations}
+</mujoco>
+"""
+
+
+def scene(*, assets: str = "", world: str = "", relations: str = "", inside: str = "") -> str:
+    """Write two legs on a floating trunk, with other elements of a scene."""
+    legs = LEG.format(name="near", side=0.1, inside="") + LEG.format(
+        name="far", side=-0.1, inside=inside
+    )
+    return SCENE.format(assets=assets, world=world, relations=relations, legs=legs)
+
+
+ELEMENTS = {
+    "plain": {},
+    "floor": {
+        "assets": '<asset><texture name="t" type="2d" builtin="checker" width="8" height="8"/>'
+        '<material name="m" texture="t"/></asset>',
+        "world": '<geom type="plane" size="5 5 .1" material="m"/>',
+    },
+    "material of a class": {
+        "assets": '<default><default class="painted"><geom material="m"/></default></default>'
+        '<asset><material name="m" rgba="1 0 0 1"/></asset>',
+        "inside": '<geom class="painted" size=".01"/><site name="s" material="m"/>',
+    },
+    "mesh": {
+        "assets": '<asset><mesh name="m" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset>',
+        "inside": '<geom type="mesh" mesh="m" mass="0"/><geom type="capsule" mesh="m"/>',
+    },
+    "height field": {
+        "assets": '<asset><hfield name="h" nrow="3" ncol="3" size="1 1 .1 .1"/></asset>',
+        "world": '<geom type="hfield" hfield="h"/>',
+    },
+    "tracking light": {"world": '<light mode="targetbody" target="far"/>'},
+    "camera": {"world": '<camera name="c" mode="targetbody" target="far"/>'},
+    "camera on a leg": {"inside": '<camera name="c"/><light/>'},
+    "tuple": {
+        "relations": '<custom><tuple name="x"><element objtype="geom" objname="far_shank"/></tuple>'
+        '<numeric name="n" data="1"/><text name="w" data="a"/></custom>'
+    },
+    "keyframe": {"relations": '<keyframe><key qpos="0 0 1 1 0 0 0 .3 .3"/></keyframe>'},
+    "exclude": {"relations": '<contact><exclude body1="near" body2="far"/></contact>'},
+    "pair": {"relations": '<contact><pair geom1="near_shank" geom2="far_shank"/></contact>'},
+    "connect": {
+        "relations": '<equality><connect body1="far" body2="trunk" anchor="0 0 0"/></equality>'
+    },
+    "connect of sites": {
+        "relations": '<equality><connect site1="far_foot" site2="near_foot"/></equality>'
+    },
+    "weld": {"relations": '<equality><weld body1="far" body2="trunk"/></equality>'},
+    "coupled joints": {
+        "relations": '<equality><joint joint1="far_knee" joint2="near_knee"/></equality>'
+    },
+    "fixed tendon": {
+        "relations": '<tendon><fixed name="t"><joint joint="far_knee" coef="1"/></fixed></tendon>'
+        '<equality><tendon tendon1="t"/></equality><sensor><tendonpos tendon="t"/></sensor>'
+    },
+    "spatial tendon": {
+        "relations": '<tendon><spatial><site site="far_foot"/><site site="near_foot"/></spatial>'
+        "</tendon>"
+    },
+    "sensors": {
+        "relations": '<sensor><jointpos joint="far_knee"/><touch site="far_foot"/>'
+        '<framepos objtype="body" objname="far"/><force site="far_foot"/></sensor>'
+    },
+    "mocap": {"world": '<body name="target" mocap="true"><geom size=".1"/></body>'},
+    "free cube": {
+        "world": '<body name="cube" pos="1 0 1"><freejoint/><geom type="box" size=".1 .1 .1"/>'
+        "</body>"
+    },
+    "ball joint": {
+        "inside": '<body name="tail"><joint name="tail" type="ball"/><geom size=".02"/></body>'
+    },
+    "replicate": {
+        "inside": '<replicate count="3" offset=".01 0 0"><geom size=".001"/></replicate>',
+    },
+    "frame": {"world": '<frame euler="0 0 1"><body name="post"><geom size=".1"/></body></frame>'},
+    "unnamed": {"world": "<body><geom size='.1'/></body>"},
+    "flexible": {
+        "world": '<flexcomp name="f" type="grid" count="3 3 1" spacing=".1 .1 .1" pos="2 0 0" '
+        'radius=".01" mass=".1" dim="2"/>'
+    },
+}
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_what_refers_to_a_removed_leg_goes_with_it(element: str, tmp_path: Path) -> None:
+    """The near knee has the inertia, gravity and range that MuJoCo computes for it."""
+    path = tmp_path / "scene.xml"
+    path.write_text(scene(**ELEMENTS[element]))
+    original = mujoco.MjModel.from_xml_path(str(path))
+    accepted("robot", "new", path)
+    robot = load_robot(tmp_path / "robot.yaml")
+    assert set(robot.joint_names) == {"near_knee", "far_knee"}
+    accepted("robot", "check", tmp_path / "robot.yaml")
+
+    joint = robot.joint("near_knee")
+    hinge = original.joint("near_knee")
+    assert joint.range == tuple(hinge.range)
+    data = mujoco.MjData(original)
+    data.joint("near_knee").qpos[:] = joint.default_position
+    mujoco.mj_forward(original, data)
+    mass = np.zeros((original.nv, original.nv))
+    mujoco.mj_fullM(original, data, mass)
+    dof = hinge.dofadr[0]
+    model = bench_spec(robot, "near_knee").compile()
+    assert model.nv == 1
+    assert bench_inertia(robot, "near_knee")[0] == pytest.approx(mass[dof, dof], rel=1e-9)
+    held = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, held, model.key("default").id)
+    mujoco.mj_forward(model, held)
+    assert held.qfrc_bias[0] == pytest.approx(data.qfrc_bias[dof], rel=1e-9)
+
+
+CHAIN = """
+<mujoco model="chain">
+  <compiler angle="radian"/>
+  <default><joint armature="0.02" frictionloss="0.1"/></default>
+  <worldbody>
+    <body name="cart" pos="0 0 0.5">
+      <joint name="x" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+      <joint name="lift" type="slide" axis="0 0 1" range="0 0.6" limited="true"/>
+      <inertial pos="0 0 0" mass="20" diaginertia="1 1 1"/>
+      <body name="upper" pos="0.1 0 0.2" euler="0.3 0 0.2">
+        <joint name="shoulder" axis="0 1 0" range="-2 2" limited="true" pos="0.01 0 0"/>
+        <joint name="twist" axis="0 0 1" range="-2 2" limited="true" pos="0 0.02 0" ref="0.2"/>
+        <inertial pos="0.05 0 0.15" mass="1.5" diaginertia="0.01 0.01 0.002"/>
+        <body name="hand" pos="0 0 0.3">
+          <joint name="wrist" axis="1 0 0" range="-2 2" limited="true"/>
+          <inertial pos="0 0.01 0.05" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/>
+          <body name="finger" pos="0 0.03 0.1">
+            <joint name="finger" type="slide" axis="0 1 0" range="0 0.05" limited="true"/>
+            <inertial pos="0 0 0.02" mass="0.2" diaginertia="1e-5 1e-5 1e-5"/>
+          </body>
+          <body name="cup" pos="0 0 0.15">
+            <joint name="cup" type="ball" pos="0 0.01 0"/>
+            <inertial pos="0 0.02 0.03" mass="0.3" diaginertia="2e-4 2e-4 1e-4"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="shoulder" kp="90" kv="3" forcerange="-40 40"/>
+    <position joint="twist" kp="60" kv="2" forcerange="-30 30"/>
+    <position joint="wrist" kp="30" kv="1" forcerange="-15 15"/>
+    <position joint="lift" kp="5000" forcerange="-300 300"/>
+    <position joint="finger" kp="200" forcerange="-20 20"/>
+  </actuator>
+  <keyframe>
+    <key name="home" qpos="0.3 0.4 0.5 -0.6 0.7 0.03 0.9 0.3 -0.2 0.1"/>
+  </keyframe>
+</mujoco>
+"""
+
+
+def test_slides_and_ball_joints_are_held_at_the_pose(tmp_path: Path) -> None:
+    """Mass matrix and gravity of the hinges are those of the whole model at its keyframe."""
+    path = tmp_path / "chain.xml"
+    path.write_text(CHAIN)
+    accepted("robot", "new", path)
+    text = (tmp_path / "robot.yaml").read_text()
+    robot = load_robot(tmp_path / "robot.yaml")
+    names = ("shoulder", "twist", "wrist")
+    assert robot.joint_names == names
+    assert set(robot.held_joints) == {"x", "lift", "finger", "cup"}
+    assert yaml.safe_load(text)["held"]["finger"] == pytest.approx(0.03)
+    assert "300 N" in text
+    checked = invoke(("robot", "check", tmp_path / "robot.yaml")).stdout
+    assert "finger" in checked
+
+    original = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(original)
+    mujoco.mj_resetDataKeyframe(original, data, 0)
+    mujoco.mj_forward(original, data)
+    whole = np.zeros((original.nv, original.nv))
+    mujoco.mj_fullM(original, data, whole)
+    dofs = [int(original.joint(name).dofadr[0]) for name in names]
+    model = free_spec(robot).compile()
+    state = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, state, model.key("default").id)
+    mujoco.mj_forward(model, state)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, state, mass)
+    np.testing.assert_allclose(mass, whole[np.ix_(dofs, dofs)], rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(state.qfrc_bias, data.qfrc_bias[dofs], rtol=1e-3, atol=1e-9)
+
+
+def test_a_hinge_that_is_held_stands_where_the_model_has_it(tmp_path: Path) -> None:
+    """Holding a hinge before or after another of the same body gives the same poses."""
+    path = tmp_path / "chain.xml"
+    path.write_text(CHAIN)
+    text = yaml_of_model(path)
+    original = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(original)
+    mujoco.mj_resetDataKeyframe(original, data, 0)
+    mujoco.mj_kinematics(original, data)
+    for name, angle in (("shoulder", 0.5), ("twist", -0.6)):
+        content = yaml.safe_load(text)
+        content["held"][name] = angle
+        for section in ("groups", "drives"):
+            del content[section][name]
+        (tmp_path / "robot.yaml").write_text(yaml.safe_dump(content))
+        robot = load_robot(tmp_path / "robot.yaml")
+        assert name in robot.held_joints
+        model = free_spec(robot).compile()
+        state = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, state, model.key("default").id)
+        mujoco.mj_kinematics(model, state)
+        np.testing.assert_allclose(state.body("cup").xpos, data.body("cup").xpos, atol=1e-9)
+        np.testing.assert_allclose(state.body("finger").xmat, data.body("finger").xmat, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"lift": 3.0}, "lift"),
+        ({"elbow": 0.0}, "elbow"),
+        ({"cup": 0.1}, "cup"),
+        ({"cup": [0.0, 0.0, 0.0, 0.0]}, "cup"),
+    ],
+)
+def test_a_held_position_that_cannot_be_is_refused(
+    entry: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.xml"
+    path.write_text(CHAIN)
+    content = yaml.safe_load(yaml_of_model(path))
+    content["held"].update(entry)
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(RobotError, match=words):
+        load_robot(tmp_path / "robot.yaml")
+
+
+ACTUATED = """
+<mujoco model="actuated">
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="link" pos="0 0 1">
+      <joint name="j" axis="0 1 0" range="-1 1" limited="true" armature="0.03" damping="0.07"
+             frictionloss="0.2" {joint}/>
+      <inertial pos="0 0 -0.2" mass="1.3" diaginertia="2e-3 2e-3 2e-3"/>
+      <body name="tip" pos="0 0 -0.4">
+        <joint name="spring" axis="0 1 0" stiffness="4"/>
+        <inertial pos="0 0 -0.05" mass="0.2" diaginertia="1e-4 1e-4 1e-4"/>
+      </body>
+    </body>
+  </worldbody>
+  {tendon}
+  <actuator>{actuators}</actuator>
+</mujoco>
+"""
+TENDON = '<tendon><fixed name="t"><joint joint="j" coef="3"/></fixed></tendon>'
+
+
+@pytest.mark.parametrize(
+    ("actuators", "joint", "expected"),
+    [
+        # servo, stiffness, damping, effort limit; None where it is assumed.
+        (
+            '<position joint="j" kp="70" kv="1.5" forcerange="-11 11"/>',
+            "",
+            ("position", 70.0, 1.5, 11.0),
+        ),
+        (
+            '<position joint="j" kp="7" kv="0.1" gear="6" forcerange="-2 2" ctrlrange="-6 6"/>',
+            "",
+            ("position", 252.0, 3.6, 12.0),
+        ),
+        ('<position joint="j" kp="70"/>', "", ("position", 70.0, 0.0, None)),
+        ('<position joint="j" kp="70"/>', 'actuatorfrcrange="-9 9"', ("position", 70.0, 0.0, 9.0)),
+        (
+            '<position joint="j" kp="70" forcerange="-8 8"/><damper joint="j" kv="0.9" '
+            'ctrlrange="0 1"/>',
+            "",
+            ("position", 70.0, 0.9, 8.0),
+        ),
+        ('<intvelocity joint="j" kp="50" actrange="-1 1"/>', "", ("position", 50.0, 0.0, None)),
+        ('<velocity joint="j" kv="4" ctrlrange="-9 9"/>', "", ("velocity", None, None, None)),
+        ('<motor joint="j" gear="20" ctrlrange="-0.5 0.5"/>', "", ("motor", None, None, 10.0)),
+        (
+            '<general joint="j" gainprm="5" gear="3" ctrlrange="-1 1"/>',
+            "",
+            ("motor", None, None, 15.0),
+        ),
+        ('<motor joint="j" gear="20"/>', "", ("motor", None, None, None)),
+        (
+            '<general joint="j" biastype="affine" gainprm="45" biasprm="0 -60 -2" '
+            'forcerange="-7 7"/>',
+            "",
+            ("position", 60.0, 2.0, 7.0),
+        ),
+        (
+            '<position tendon="t" kp="10" kv="0.2" forcerange="-4 4"/>',
+            "",
+            ("position", 90.0, 1.8, 12.0),
+        ),
+    ],
+)
+def test_numbers_of_actuators_are_those_that_mujoco_computes_at_the_joint(
+    actuators: str,
+    joint: str,
+    expected: tuple[str, float | None, float | None, float | None],
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "actuated.xml"
+    path.write_text(ACTUATED.format(actuators=actuators, joint=joint, tendon=TENDON))
+    accepted("robot", "new", path)
+    robot = load_robot(tmp_path / "robot.yaml")
+    text = (tmp_path / "robot.yaml").read_text()
+    assert robot.joint_names == ("j",)
+    assert robot.held_joints == ("spring",)
+    read = robot.joint("j")
+    servo, stiffness, damping, effort_limit = expected
+    assert read.servo == servo
+    remarks = describe_model(path).remarks
+    numbers = {
+        "stiffness": (read.stiffness, stiffness),
+        "damping": (read.damping, damping),
+        "effort_limit": (read.drive.effort_limit, effort_limit),
+    }
+    for number, (value, true_value) in numbers.items():
+        mark = remarks["j", number].mark
+        assert (mark == "CHECK") == (true_value is None)
+        if true_value is not None:
+            assert value == pytest.approx(true_value, rel=1e-9)
+        line = next(line for line in text.splitlines() if f" {number}:" in line)
+        assert f"# {mark}" in line
+    if effort_limit is None:
+        assert read.drive.effort_limit >= read.stiffness
+    assert (read.drive.armature, read.drive.viscous_damping) == (0.03, 0.07)
+    checked = accepted("robot", "check", tmp_path / "robot.yaml")
+    assert "nothing is inconsistent" not in checked
+
+
+def test_stiffness_is_the_derivative_of_the_torque_of_the_actuators(tmp_path: Path) -> None:
+    """By MuJoCo's own forces, at two positions and two speeds."""
+    actuators = (
+        '<position joint="j" kp="7" kv="0.3" gear="5"/><position joint="j" kp="3" kv="0.1"/>'
+    )
+    path = tmp_path / "actuated.xml"
+    path.write_text(ACTUATED.format(actuators=actuators, joint="", tendon=""))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    torques = {}
+    for position, speed in ((0.0, 0.0), (0.1, 0.0), (0.0, 1.0)):
+        data.joint("j").qpos[:] = position
+        data.joint("j").qvel[:] = speed
+        mujoco.mj_forward(model, data)
+        torques[position, speed] = data.joint("j").qfrc_actuator[0]
+    joint = load_robot(path).joint("j")
+    assert joint.stiffness == pytest.approx(-(torques[0.1, 0.0] - torques[0.0, 0.0]) / 0.1)
+    assert joint.damping == pytest.approx(-(torques[0.0, 1.0] - torques[0.0, 0.0]))
+
+
+@pytest.mark.parametrize("pose", [-0.7, -3e-13, 0.0, 2.0, 2.4])
+def test_a_pose_at_a_stop_is_moved_and_named(pose: float, tmp_path: Path) -> None:
+    path = tmp_path / "knee.xml"
+    path.write_text(
+        "<mujoco><compiler angle='radian'/><worldbody><body><joint name='knee' axis='0 1 0' "
+        "range='-3e-13 2.4' limited='true' armature='.01' frictionloss='.1'/>"
+        "<inertial pos='0 0 -.1' mass='1' diaginertia='.01 .01 .01'/></body></worldbody>"
+        f"<actuator><position joint='knee' kp='30' kv='1' forcerange='-20 20'/></actuator>"
+        f"<keyframe><key qpos='{pose}'/></keyframe></mujoco>"
+    )
+    accepted("robot", "new", path)
+    file = tmp_path / "robot.yaml"
+    joint = load_robot(file).joint("knee")
+    low, high = joint.range
+    assert low + 0.3 < joint.default_position < high - 0.3
+    content = yaml.safe_load(file.read_text())
+    for position, is_named in ((0.0, True), (2.4, True), (1.0, False)):
+        content["poses"]["default"]["knee"] = position
+        file.write_text(yaml.safe_dump(content))
+        assert ("end of its range" in invoke(("robot", "check", file)).stderr) == is_named
+
+
+LINKS = """
+<?xml version="1.0"?>
+<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <material name="grey"><color rgba=".5 .5 .5 1"/></material>
+  <material name="grey"><color rgba=".5 .5 .5 1"/></material>
+  <link name="base">
+    <inertial><mass value="3"/>
+      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://arm/base.dae"/></geometry>
+      <material name="grey"/><material name="other"/></visual>
+    <collision name="c"><geometry><mesh filename="package://arm/base.stl"/></geometry></collision>
+  </link>
+  <link name="lower">
+    <inertial><origin xyz="0 0 -0.2"/><mass value="0.8"/>
+      <inertia ixx="{inertia}" iyy="0.004" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="http://nowhere/x.stl"/></geometry></visual>
+    <collision name="c"><geometry><sphere radius="0.02"/></geometry></collision>
+  </link>
+  <link name="camera">
+    <inertial><mass value="0.01"/>
+      <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
+    <sensor/>
+  </link>
+  <link name="optical_frame"/>
+  <link name="follower">
+    <inertial><mass value="0.1"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="elbow" type="revolute"><parent link="base"/><child link="lower"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="2" effort="{effort}" velocity="{speed}"/></joint>
+  <joint name="f1" type="fixed"><parent link="lower"/><child link="camera"/></joint>
+  <joint name="f2" type="fixed"><parent link="camera"/><child link="optical_frame"/></joint>
+  <joint name="finger" type="revolute"><parent link="lower"/><child link="follower"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>
+    <mimic joint="elbow"/></joint>
+  <gazebo reference="camera"><sensor type="depth"/></gazebo>
+  <transmission name="t"/>
+</robot>
+"""
+
+
+def urdf(folder: Path, *, inertia: float = 0.004, effort: float = 9.0, speed: float = 3.1) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(LINKS.format(inertia=inertia, effort=effort, speed=speed))
+    return path
+
+
+def test_a_urdf_needs_no_meshes_and_its_limits_are_used(tmp_path: Path) -> None:
+    accepted("robot", "new", urdf(tmp_path))
+    file = tmp_path / "robot.yaml"
+    robot = load_robot(file)
+    joint = robot.joint("elbow")
+    assert robot.held_joints == ("finger",)
+    assert joint.range == (-1.0, 2.0)
+    assert joint.drive.effort_limit == 9.0
+    assert joint.drive.no_load_speed == 3.1
+    # The lower link about its end, and camera and finger at the axis.
+    inertia = 0.004 + 0.8 * 0.2**2 + 0.4 * 0.01 * 0.01**2 + 1e-4
+    assert bench_inertia(robot, "elbow")[0] == pytest.approx(inertia, rel=1e-6)
+    content = yaml.safe_load(file.read_text())
+    content["drives"]["elbow"]["effort_limit"] = 20.0
+    content["drives"]["elbow"]["no_load_speed"] = 1.0
+    file.write_text(yaml.safe_dump(content))
+    problems = invoke(("robot", "check", file)).stderr
+    assert "effort limit of elbow" in problems
+    assert "speed of elbow" in problems
+
+
+def test_an_inertia_that_no_body_has_is_replaced_and_named(tmp_path: Path) -> None:
+    for inertia in (0.05, -0.004):
+        path = urdf(tmp_path, inertia=inertia)
+        description = describe_model(path)
+        assert any("lower" in note for note in description.notes)
+    assert "elbow" in description.file.groups
+
+
+def test_a_urdf_without_effort_gets_an_assumed_one(tmp_path: Path) -> None:
+    path = urdf(tmp_path, effort=0.0, speed=0.0)
+    remarks = describe_model(path).remarks
+    assert remarks["elbow", "effort_limit"].mark == "CHECK"
+    assert remarks["elbow", "no_load_speed"].mark == "CHECK"
+    assert load_robot(path).joint("elbow").drive.effort_limit > 0.0
+
+
+def test_the_effort_limit_is_compared_with_stiffness_and_gravity(tmp_path: Path) -> None:
+    for actuator, words in (
+        ('<position joint="j" kp="900" kv="3" forcerange="-3 3"/>', "stiffness of j"),
+        ('<position joint="j" kp="2" kv="0.1" forcerange="-0.3 0.3"/>', "gravity"),
+    ):
+        path = tmp_path / "actuated.xml"
+        text = ACTUATED.format(actuators=actuator, joint="", tendon="")
+        path.write_text(text.replace('pos="0 0 -0.2"', 'pos="0.3 0 0"'))
+        assert words in invoke(("robot", "check", path)).stderr
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<mujoco><worldbody>" + "<body>" * 20_000 + "</body>" * 20_000 + "</worldbody></mujoco>",
+        "<mujoco><default>"
+        + "<default>" * (MAX_DEPTH + 9)
+        + "</default>" * (MAX_DEPTH + 9)
+        + "</default></mujoco>",
+        "<mujoco><worldbody><replicate count='100000'><replicate count='100000'>"
+        "<body><geom size='.1'/></body></replicate></replicate></worldbody></mujoco>",
+        "<mujoco><asset><texture type='2d' name='t' builtin='flat' width='1000000' "
+        "height='1000000'/></asset></mujoco>",
+        "<mujoco><asset><hfield name='h' nrow='100000' ncol='100000' size='1 1 1 1'/></asset>"
+        "</mujoco>",
+        "<mujoco><worldbody><flexcomp name='f' type='grid' count='5000 5000 50' "
+        "spacing='1 1 1'/></worldbody></mujoco>",
+        "<mujoco><include file='robot.xml'/></mujoco>",
+        "<mujoco><option timestep='nan'/><worldbody><body><joint/><geom size='nan'/></body>"
+        "</worldbody></mujoco>",
+        "<mujoco",
+        "",
+        "<robot/>",
+        "<robot name='r'><link/><joint/></robot>",
+        "<mujoco><worldbody><body><joint/><inertial mass='-1' pos='0 0 0'/></body></worldbody>"
+        "</mujoco>",
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    refused("robot", "new", path)
+    assert [file.name for file in tmp_path.iterdir()] == ["robot.xml"]
