@@ -61,8 +61,8 @@ def problems_of(robot: RobotSpec) -> list[str]:
             by_type.setdefault(joint.servo, []).append(joint.name)
     for servo_type, names in by_type.items():
         problems.append(
-            f"the model has {SERVOS[servo_type]} and no position servo for {', '.join(names)}: give "
-            "the gains of the real drives and remove `servo`"
+            f"the model has {SERVOS[servo_type]} and no position servo for {', '.join(names)}: "
+            "give the gains of the real drives and remove `servo`"
         )
     return problems
 
