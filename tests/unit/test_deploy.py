@@ -464,8 +464,8 @@ def stopped(name: str) -> list[State]:
 
 def test_a_robot_at_rest_may_move() -> None:
     assert refused(stream()) == ()
-    # A voltage of 0 is one that the link does not carry.
-    assert refused(stream(temperature=np.full(12, 40.0), bus_voltage=0.0)) == ()
+    # A voltage that is not a number is one that the link does not carry.
+    assert refused(stream(temperature=np.full(12, 40.0), bus_voltage=math.nan)) == ()
 
 
 LEANING = {"orientation": rolled(1.0), "accelerometer": 9.81 * np.array([0, 0.84147, 0.54030])}
@@ -489,6 +489,7 @@ LEANING = {"orientation": rolled(1.0), "accelerometer": 9.81 * np.array([0, 0.84
         (stream(position=at(2, 2.8)), 0.5, "FR_knee"),
         (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll"),
         (stream(bus_voltage=18.0), 0.5, "18.0"),
+        (stream(bus_voltage=0.0), 0.5, "0.0 V"),
         (stream(temperature=np.full(12, 90.0)), 0.5, "FR_hip_roll"),
         *((stopped(name), 0.5, name) for name in ("gyro", "accelerometer", "orientation")),
     ],

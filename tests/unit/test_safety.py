@@ -99,6 +99,24 @@ def test_a_command_within_all_limits_passes_unchanged() -> None:
     assert sent.damping is KD
 
 
+@pytest.mark.parametrize("target", [1e3, -1e3, 1e5, 1e6 - 1.0])
+def test_a_target_far_beyond_its_range_is_a_fault_at_once(target: float) -> None:
+    absurd = command(position=at(POSE, target, 4))
+    sent, decision, safety = judged(state(), absurd, 0.001)
+    assert sent is None
+    assert decision.reason is Reason.FAR_TARGET
+    assert ROBOT.joint_names[4] in decision.detail
+    assert safety.level is FilterAction.LATCH
+    beyond = float(LIMITS.joints.high[4]) + LIMITS.operating.far_target
+    near = command(position=at(POSE, beyond - 0.01, 4))
+    far = command(position=at(POSE, beyond + 0.01, 4))
+    assert reason_of(state(), near) is not Reason.FAR_TARGET
+    assert reason_of(state(), far) is Reason.FAR_TARGET
+    # A joint without stiffness has no target.
+    loose = command(position=at(POSE, 1e3, 4), stiffness=at(KP, 0.0, 4))
+    assert reason_of(state(), loose) is not Reason.FAR_TARGET
+
+
 @pytest.mark.parametrize(
     ("age_s", "reason"),
     [
@@ -133,7 +151,7 @@ def test_each_reason_has_its_level() -> None:
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_what_is_not_a_number_latches(number: float) -> None:
-    for name in ("position", "velocity", "gyro", "orientation"):
+    for name in ("position", "velocity", "gyro", "accelerometer", "orientation"):
         s = state(**{name: at(getattr(state(), name), number)})
         assert reason_of(s, command()) == Reason.STATE_NOT_FINITE
     for name in ("position", "stiffness", "damping"):
@@ -338,7 +356,7 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
         velocity=spread(of_joints, 0.0, 5.0),
         orientation=orientation,
         torque=np.full((count, 12), np.nan),
-        gyro=spread((count, 3), 0.0, 1.0),
+        imu=spread((count, 6), (0.0, 0.0, 0.0, 0.0, 0.0, 9.81), 1.0),
         temperature=np.where(
             rng.random(of_joints) < 0.5, np.nan, rng.uniform(20.0, 82.0, of_joints)
         ),
@@ -352,7 +370,7 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
         previous=position + spread(of_joints, 0.0, 0.3),
         dead_man=rng.random(count) < 0.95,
     )
-    for values in (drawn.position, drawn.velocity, drawn.gyro, drawn.target, drawn.previous):
+    for values in (drawn.position, drawn.velocity, drawn.imu, drawn.target, drawn.previous):
         struck = rng.random(values.shape) < 0.001
         values[struck] = rng.choice([math.nan, math.inf, -math.inf, 1e300], struck.sum())
     return drawn

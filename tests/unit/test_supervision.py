@@ -184,3 +184,106 @@ def test_old_states_are_held_for_a_tenth_of_any_second() -> None:
             break
     assert decision.reason is Reason.HELD
     assert 0.5 < t < 1.1
+
+
+# --- Clocks and the stream of states --------------------------------------------------------------
+
+CLOCKS: dict[str, Callable[[float], float | None]] = {
+    "none": lambda t: None,
+    "right": lambda t: 1000.0 + t,
+    "stuck": lambda t: 1.0,
+    "1000 times too fast": lambda t: 1e3 * t,
+    "1000 times too slow": lambda t: 1e-3 * t,
+    "jumps by 10 s": lambda t: t + 10.0 * (math.floor(t / 0.1) % 2),
+    "backwards": lambda t: -t,
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_frozen_unit_is_found_whatever_the_robots_own_time_says(clock: str) -> None:
+    def timed() -> Iterator[State]:
+        for state in spoil(lambda sound, state: spoiled("imu-repeats", sound, state)):
+            yield replace(state, robot_time=CLOCKS[clock](state.time))
+
+    reason, when = judged(timed())
+    assert reason is Reason.REPEATED
+    assert when - BEGINS <= 0.05
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_robots_clock_that_disagrees_with_arrival_is_a_fault(clock: str) -> None:
+    states = (replace(state, robot_time=CLOCKS[clock](state.time)) for state in moving(4.0))
+    reason, when = judged(states)
+    if clock in ("none", "right"):
+        assert reason is Reason.NONE
+    else:
+        assert reason is Reason.ROBOT_CLOCK
+        assert when <= 2.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_right_clock_and_arrivals_of_a_busy_computer_give_no_alarm(seed: int) -> None:
+    """States arrive late by up to 45 ms, together with those that were sent meanwhile."""
+    rng = np.random.default_rng(seed)
+    arrival = 0.0
+    arrived = []
+    for state in moving(6.0, seed):
+        pause = 0.045 * rng.random() if rng.random() < 0.02 else 0.0
+        arrival = max(arrival + 1e-6, state.time + pause)
+        drifting_time = 5.0 + 1.001 * state.time
+        arrived.append(replace(state, time=arrival, robot_time=drifting_time))
+    assert judged(iter(arrived))[0] is Reason.NONE
+
+
+def test_states_that_are_never_compared_are_a_fault() -> None:
+    # Times of arrival that go back every 20 ms, so that nothing is ever compared for long.
+    states = (
+        replace(state, time=state.time - 0.004 * (state.sequence // 10), sequence=state.sequence)
+        for state in moving(1.0)
+    )
+    safety = SafetyFilter(limits=LIMITS)
+    for state in states:
+        safety.sensors.observe(state)
+    assert safety.sensors.restarts > LIMITS.sensors.restarts
+
+
+def test_an_overtaken_state_changes_nothing() -> None:
+    states = list(moving(1.0))
+    for k in range(50, 450, 50):
+        states[k], states[k + 1] = states[k + 1], states[k]
+    assert judged(iter(states))[0] is Reason.NONE
+
+
+# --- Bus voltage and numbers ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("volts", "found"), [(0.0, True), (6.0, True), (20.0, False)])
+def test_a_low_bus_voltage_is_found(volts: float, found: bool) -> None:
+    reason, when = judged(spoil(lambda _, state: replace(state, bus_voltage=volts)))
+    assert reason is (Reason.BUS_VOLTAGE if found else Reason.NONE)
+    if found:
+        assert when - BEGINS <= 0.1
+
+
+def test_a_voltage_that_the_wire_lacks_or_that_sags_for_a_moment_is_no_fault() -> None:
+    missing = (replace(state, bus_voltage=math.nan) for state in moving(1.0))
+    assert judged(missing)[0] is Reason.NONE
+    sagging = (
+        replace(state, bus_voltage=10.0 if state.time % 0.2 < 0.05 else 24.0)
+        for state in moving(1.0)
+    )
+    assert judged(sagging)[0] is Reason.NONE
+
+
+def test_one_accelerometer_reading_that_is_no_number_is_a_fault_and_poisons_no_mean() -> None:
+    def once(state: State, k: int) -> State:
+        return replace(state, accelerometer=np.full(3, math.nan)) if k == 100 else state
+
+    assert judged(once(state, k) for k, state in enumerate(moving(1.0)))[0] is (
+        Reason.STATE_NOT_FINITE
+    )
+    safety = SafetyFilter(limits=LIMITS)
+    for k, state in enumerate(moving(1.0)):
+        safety.sensors.observe(once(state, k))
+    assert np.isfinite(safety.sensors.force).all()
+    assert safety.sensors.lean < 0.2

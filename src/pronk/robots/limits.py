@@ -39,6 +39,11 @@ class OperatingLimits:
     """Largest angle of the trunk's z axis from the vertical [rad]; infinite for a hung robot."""
     temperature: float = 80.0
     """Largest temperature of a motor, where it is measured [deg C]."""
+    far_target: float = 1.0
+    """Distance beyond a mechanical limit from which a target is a fault [rad]; nearer ones are
+    moved back."""
+    bus_voltage: float = 0.0
+    """Least bus voltage, where the link carries it [V]; 0 for a share of the drives' nominal."""
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
@@ -51,11 +56,17 @@ class OperatingLimits:
             "power_w": self.power_w,
             "overrun": self.overrun,
             "temperature": self.temperature,
+            "far_target": self.far_target,
         }
         for name, number in numbers.items():
             if not 0.0 < number < math.inf:
                 raise RobotError(
                     f"OperatingLimits.{name} is {number}; it must be positive and finite."
                 )
+        if not 0.0 <= self.bus_voltage < math.inf:
+            raise RobotError(
+                f"OperatingLimits.bus_voltage is {self.bus_voltage}; it must be finite and not "
+                "negative."
+            )
         if not self.tilt > 0.0:
             raise RobotError(f"OperatingLimits.tilt is {self.tilt}; it must be positive.")

@@ -160,6 +160,8 @@ class LimitsEntry(_Entry, frozen=True):
     overrun: _Positive = OperatingLimits.overrun
     tilt: _Positive = OperatingLimits.tilt
     temperature: _Positive = OperatingLimits.temperature
+    far_target: _Positive = OperatingLimits.far_target
+    bus_voltage: float = OperatingLimits.bus_voltage
 
     def limits(self) -> OperatingLimits:
         """Return the limits of the robot."""
@@ -173,6 +175,8 @@ class LimitsEntry(_Entry, frozen=True):
             overrun=self.overrun,
             tilt=self.tilt,
             temperature=self.temperature,
+            far_target=self.far_target,
+            bus_voltage=self.bus_voltage,
         )
 
 

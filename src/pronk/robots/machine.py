@@ -36,7 +36,7 @@ class State:
     torque: Array  # as the drives report it [N m]
     gyro: Array  # angular velocity of the trunk in its own frame [rad/s], shape (3,)
     accelerometer: Array  # specific force of the trunk in its own frame [m/s^2], shape (3,)
-    bus_voltage: float  # [V]
+    bus_voltage: float  # [V]; NaN where the wire carries none
     # Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z. Its yaw has
     # an arbitrary zero.
     orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,11 @@ from pronk.errors import RobotError
 from pronk.robots.limits import OperatingLimits
 from pronk.robots.motor import winding_loss
 from pronk.robots.robot import RobotSpec
+
+VOLTAGE_SHARE = 0.55
+"""Least bus voltage of a robot whose file states none, as a share of the nominal: lithium cells at
+2.5 V, below which they are damaged, of a nominal 3.6 to 4 V still give 0.63 to 0.69. Take-offs pull
+it lower for some milliseconds."""
 
 
 def _require_positive(group: str, numbers: Mapping[str, float]) -> None:
@@ -171,6 +176,10 @@ class SensorLimits:
     others_moved: float = 0.05
     """Largest sum of the displacements of other joints while one is constant for `repeat_s` [rad];
     the largest measured is 0.003, with encoders of 12 bits without noise."""
+    clock_s: float = 0.2
+    """Largest difference of the robot's clock and the times of arrival over a second [s]."""
+    restarts: int = 4
+    """Largest number of times in a row that the comparison of states begins anew."""
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
@@ -185,6 +194,8 @@ class SensorLimits:
                 "encoder": self.encoder,
                 "moved": self.moved,
                 "others_moved": self.others_moved,
+                "clock_s": self.clock_s,
+                "restarts": self.restarts,
             },
         )
 
@@ -288,4 +299,8 @@ class Limits:
             loss=np.array(loss, dtype=float),
             felt=np.array(felt),
         )
-        return cls(joints=joints, operating=robot.limits)
+        operating = robot.limits
+        if operating.bus_voltage == 0.0:
+            nominal = max(joint.drive.bus_voltage for joint in robot.joints)
+            operating = replace(operating, bus_voltage=VOLTAGE_SHARE * nominal)
+        return cls(joints=joints, operating=operating)

@@ -31,6 +31,9 @@ NORM_SLACK = 0.02
 """Largest difference of the length of the attitude's quaternion from 1."""
 REST_SPEED = 1.0
 """Fastest that a joint of a robot at rest may turn [rad/s]."""
+CLOCK_SHARE = 0.3
+"""Largest difference of the robot's clock and the times of arrival, as a share of the time of the
+check: a pause of this computer of 0.1 s delays a state of half a second by 0.2 of it."""
 BATTERY_SHARE = 0.85
 """Least share of the nominal bus voltage: a lithium battery is nearly empty there."""
 _LIVE_S = 0.1
@@ -94,6 +97,16 @@ def _stream(
         )
     if age < -limits.ages.future_s:
         yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; correct the link's clock."
+    first, last = states[0], states[-1]
+    if first.robot_time is not None and last.robot_time is not None:
+        arrived_s = last.time - first.time
+        stamped_s = last.robot_time - first.robot_time
+        if not abs(stamped_s - arrived_s) <= CLOCK_SHARE * seconds:
+            yield (
+                f"the robot's own clock advanced by {stamped_s:.3g} s while states arrived for "
+                f"{arrived_s:.3g} s; it stands still, has jumped or counts in another unit, so "
+                "correct it, or let the link leave `robot_time` out."
+            )
 
 
 def _sensors(states: Sequence[State], limits: Limits, seconds: float) -> Iterator[str]:
@@ -179,8 +192,8 @@ def _battery(states: Sequence[State], robot: RobotSpec) -> Iterator[str]:
     nominal = max(joint.drive.bus_voltage for joint in robot.joints)
     lowest = BATTERY_SHARE * nominal
     voltage = float(np.mean([state.bus_voltage for state in states]))
-    # A link that does not carry the voltage gives 0 or NaN.
-    if 0.0 < voltage < lowest:
+    # A link that does not carry the voltage gives NaN; 0 V is a measurement.
+    if voltage < lowest:
         yield f"the battery gives {voltage:.1f} V, expected {lowest:.1f} V at least; charge it."
 
 

@@ -57,6 +57,10 @@ class Reason(IntEnum):
     CLIPPED = 27
     SWAPPED = 28
     STANDBY = 29
+    ROBOT_CLOCK = 30
+    INTERRUPTED = 31
+    BUS_VOLTAGE = 32
+    FAR_TARGET = 33
 
     @property
     def text(self) -> str:
@@ -180,6 +184,18 @@ REASONS: tuple[ReasonEntry, ...] = (
         _LATCH,
         "the servo was silent for too long, and the standby process damped the joints",
     ),
+    ReasonEntry(
+        Reason.ROBOT_CLOCK,
+        _LATCH,
+        "the robot's own clock disagrees with the times at which its states arrive",
+    ),
+    ReasonEntry(
+        Reason.INTERRUPTED,
+        _LATCH,
+        "states come with pauses or out of order, so that they cannot be compared",
+    ),
+    ReasonEntry(Reason.BUS_VOLTAGE, _LATCH, "the bus voltage is too low for the drives"),
+    ReasonEntry(Reason.FAR_TARGET, _LATCH, "a target is far beyond the range of its joint"),
 )
 """Every reason in the order of its number: entry `n` is that of `Reason(n)`."""
 

@@ -57,8 +57,8 @@ class SafetyInput:
     """Temperatures of the motors [deg C], (..., n)."""
     orientation: Array
     """Attitudes of the trunk, quaternions w, x, y, z, (..., 4)."""
-    gyro: Array
-    """Angular velocities of the trunk [rad/s], (..., 3)."""
+    imu: Array
+    """Angular velocities of the trunk [rad/s], then its specific forces [m/s^2], (..., 6)."""
     state_age: Array | float
     """Age of the newest state, positive for one in the past [s]."""
     target: Array
@@ -103,7 +103,7 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     n = len(limits.joints.names)
     ages = limits.ages
     state_is_finite, state = _finite(
-        checked.position, checked.velocity, checked.orientation, checked.gyro
+        checked.position, checked.velocity, checked.orientation, checked.imu
     )
     command_is_finite, command = _finite(
         checked.target, checked.stiffness, checked.damping, checked.previous
@@ -117,6 +117,11 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     previous = command[..., 3 * n :]
     state_age = np.asarray(checked.state_age)
     command_age = np.asarray(checked.command_age)
+
+    low = limits.joints.low - limits.operating.far_target
+    high = limits.joints.high + limits.operating.far_target
+    is_far = ((target < low) | (target > high)) & (stiffness > _NO_STIFFNESS)
+    far_target = is_far.any(axis=-1)
 
     # The target: held if the state is old, then moved into all limits.
     hold = state_age > ages.hold_s
@@ -148,6 +153,7 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
         (Reason.STATE_NOT_FINITE, bad_state),
         (Reason.COMMAND_NOT_FINITE, bad_command),
         (Reason.GAINS, bad_gains),
+        (Reason.FAR_TARGET, far_target),
         (Reason.CLOCK, np.minimum(state_age, command_age) < -ages.future_s),
         (Reason.EXPIRED, command_age > expiry),
         (Reason.STATE_LOST, state_age > ages.latch_s),

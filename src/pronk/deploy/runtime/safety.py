@@ -158,6 +158,8 @@ class SafetyFilter:
         n = len(self.limits.joints.names)
         newest = states[-1]
         position = _rows([state.position for state in states], n)
+        gyro = _rows([state.gyro for state in states], 3)
+        accelerometer = _rows([state.accelerometer for state in states], 3)
         lag = 0.0
         if command.state_sequence >= 0:
             lag = (newest.sequence - command.state_sequence) * LAG_RATE_HZ / self.state_rate_hz
@@ -167,7 +169,7 @@ class SafetyFilter:
             torque=_rows([state.torque for state in states], n),
             temperature=_rows([state.temperature for state in states], n),
             orientation=_rows([state.orientation for state in states], 4),
-            gyro=_rows([state.gyro for state in states], 3),
+            imu=np.concatenate((gyro, accelerometer), axis=-1),
             state_age=t - newest.time,
             target=_rows([command.position], n),
             stiffness=_rows([command.stiffness], n),
@@ -217,6 +219,12 @@ def fault_detail(reason: Reason, state: State, command: Command, limits: Limits,
         return (
             f"{joints.names[i]} {position[i]:.2f}, of {joints.low[i]:.2f} to "
             f"{joints.high[i]:.2f} rad"
+        )
+    if reason is Reason.FAR_TARGET:
+        target = np.asarray(command.position)
+        i = int(np.argmax(np.maximum(joints.low - target, target - joints.high)))
+        return (
+            f"{joints.names[i]} {target[i]:.2f}, of {joints.low[i]:.2f} to {joints.high[i]:.2f} rad"
         )
     if reason is Reason.TEMPERATURE and state.temperature is not None:
         i = int(np.nanargmax(state.temperature))

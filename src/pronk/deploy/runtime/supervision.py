@@ -10,10 +10,11 @@ Cheetah with ten parameter sets, a third of it with 30 % of the states lost (see
 rule. "Largest" is the largest value of the quantity in that time. `python -m benchmarks
 supervision` repeats the measurement.
 
-Times between states are the robot's own where it sends them, else of arrival. Where the number of
-states and their time of arrival differ, as in a burst after a pause, an integral is as uncertain as
-the product of that difference and the speed. Between two states of which some in between were lost
-it is as uncertain as half the change of the speed times the time.
+Times between states are those of their arrival. The robot's own clock times nothing here; it is
+compared with arrival (`clocks.ClockComparison`). Where the number of states and their time of
+arrival differ, as in a burst after a pause, an integral is as uncertain as the product of that
+difference and the speed. Between two states of which some in between were lost it is as uncertain
+as half the change of the speed times the time.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pronk.arrays import Array, Mask
+from pronk.deploy.runtime.clocks import ClockComparison
 from pronk.deploy.runtime.limits import Limits
 from pronk.deploy.runtime.reasons import Decision, Reason
 from pronk.robots.machine import State
@@ -38,6 +40,12 @@ AVERAGE_S = 1.0
 """Time constant of the mean specific force [s]."""
 LONGEST_GAP_S = 0.05
 """Longest time between two states; after a longer one the comparison begins anew [s]."""
+LONGEST_STEP = 5.0
+"""Periods that count, for each state by its number, towards the time for which a source repeats: a
+pause in which nothing arrived does not show that a source has stopped."""
+VOLTAGE_S = 0.08
+"""Time within which the largest bus voltage counts [s]: twice the longest that a take-off of the
+virtual robot pulls it below 0.6 of the nominal, 38 ms."""
 _GRAVITY = 9.81
 _IMU_SOURCES = ("orientation", "gyro", "accelerometer")
 _ALL_CONSTANT_SHARE = 0.5
@@ -56,6 +64,12 @@ class SensorHistory:
         self._window = max(2, round(WINDOW_S * state_rate_hz))
         self.live = np.zeros(joints, dtype=np.bool_)
         """Whether position or velocity of a joint has ever changed."""
+        self.clock = ClockComparison()
+        """The robot's own clock against the times of arrival."""
+        self.restarts = 0
+        """Restarts of the comparison since states were last compared for `WINDOW_S` without one."""
+        self._undisturbed_s = 0.0
+        self._voltages: deque[float] = deque(maxlen=max(1, round(VOLTAGE_S * state_rate_hz)))
         self._newest: State | None = None
         self._command_torque = np.zeros(joints)
         self._reset(np.zeros(joints))
@@ -116,9 +130,19 @@ class SensorHistory:
         x, y, z = self.force
         return math.atan2(math.hypot(x, y), z)
 
+    @property
+    def voltage(self) -> float:
+        """Largest bus voltage of the last `VOLTAGE_S` [V]; NaN before, and where there is none."""
+        voltages = self._voltages
+        return max(voltages) if len(voltages) == voltages.maxlen else math.nan
+
     def begin(self) -> None:
         """Begin anew with the next state."""
         self._newest = None
+        self.restarts = 0
+        self._undisturbed_s = 0.0
+        self._voltages.clear()
+        self.clock.begin()
 
     def command(self, torque: Array) -> None:
         """Note the part of the commanded torque that depends on the target, `kp target` [N m]."""
@@ -131,13 +155,21 @@ class SensorHistory:
             self._newest = state
             self._reset(state.position)
             return
-        if state.sequence == before.sequence and state.time <= before.time:
+        if state.sequence <= before.sequence and state.time <= before.time:
             return
         self._newest = state
-        seconds = _state_clock(state) - _state_clock(before)
-        if not 0.0 < seconds <= LONGEST_GAP_S:
+        seconds = state.time - before.time
+        if not 0.0 <= seconds <= LONGEST_GAP_S:
+            self.restarts += 1
+            self._undisturbed_s = 0.0
             self._reset(state.position)
+            self.clock.begin()
             return
+        self._undisturbed_s += seconds
+        if self._undisturbed_s > WINDOW_S:
+            self.restarts = 0
+        self.clock.observe(state.time, state.robot_time)
+        self._voltages.append(state.bus_voltage)
         self._late += seconds - self._period * (state.sequence - before.sequence)
         self._late_window.append(self._late)
         self._late_spread = max(self._late_window) - min(self._late_window)
@@ -146,9 +178,11 @@ class SensorHistory:
 
     def _observe_trunk(self, before: State, state: State, seconds: float) -> None:
         """Update the quantities of the trunk between two states."""
+        states = max(1, state.sequence - before.sequence)
+        counted_s = min(seconds, LONGEST_STEP * self._period * states)
         for name, constant_s in self.repeated.items():
             same = getattr(state, name).tobytes() == getattr(before, name).tobytes()
-            self.repeated[name] = constant_s + seconds if same else 0.0
+            self.repeated[name] = constant_s + counted_s if same else 0.0
         # Plain numbers: arrays of three cost more than their arithmetic.
         attitude = state.orientation.tolist()
         rate_x, rate_y, rate_z = (0.5 * (before.gyro + state.gyro)).tolist()
@@ -181,12 +215,14 @@ class SensorHistory:
 
         share = min(seconds / AVERAGE_S, 1.0)
         force_x, force_y, force_z = _to_world(attitude, state.accelerometer.tolist())
-        mean_x, mean_y, mean_z = self.force
-        self.force = (
-            mean_x + share * (force_x - mean_x),
-            mean_y + share * (force_y - mean_y),
-            mean_z + share * (force_z - mean_z),
-        )
+        # The filter refuses such a state; a mean that took one in would never be a number again.
+        if math.isfinite(force_x + force_y + force_z):
+            mean_x, mean_y, mean_z = self.force
+            self.force = (
+                mean_x + share * (force_x - mean_x),
+                mean_y + share * (force_y - mean_y),
+                mean_z + share * (force_z - mean_z),
+            )
 
     def _observe_joints(self, before: State, state: State, seconds: float) -> None:
         """Update the quantities of the joints between two states.
@@ -249,11 +285,6 @@ class SensorHistory:
         self.others = np.abs(position - self._origins).sum(axis=1)
 
 
-def _state_clock(state: State) -> float:
-    """Return the robot's own time of a state, or that of its arrival [s]."""
-    return state.time if state.robot_time is None else state.robot_time
-
-
 def _small_rotation(first: list[float], second: list[float]) -> Vector:
     """Return the rotation from one attitude to another in the trunk's frame; small angles [rad].
 
@@ -288,6 +319,42 @@ def _to_world(attitude: list[float], vector: list[float]) -> Vector:
 # Each rule returns what contradicts what, in words with numbers, or "" if nothing does.
 
 SensorRule = Callable[[SensorHistory, Limits], str]
+
+
+def robot_clock_off(history: SensorHistory, limits: Limits) -> str:
+    """Find a robot's clock that disagrees with the times of arrival.
+
+    Rule: `|change of the robot's time - change of the time of arrival|` over a second is more than
+    `clock_s`, 0.2 s, where each half second is timed by its least delayed state; or the robot's
+    times of half a second scatter by more than 0.5 s about those of arrival. A pause of this
+    computer, or a burst after it, delays some states of a block but not all. Only where the wire
+    carries the robot's time.
+    """
+    if history.clock.disagreement > limits.sensors.clock_s:
+        return f"by {history.clock.disagreement:.1f} s in a second"
+    return ""
+
+
+def interrupted_states(history: SensorHistory, limits: Limits) -> str:
+    """Find states that are never compared for long enough to find anything.
+
+    Rule: more than `restarts`, 4, times in a row the comparison began anew, because of a pause of
+    more than 50 ms or a time of arrival that went back, without 60 ms of states in between.
+    """
+    if history.restarts > limits.sensors.restarts:
+        return f"{history.restarts} times in a row"
+    return ""
+
+
+def low_voltage(history: SensorHistory, limits: Limits) -> str:
+    """Find a bus voltage below what the drives need.
+
+    Rule: the largest bus voltage of 80 ms is below `OperatingLimits.bus_voltage`, by default 0.55
+    of the nominal. NaN is no measurement; 0 is one.
+    """
+    if history.voltage < limits.operating.bus_voltage:
+        return f"{history.voltage:.1f} of {limits.operating.bus_voltage:.1f} V"
+    return ""
 
 
 def repeated_source(history: SensorHistory, limits: Limits) -> str:
@@ -415,6 +482,12 @@ def _constant(history: SensorHistory, limits: Limits) -> tuple[Mask, Mask]:
     return constant[:n], constant[n:]
 
 
+STREAM_RULES: tuple[tuple[Reason, SensorRule], ...] = (
+    (Reason.ROBOT_CLOCK, robot_clock_off),
+    (Reason.INTERRUPTED, interrupted_states),
+    (Reason.BUS_VOLTAGE, low_voltage),
+)
+"""Rules of the stream of states and of the supply, of any robot, before all others."""
 TRUNK_RULES: tuple[tuple[Reason, SensorRule], ...] = (
     (Reason.REPEATED, repeated_source),
     (Reason.ATTITUDE, attitude_off_gyro),
@@ -435,9 +508,9 @@ robot at rest may repeat for good, so it takes a contradiction to make a fault."
 
 def find_contradiction(history: SensorHistory, limits: Limits) -> Decision | None:
     """Return the fault of the first rule that is met; None if the states can all be true."""
-    rules = JOINT_RULES
+    rules = STREAM_RULES + JOINT_RULES
     if limits.trunk_is_free:
-        rules = TRUNK_RULES + JOINT_RULES
+        rules = STREAM_RULES + TRUNK_RULES + JOINT_RULES
     if (history.constant_s > limits.sensors.repeat_s).any():
         rules = rules + CONSTANT_RULES
     for reason, rule in rules:

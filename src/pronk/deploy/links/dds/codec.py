@@ -218,6 +218,7 @@ class DdsStateDecoder(StateNumbering):
         gyroscope = imu["gyroscope"]
         accelerometer = imu["accelerometer"]
         _check_finite("imu_state", (quaternion, gyroscope, accelerometer))
+        _check_finite("power_v", (record["power_v"],))
         serial = record["sn"][0]
         self.virtual = (int(serial[0]), int(serial[1])) == VIRTUAL_SERIAL
         tick = int(record["tick"][0])
