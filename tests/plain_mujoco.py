@@ -29,9 +29,23 @@ class Peaks:
     """Greatest distance from the pose [rad]."""
 
 
-def peaks_in_mujoco(
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """What the excited joint did at the start of each physics step, shape (steps,) each."""
+
+    position: Array
+    """Position [rad]."""
+    speed: Array
+    """Speed [rad/s]."""
+    torque: Array
+    """Torque of its actuator during the step [N m]."""
+    timestep_s: float
+    """Physics step [s]."""
+
+
+def motion_in_mujoco(
     robot: RobotSpec, joint: str, offsets: Array, timestep_s: float = TIMESTEP_S
-) -> Peaks:
+) -> Motion:
     """Excite one joint of a robot on a fixed base, the others of its chain held.
 
     Args:
@@ -67,15 +81,30 @@ def peaks_in_mujoco(
     excited = model.actuator(joint).id
     place = model.joint(joint).qposadr[0]
     rate = model.joint(joint).dofadr[0]
-    torque = speed = reach = 0.0
     rest_ticks = round(REST_S * robot.policy_rate_hz)
     data.ctrl[:] = pose
+    rows = []
     for offset in [*np.zeros(rest_ticks), *offsets]:
         data.ctrl[excited] = pose[excited] + offset
         for _ in range(steps):
-            reach = max(reach, abs(float(data.qpos[place]) - pose[excited]))
-            speed = max(speed, abs(float(data.qvel[rate])))
+            before = (float(data.qpos[place]), float(data.qvel[rate]))
             mujoco.mj_step(model, data)
             # The force of the step that was done.
-            torque = max(torque, abs(float(data.actuator_force[excited])))
-    return Peaks(torque=torque, speed=speed, reach=reach)
+            rows.append((*before, float(data.actuator_force[excited])))
+    position, speed, torque = np.array(rows).T
+    return Motion(
+        position=position, speed=speed, torque=torque, timestep_s=float(model.opt.timestep)
+    )
+
+
+def peaks_in_mujoco(
+    robot: RobotSpec, joint: str, offsets: Array, timestep_s: float = TIMESTEP_S
+) -> Peaks:
+    """Return the peaks of `motion_in_mujoco`."""
+    motion = motion_in_mujoco(robot, joint, offsets, timestep_s)
+    pose = robot.joint(joint).default_position
+    return Peaks(
+        torque=float(np.abs(motion.torque).max()),
+        speed=float(np.abs(motion.speed).max()),
+        reach=float(np.abs(motion.position - pose).max()),
+    )

@@ -45,8 +45,15 @@ Indices = NDArray[np.intp]
 
 # Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
 _STABLE = 1.0
-# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass as well [kg].
+# Largest damping of a drive times the step over the inertia of its rotor, for the second-order
+# correction of the inertia to suffice.
+_DAMPED = 0.5
+# Lowest frequency at which rotor and link may swing on their belt [Hz].
+_SOFTEST_HZ = 1.0
+# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass and inertia as
+# well [kg, kg m^2]: at most a millionth of the rotor's.
 _ROTOR_MASS = 1e-9
+_ROTOR_SHARE = 1e-6
 # Time in which a joint that has run into its stop is pushed back, 8 physics steps [s].
 _STOP_S = 2e-3
 # Joints of a compliant stand, and their axes.
@@ -81,6 +88,8 @@ class Plant:
         legs: tuple[str, ...],
         timestep_s: float,
         ground: Ground | None = None,
+        *,
+        checked: bool = True,
     ) -> None:
         """Build the plant.
 
@@ -90,6 +99,7 @@ class Plant:
             legs: Limbs that are simulated, of `legs_of(robot)`.
             timestep_s: Physics step [s].
             ground: The ground under a free trunk; None on the bench, without contacts.
+            checked: False to build it even if the step is too large; see `largest_timestep`.
 
         Raises:
             RobotError: Parameters of another robot, or a robot that cannot be simulated.
@@ -172,23 +182,52 @@ class Plant:
         [V]."""
         self.state_size = int(model.nq + model.nv + model.na + 1)
         """Numbers in a raw state: positions, velocities, activations, bus voltage."""
-        self._check_springs(params)
+        self._rotor_mass = model.body_mass[model.dof_bodyid[self.rotor]].copy()
+        damping = np.array([robot.joint(name).damping for name in names])
+        self.largest_timestep = self._largest_timestep(params, damping)
+        """Largest physics step at which belts, friction and drives can be simulated [s]."""
+        self._params = params
+        if checked:
+            self.check_springs()
 
-    def _check_springs(self, joints: list[JointParams]) -> None:
-        """Refuse springs that the physics step cannot follow; name field and largest value."""
+    def _mobilities(self) -> tuple[Array, Array]:
+        """Return what a torque accelerates, of rotors and belts [1 / (kg m^2)], (joints,) each."""
         model = self.model
         data = mujoco.MjData(model)
         inertia = np.zeros((model.nv, model.nv))
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, inertia)
         mobility = np.diag(np.linalg.inv(inertia))
-        for k, (name, joint) in enumerate(zip(self.joints, joints, strict=True)):
-            rotor_mobility = mobility[self.rotor[k]]
-            belt_mobility = rotor_mobility + mobility[self.link[k]]
-            self._check_spring(f"{name}.belt_stiffness", joint.belt_stiffness, belt_mobility)
-            self._check_spring(
-                f"{name}.presliding_stiffness", joint.presliding_stiffness, rotor_mobility
+        return mobility[self.rotor], mobility[self.rotor] + mobility[self.link]
+
+    def _largest_timestep(self, joints: list[JointParams], damping: Array) -> float:
+        """Compute `largest_timestep` from the drives' nominal damping [N m s/rad], (joints,)."""
+        rotors, belts = self._mobilities()
+        largest = math.inf
+        for k, joint in enumerate(joints):
+            fastest = math.sqrt(
+                max(joint.belt_stiffness * belts[k], joint.presliding_stiffness * rotors[k])
             )
+            largest = min(largest, _STABLE / fastest, _DAMPED / (damping[k] * rotors[k]))
+        return largest
+
+    def check_springs(self) -> None:
+        """Refuse springs that the physics step cannot follow, and belts that hold no link.
+
+        Raises:
+            RobotError: There is one; the message names field and limit.
+        """
+        rotors, belts = self._mobilities()
+        for name, joint, rotor, belt in zip(self.joints, self._params, rotors, belts, strict=True):
+            self._check_spring(f"{name}.belt_stiffness", joint.belt_stiffness, belt)
+            self._check_spring(f"{name}.presliding_stiffness", joint.presliding_stiffness, rotor)
+            lowest = (2.0 * math.pi * _SOFTEST_HZ) ** 2 / belt
+            if joint.belt_stiffness < lowest:
+                raise RobotError(
+                    f"joints.{name}.belt_stiffness is {joint.belt_stiffness:g}; rotor and link "
+                    f"would swing on it at less than {_SOFTEST_HZ:g} Hz; expected at least "
+                    f"{lowest:.3g} N m/rad."
+                )
 
     def _check_spring(self, field: str, stiffness: float, mobility: float) -> None:
         """Refuse a spring [N m/rad] on a mobility [1 / (kg m^2)] that is too stiff for the step."""
@@ -227,7 +266,7 @@ class Plant:
         inertia = self._rotor_inertia + half_step * explicit
         self.model.dof_armature[self.rotor] = inertia
         # MuJoCo reads this in its place for a rotor whose parent cannot move.
-        self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
+        self.model.dof_M0[self.rotor] = inertia + self._rotor_mass
 
     def motor_torque(self, act: Array) -> Array:
         """Compute motor torques without friction.
@@ -327,12 +366,14 @@ def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: f
     link = spec.joint(name)
     if link is None:
         raise RobotError(f"the robot's model has no joint {name!r}.")
+    rotor_inertia = params.rotor_inertia * drive.gear_ratio**2
+    rotor_mass = min(_ROTOR_MASS, _ROTOR_SHARE * rotor_inertia)
     rotor_body = link.parent.parent.add_body(
         name=f"{name}/rotor",
         pos=link.parent.pos,
         quat=link.parent.quat,
-        mass=_ROTOR_MASS,
-        inertia=[_ROTOR_MASS] * 3,
+        mass=rotor_mass,
+        inertia=[rotor_mass] * 3,
         ipos=link.pos,
         explicitinertial=True,
     )
@@ -341,7 +382,7 @@ def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: f
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=link.axis,
         pos=link.pos,
-        armature=params.rotor_inertia * drive.gear_ratio**2,
+        armature=rotor_inertia,
         damping=[params.viscous, 0, 0],
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
     )

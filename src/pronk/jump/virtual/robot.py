@@ -31,6 +31,8 @@ from pronk.robots.robot import RobotSpec
 
 TIMESTEP_S = 0.25e-3
 """Physics step [s]; the module's docstring says why it suffices."""
+SMALLEST_TIMESTEP_S = TIMESTEP_S / 64.0
+"""Smallest physics step that is taken for links that need one [s]."""
 _SETTLE_S = 2.0
 """Time before the clock starts on the bench, in which the legs settle into their hold [s]."""
 
@@ -66,7 +68,7 @@ class VirtualRobot:
         log_rate_hz: float = 500.0,
         capture_rate_hz: float | None = 1000.0,
         legs: tuple[str, ...] | None = None,
-        timestep_s: float = TIMESTEP_S,
+        timestep_s: float | None = None,
     ) -> None:
         """Build the plant.
 
@@ -82,7 +84,8 @@ class VirtualRobot:
                 0.7 MB at 1 kHz).
             legs: Legs that are simulated on the bench; None for all. Joints of absent legs report
                 their default position and no speed.
-            timestep_s: Physics step [s].
+            timestep_s: Physics step [s]; None for `TIMESTEP_S`, or a part of it where links are so
+                light, or drives so stiff, that they need one.
 
         Raises:
             HardwareError: Options that do not go together, or an impossible rate.
@@ -100,9 +103,10 @@ class VirtualRobot:
                 f"legs {legs}; expected some of {', '.join(all_legs)}, the legs of {robot.name}, "
                 "or None for all."
             )
-        _check_rate("log_rate_hz", log_rate_hz, timestep_s)
+        # A part of the step makes no lower rate impossible.
+        _check_rate("log_rate_hz", log_rate_hz, timestep_s or TIMESTEP_S)
         if capture_rate_hz is not None:
-            _check_rate("capture_rate_hz", capture_rate_hz, timestep_s)
+            _check_rate("capture_rate_hz", capture_rate_hz, timestep_s or TIMESTEP_S)
         self.robot = robot.name
         self.state_rate_hz = log_rate_hz
         self.capture_rate_hz = capture_rate_hz
@@ -114,8 +118,12 @@ class VirtualRobot:
         if base == "ground":
             self._ground = ground or sim_params.ground
         self._start = start or Start()
-        self._dt = timestep_s
-        self._plant = Plant(robot, sim_params, legs or all_legs, timestep_s, self._ground)
+        limbs = legs or all_legs
+        if timestep_s is None:
+            self._plant = _plant(robot, sim_params, limbs, self._ground)
+        else:
+            self._plant = Plant(robot, sim_params, limbs, timestep_s, self._ground)
+        self._dt = float(self._plant.model.opt.timestep)
         self._physics: Physics | None = None
         self._open = False
 
@@ -236,6 +244,20 @@ class VirtualRobot:
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         rows = self._running().run(steps.tolist())
         return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
+
+
+def _plant(
+    robot: RobotSpec, sim_params: SimParams, limbs: tuple[str, ...], ground: Ground | None
+) -> Plant:
+    """Build a plant at `TIMESTEP_S`, or at the largest half, quarter and so on that suffices."""
+    plant = Plant(robot, sim_params, limbs, TIMESTEP_S, ground, checked=False)
+    timestep_s = TIMESTEP_S
+    while timestep_s > plant.largest_timestep and timestep_s > SMALLEST_TIMESTEP_S:
+        timestep_s *= 0.5
+    if timestep_s == TIMESTEP_S:
+        plant.check_springs()
+        return plant
+    return Plant(robot, sim_params, limbs, timestep_s, ground)
 
 
 def _check_rate(name: str, rate_hz: float, timestep_s: float) -> None:

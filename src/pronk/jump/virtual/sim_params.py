@@ -30,14 +30,15 @@ SHIPPED_ROBOT = "mini_cheetah"
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 """File of the shipped parameters."""
 
-# Bounds exclude errors by a factor of ten or more in a file.
+# Bounds exclude errors by a factor of ten or more in a file. Those of joints hold for every size,
+# from a finger of grams to a leg of fifty kilograms; `Plant` refuses what does not suit the links.
+_Spring = Annotated[float, Meta(ge=1e-6, le=1e8)]
+_Torque = Annotated[float, Meta(ge=0.0, le=1e5)]
 _Share = Annotated[float, Meta(ge=0.1, le=10.0)]
 _UpTo10 = Annotated[float, Meta(ge=0.0, le=10.0)]
-_UpTo100 = Annotated[float, Meta(ge=0.0, le=100.0)]
 _Delay = Annotated[float, Meta(ge=0.0, le=0.5)]
 _Jitter = Annotated[float, Meta(ge=0.0, le=1e-3)]
 _Span = Annotated[float, Meta(ge=1e-6, le=0.1)]
-_Spring = Annotated[float, Meta(ge=1.0, le=1e5)]
 _Rate = Annotated[float, Meta(ge=-1.0, le=1.0)]
 _Force = Annotated[float, Meta(ge=-5.0, le=5.0)]
 _Offset = Annotated[float, Meta(ge=-0.2, le=0.2)]
@@ -52,23 +53,23 @@ class JointParams(Bounded):
     """Torque that the motor gives per torque that its drive computes [1]."""
     link_inertia_scale: _Share
     """Mass and inertia of the link this joint moves, relative to the model's [1]."""
-    rotor_inertia: Annotated[float, Meta(ge=1e-9, le=1.0)]
+    rotor_inertia: Annotated[float, Meta(ge=1e-15, le=1e3)]
     """Inertia of the rotor about its own axis, motor side [kg m^2]."""
     belt_stiffness: _Spring
     """Stiffness of the belt between rotor (reflected) and link [N m/rad]."""
-    belt_damping: _UpTo100
+    belt_damping: _Torque
     """Damping of the belt between rotor (reflected) and link [N m s/rad]."""
-    coulomb: _UpTo100
+    coulomb: _Torque
     """Dry friction of the rotor while it slips [N m]."""
-    breakaway: _UpTo100
+    breakaway: _Torque
     """Dry friction at the onset of slip; the Stribeck peak, not below `coulomb` [N m]."""
     stribeck_speed: Annotated[float, Meta(ge=1e-6, le=100.0)]
     """Speed at which the peak has fallen to 1/e of its height over `coulomb` [rad/s]."""
-    presliding_stiffness: Annotated[float, Meta(ge=1e-3, le=1e6)]
+    presliding_stiffness: Annotated[float, Meta(ge=1e-9, le=1e9)]
     """Stiffness of the bristles before slip, LuGre sigma_0 [N m/rad]."""
-    presliding_damping: _UpTo100
+    presliding_damping: _Torque
     """Damping of the bristles, LuGre sigma_1 [N m s/rad]."""
-    viscous: _UpTo100
+    viscous: _Torque
     """Viscous friction of the rotor [N m s/rad]."""
     encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
     """Reading minus true angle; the drive closes its loop on the reading [rad]."""
@@ -136,7 +137,7 @@ class FixtureParams(Bounded):
 
     clamp_stiffness: _Spring
     """Stiffness of the fixture that holds a clamped link [N m/rad]."""
-    clamp_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
+    clamp_damping: _Torque
     """Damping of that fixture [N m s/rad]."""
     stand_stiffness: Annotated[float, Meta(ge=100.0)]
     """Stiffness of the stand under the body, about each axis; .inf is rigid [N m/rad]."""
@@ -277,23 +278,53 @@ def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = No
     return parse_sim_params(body, str(path))
 
 
-_RING_HZ = 100.0  # of rotor and link against each other; above all excitation
-_PRESLIDING_RAD = 1e-3  # deflection at which dry friction breaks away
+_RING_HZ = 100.0
+"""Frequency of rotor and link against each other, above all excitation, at least [Hz]."""
+_BELT_SHARE = 25.0
+"""Stiffness of the belt over that of the drive, at least, for the share of the inertia that the
+belt carries: the link swings on its belt at five times the frequency of the joint on its drive, or
+more. That of the shipped robots is 90 to 650."""
+_ROTOR_S = 0.25e-3
+"""Least inertia of a rotor over the damping of its drive [s]. A drive stops a lighter rotor within
+less than its own lag, which no real drive can. At 25 Hz the inertia that this adds to a joint takes
+4 % of the torque of the damping."""
+_FASTEST_RAD_S = 1e3
+"""Largest angular frequency of a joint on the spring of its drive, six times the highest of a
+sweep: below it, inertia is added to the rotor."""
+_PRESLIDING_RAD = 1e-3
+"""Deflection at which dry friction breaks away [rad]."""
+_FRICTION_RAD = 0.005
+"""Angle at which the spring of the drive has the dry friction of a joint, at most, where the
+robot's file has no friction [rad]."""
+_CLAMP_HZ = (30.0, 300.0)
+"""Frequencies between which a link swings in the fixture that clamps it [Hz]."""
 
 
 def default_sim_params(robot: RobotSpec) -> SimParams:
     """Derive the hidden parameters of a robot that has no file of its own, for the bench.
 
     Tolerances are of the size that the virtual Mini Cheetah has. Timing and noise are those of the
-    shipped file, the encoders as fine at the joint as its hips'.
+    shipped file, the encoders as fine at the joint as its hips'. What depends on the size of a
+    link (belt, rotor, friction, fixture) is derived from it and from the gains of its drive.
     """
     shipped = load_sim_params(SHIPPED)
     drives = [joint.drive for joint in robot.joints]
     smallest_gear_ratio = min(drive.gear_ratio for drive in drives)
     smallest_effort_limit = min(drive.effort_limit for drive in drives)
     extra_bits = max(0, math.ceil(math.log2(6.0 / smallest_gear_ratio)))
+    links = {}
+    joints = {}
+    lag_s = shipped.machine.drive_lag_s
+    for joint in robot.joints:
+        link = _link_inertia(robot, joint)
+        links[joint.name] = link
+        joints[joint.name] = _default_joint(joint, link)
+        rotor = joints[joint.name].rotor_inertia * joint.drive.gear_ratio**2
+        # The lag of a drive is shorter than the time in which its damping stops its rotor.
+        lag_s = min(lag_s, 0.5 * rotor / joint.damping)
     machine = replace(
         shipped.machine,
+        drive_lag_s=lag_s,
         bus_voltage=max(drive.bus_voltage for drive in drives),
         bus_resistance=0.0,
         encoder_bits=min(24, 14 + extra_bits),
@@ -303,13 +334,13 @@ def default_sim_params(robot: RobotSpec) -> SimParams:
         robot=robot.name,
         machine=machine,
         imu=shipped.imu,
-        fixture=shipped.fixture,
-        joints={joint.name: _default_joint(robot, joint) for joint in robot.joints},
+        fixture=_default_fixture(robot, links, shipped.fixture),
+        joints=joints,
     )
 
 
-def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
-    """Derive the hidden parameters of a joint."""
+def _link_inertia(robot: RobotSpec, joint: Joint) -> float:
+    """Compute the inertia of a joint's link at its belt, without the rotor [kg m^2]."""
     model = bench_spec(robot, joint.name).compile()
     data = mujoco.MjData(model)
     inertia = np.zeros((model.nv, model.nv))
@@ -317,15 +348,41 @@ def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, inertia)
     dof = int(model.joint(joint.name).dofadr[0])
-    # Inertia of the link at the belt, the others of its chain free to move.
+    # The others of its chain are free to move.
     link = 1.0 / float(np.linalg.inv(inertia)[dof, dof]) - float(model.dof_armature[dof])
-    link = max(link, 0.1 * float(inertia[dof, dof] - model.dof_armature[dof]))
+    return max(link, 0.1 * float(inertia[dof, dof] - model.dof_armature[dof]))
+
+
+def _default_fixture(
+    robot: RobotSpec, links: Mapping[str, float], shipped: FixtureParams
+) -> FixtureParams:
+    """Return a fixture that holds the links of a robot; the shipped one where it does."""
+    clamped: set[str] = set()
+    for joint in robot.joints:
+        clamped.update(joint.clamped)
+    if not clamped:
+        return shipped
+    slowest, fastest = 2.0 * math.pi * np.array(_CLAMP_HZ)
+    # The lightest link bounds the stiffness, which must not be too much for the physics step.
+    stiffness = max(shipped.clamp_stiffness, slowest**2 * max(links[name] for name in clamped))
+    stiffness = min(stiffness, fastest**2 * min(links[name] for name in clamped))
+    if stiffness == shipped.clamp_stiffness:
+        return shipped
+    damping = shipped.clamp_damping * stiffness / shipped.clamp_stiffness
+    return replace(shipped, clamp_stiffness=stiffness, clamp_damping=damping)
+
+
+def _default_joint(joint: Joint, link: float) -> JointParams:
+    """Derive the hidden parameters of a joint from the inertia of its link [kg m^2]."""
     rotor = 0.9 * joint.drive.armature
     if rotor == 0.0:  # the model has none
         rotor = 0.1 * link
+    rotor = max(rotor, _ROTOR_S * joint.damping, joint.stiffness / _FASTEST_RAD_S**2 - link)
     reduced = rotor * link / (rotor + link)
     belt = (2.0 * math.pi * _RING_HZ) ** 2 * reduced
-    coulomb = max(0.8 * joint.drive.frictionloss, 0.002 * joint.drive.effort_limit)
+    belt = max(belt, _BELT_SHARE * joint.stiffness * link / (rotor + link))
+    coulomb = min(0.002 * joint.drive.effort_limit, _FRICTION_RAD * joint.stiffness)
+    coulomb = max(0.8 * joint.drive.frictionloss, coulomb)
     # No stiffer than the belt's ring allows a light rotor to be simulated.
     bristles = min(1.25 * coulomb / _PRESLIDING_RAD, (2.0 * math.pi * 2.0 * _RING_HZ) ** 2 * rotor)
     return JointParams(
