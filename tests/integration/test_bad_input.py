@@ -325,7 +325,7 @@ def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], na
         ({"joint_order": ["a", "b"]}, "by the file"),
         ({"command_topic": "/x"}, "command_topic"),
         ({"reader_options": {"units": "rad"}}, "units"),
-        ({"format": "hdf5"}, "mcap, csv, sage, pace, npz"),
+        ({"format": "hdf5"}, "mcap, rosbag, csv, sage, pace, npz"),
     ],
 )
 def test_wrong_options_are_named(tmp_path: Path, options: dict[str, Any], named: str) -> None:

@@ -39,7 +39,7 @@ def assert_same(a: JointLog, b: JointLog) -> None:
 def test_round_trip_is_exact(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", LOG)
     assert_same(LOG, read_mcap(tmp_path / "a.mcap", None, ReadOptions()))
-    with pytest.raises(LogError, match="leave them out"):
+    with pytest.raises(LogError, match="leave the options out"):
         read_log(tmp_path / "a.mcap", options=ReadOptions(command_topic="/sweep/sample"))
 
 

@@ -82,6 +82,12 @@ def import_columns(columns: Columns, robot: RobotSpec | None, options: ReadOptio
         )
     joints = _joint_names(columns, robot, options)
     notes = list(columns.notes)
+    renamed = []
+    for theirs, ours in zip(columns.joints, joints, strict=False):
+        if theirs != ours:
+            renamed.append(f"{theirs}: {ours}")
+    if renamed and robot is not None:
+        notes.append(f"joints by their names in {robot.name}: {', '.join(renamed)}")
     command = columns.command
     if command is None:
         # A command that stands still excites nothing.
@@ -159,6 +165,8 @@ def _joint_names(
         f"{source}: its {shape[1]} columns", shape[1], robot, options.joint_order, columns.joints
     )
     new_names = columns.standard_names if options.joint_names is None else options.joint_names
+    if robot is not None:
+        new_names = {**robot_names(names, robot), **(new_names or {})}
     if new_names is not None:
         unknown = [name for name in new_names if name not in names]
         if unknown:
@@ -232,9 +240,49 @@ def ordered_joints(
     return joints
 
 
-def command_index(sent: Array, time: Array) -> NDArray[np.intp]:
+def robot_names(names: Sequence[str], robot: RobotSpec | None) -> dict[str, str]:
+    """Return the robot's joint names by those that its maker's models or drivers give them.
+
+    A name that is none of the robot's is one of the maker's for the same joint, or one of these
+    names in another case or without `joint` at its end. A name that fits two joints is left.
+    """
+    if robot is None:
+        return {}
+    by_simple_name: dict[str, list[str]] = {}
+    for joint in robot.joints:
+        for name in {_simple_name(joint.name), _simple_name(joint.own_name)}:
+            if name:
+                by_simple_name.setdefault(name, []).append(joint.name)
+    by_maker = {joint.own_name: joint.name for joint in robot.joints if joint.own_name}
+    renamed = {}
+    for name in names:
+        if name in robot.joint_names:
+            continue
+        candidates = by_simple_name.get(_simple_name(name), [])
+        if name in by_maker:
+            renamed[name] = by_maker[name]
+        elif len(candidates) == 1:
+            renamed[name] = candidates[0]
+    # Two columns of one joint are not told apart by their names.
+    targets = list(renamed.values())
+    unique = {}
+    for name, joint_name in renamed.items():
+        if targets.count(joint_name) == 1 and joint_name not in names:
+            unique[name] = joint_name
+    return unique
+
+
+def _simple_name(name: str) -> str:
+    """A joint's name in lower case, without `joint` at its end."""
+    return name.casefold().removesuffix("joint").rstrip("_- ")
+
+
+def command_index(
+    sent: Array | NDArray[np.int64], time: Array | NDArray[np.int64]
+) -> NDArray[np.intp]:
     """Return the index of the last command sent at or before each instant; -1 before the first.
 
-    `sent` holds the increasing instants of the commands and `time` the instants asked for [s].
+    `sent` holds the increasing instants of the commands and `time` the instants asked for, both in
+    one unit.
     """
     return np.asarray(np.searchsorted(sent, time, side="right") - 1)

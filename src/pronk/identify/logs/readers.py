@@ -9,8 +9,10 @@ from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from pronk.errors import LogError, PronkError
+from pronk.errors import LogError, PronkError, RobotError
 from pronk.files import check_regular
+from pronk.identify.logs.bag import METADATA
+from pronk.identify.logs.bag_reader import read_rosbag
 from pronk.identify.logs.checks import (
     check_radians,
     check_rate,
@@ -52,12 +54,19 @@ class Reader:
     another package names its own here as well: they are in `ReadOptions.reader_options`."""
 
 
+_BAG_OPTIONS = ("measured_topic", "command_topic", "command_field", *COLUMN_OPTIONS)
 _BUILT_IN = (
     Reader(
         name="mcap",
         suffixes=(".mcap",),
         read=read_mcap,
-        options=("measured_topic", "command_topic", "command_field", "joint_order"),
+        options=_BAG_OPTIONS,
+    ),
+    Reader(
+        name="rosbag",
+        suffixes=(".db3", ".bag"),
+        read=read_rosbag,
+        options=_BAG_OPTIONS,
     ),
     Reader(
         name="csv",
@@ -130,12 +139,6 @@ def read_log(
     format_name = stated.format or _format_of(path, by_format)
     if format_name not in by_format:
         raise LogError(f"{path}: format {format_name!r}; expected one of {', '.join(by_format)}.")
-    if format_name == "mcap" and path.is_dir():
-        files = sorted(path.glob("*.mcap"))
-        if len(files) != 1:
-            raise LogError(f"{path}: {len(files)} MCAP files in it; name the one to read.")
-        path = files[0]
-        check_regular(path, LogError)
     reader = by_format[format_name]
     foreign_options = [name for name in stated.stated() if name not in reader.options]
     if foreign_options:
@@ -172,8 +175,11 @@ def _examine(
         )
     notes = [timing.words()]
     for joint in log.joints:
-        if robot is not None:
-            robot.joint(joint)
+        if robot is not None and joint not in robot.joint_names:
+            raise RobotError(
+                f"{path}: no joint {joint!r} in {robot.name}; it has "
+                f"{', '.join(robot.joint_names)}; --joint-names THEIRS=OURS renames joints."
+            )
         check_radians(log, joint)
         saturation = saturation_note(log, joint)
         if saturation:
@@ -218,7 +224,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     suffixes = _formats_by_suffix(readers())
     logs: list[Path] = []
     for path in map(Path, paths):
-        if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
+        if not path.is_dir() or is_sage(path) or (path / METADATA).is_file():
             logs.append(path)
             continue
         logs_inside = []
@@ -252,11 +258,16 @@ def _format_of(path: Path, by_format: Mapping[str, Reader]) -> str:
     if path.is_dir():
         if is_sage(path):
             return "sage"
-        if any(path.glob("*.mcap")):
+        if any(path.glob("*.db3*")):
+            return "rosbag"
+        files = sorted(path.glob("*.mcap"))
+        if len(files) > 1 and not (path / METADATA).exists():
+            raise LogError(f"{path}: {len(files)} MCAP files in it; name the one to read.")
+        if files:
             return "mcap"
         raise LogError(
             f"{path}: a folder, but no SAGE recording (control.csv, state_motor.csv, "
-            "joint_list.txt) and no MCAP file in it."
+            "joint_list.txt) and no .mcap or .db3 file of a rosbag2 in it."
         )
     formats = _formats_by_suffix(by_format)
     suffix = _ending(path)
