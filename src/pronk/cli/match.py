@@ -32,6 +32,7 @@ def match_command(
     fitted: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
+    segment_s: float | None = None,
     frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
@@ -50,6 +51,8 @@ def match_command(
         zero_armature: Repeat the paper's search without rotor inertia (--method paper).
         fitted: drive: fit this instead; repeat it. What the logs do not identify is refused.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        segment_s: Length of the segments of a response in s, whose inverse is the spacing of its
+            frequencies; 8, or less for shorter excitations, if left out.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
             repeat it. A name of `pronk profiles`, or NAME,timestep_s=S,iterations=N,friction=none.
@@ -60,6 +63,7 @@ def match_command(
     from pronk.identify.match.match import match as match_logs
     from pronk.identify.match.result import save_match
     from pronk.identify.match.settings import MatchSettings
+    from pronk.identify.response.response import Estimator
     from pronk.identify.simulators.profiles import profile
     from pronk.robots import load_robot
 
@@ -78,7 +82,10 @@ def match_command(
     gains_on_drives = options.drive_gains(drive_gains)
     logs = reading.read(paths, robot_spec)
     settings = MatchSettings(
-        fitted=fitted, zero_armature=zero_armature, simulator_python=simulator_python
+        fitted=fitted,
+        zero_armature=zero_armature,
+        simulator_python=simulator_python,
+        estimator=Estimator(segment_s=segment_s),
     )
     results: dict[str, MatchResult] = {}
     written: list[Path] = []
@@ -202,6 +209,8 @@ def print_summary(result: MatchResult) -> None:
         others = [flag for flag in flags if not flag.startswith(NO_MATCH)]
         if others:
             console.say(f"{name}: {'; '.join(others)}")
+    for note in result.notes:
+        console.say(f"note: {note}")
 
 
 def summary(result: MatchResult) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
     from pronk.identify.logs.joint_log import JointLog
-    from pronk.identify.response.response import FrequencyResponse
+    from pronk.identify.response.response import Estimator, FrequencyResponse
 
 COHERENT = 0.95
 """Least coherence of a frequency that counts as measured."""
@@ -30,6 +30,7 @@ def response(
     robot: str | None = None,
     out: Path | None = None,
     plots: bool = True,
+    segment_s: float | None = None,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Estimate the frequency response of every joint that was excited.
@@ -39,20 +40,26 @@ def response(
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the log's if left out.
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
+        segment_s: Length of the segments of a response in s, whose inverse is the spacing of its
+            frequencies; 8, or less for shorter excitations, if left out.
         reading: How logs are read.
     """
-    from pronk.identify.response.response import save_responses
+    from pronk.identify.response.estimate import resolution_note
+    from pronk.identify.response.response import Estimator, save_responses
     from pronk.robots import load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)
+    estimator = Estimator(segment_s=segment_s)
     rows: list[dict[str, Any]] = []
+    notes: list[str] = []
     written: list[Path] = []
     with console.progress() as report:
         progress = report.bar("estimate")
         for count, log in enumerate(logs, start=1):
             source = Path(log.source or "log")
             folder = source.parent if out is None else out
-            by_joint = _responses_by_joint(log)
+            by_joint = _responses_by_joint(log, estimator)
+            notes += [f"{source.name}: {note}" for note in log.notes]
             if plots:
                 written += _write_plots(by_joint, folder, source.stem)
             responses = []
@@ -63,11 +70,13 @@ def response(
             written.append(path)
             for joint_response in responses:
                 rows.append(response_figures(joint_response) | {"log": log.source})
+                resolution = resolution_note(joint_response)
+                if resolution:
+                    notes.append(f"{source.name}: {resolution}")
             progress(count / len(logs))
     console.show(response_table(rows))
-    for log in logs:
-        for note in log.notes:
-            console.say(f"note: {Path(log.source).name}: {note}")
+    for note in notes:
+        console.say(f"note: {note}")
     robot_name = robot or logs[0].robot or "ROBOT"
     logs_stated = " ".join(str(path) for path in paths)
     return console.Outcome(
@@ -77,13 +86,13 @@ def response(
     )
 
 
-def _responses_by_joint(log: JointLog) -> dict[str, list[FrequencyResponse]]:
+def _responses_by_joint(log: JointLog, estimator: Estimator) -> dict[str, list[FrequencyResponse]]:
     """Responses of every excited joint; a LogError if none was excited."""
     from pronk.identify.response.estimate import estimate_response
 
     if not log.excited_joints:
         raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
-    return {joint: estimate_response(log, joint) for joint in log.excited_joints}
+    return {joint: estimate_response(log, joint, estimator) for joint in log.excited_joints}
 
 
 def _write_plots(

@@ -12,7 +12,7 @@ from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match.measured import DB, MeasuredJoint, rms
 from pronk.identify.response.estimate import estimate_response
-from pronk.identify.response.response import FrequencyResponse
+from pronk.identify.response.response import Estimator, FrequencyResponse
 from pronk.robots.robot import RobotSpec
 
 COHERENCE_MIN = 0.8
@@ -86,6 +86,7 @@ def compare_recordings(
     nominal: Sequence[Array],
     *,
     highest_hz: float,
+    estimator: Estimator | None = None,
 ) -> ComparedResponses | None:
     """Compare the responses of a joint that moved together with others.
 
@@ -99,6 +100,7 @@ def compare_recordings(
         matched: Positions of the joint with the matched gains, one array of shape (n,) a log [rad].
         nominal: Positions of the joint with the nominal gains [rad].
         highest_hz: Frequency from which on the drive could not follow [Hz].
+        estimator: Segments, window and band; the defaults if None.
 
     Returns:
         The responses; None where no recording gives a response of the joint.
@@ -110,7 +112,7 @@ def compare_recordings(
     compared = np.zeros(0, dtype=bool)
     for number, log in enumerate(logs):
         try:
-            measured = estimate_response(log, joint_name)[0]
+            measured = estimate_response(log, joint_name, estimator)[0]
         except LogError:
             continue  # The joint was not excited, or was stuck, in this recording.
         coherent = measured.band(*band_hz, COHERENCE_MIN)
@@ -125,7 +127,8 @@ def compare_recordings(
     for position in (matched[best_number], nominal[best_number]):
         positions = log.position.copy()
         positions[:, log.column(joint_name)] = position
-        simulated.append(estimate_response(replace(log, position=positions), joint_name)[0])
+        moved = replace(log, position=positions)
+        simulated.append(estimate_response(moved, joint_name, estimator)[0])
     return ComparedResponses(
         measured=(best,),
         matched=simulated[0].response,

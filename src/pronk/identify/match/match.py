@@ -53,6 +53,8 @@ from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
 from pronk.identify.match.uncertainty import widen_by_step
+from pronk.identify.response.estimate import resolution_note
+from pronk.identify.response.response import ShortExcitationError
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
@@ -145,7 +147,14 @@ def match(
         nominal: dict[str, dict[str, float]] = {}
         for name, joint_logs in sources.items():
             excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
-            measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
+            try:
+                measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
+            except ShortExcitationError as error:
+                # The fit in time needs no response, and mode paper nothing else.
+                if method == "paper" or settings.estimator.segment_s is not None:
+                    raise
+                measured[name] = []
+                excitation_flags[name] = (*excitation_flags[name], f"no response: {error}")
             nominal |= nominal_drives(joint_logs, [name], rigs.robot)
             progress("estimate", len(measured) / len(sources))
 
@@ -169,8 +178,10 @@ def match(
 
         joints: dict[str, JointResult] = {}
         for name, fit in with_torque(fits, torque_fits, robot).items():
-            if name not in measured:
-                joints[name] = JointResult(joint=name, gains=joint_gains(fit, robot), fit=fit)
+            if not measured.get(name):
+                flags = excitation_flags.get(name, ())
+                gains = joint_gains(fit, robot, flags=flags)
+                joints[name] = JointResult(joint=name, gains=gains, fit=fit)
                 continue
             target = measured[name][0]
             compared = compare(
@@ -297,8 +308,8 @@ def match_chains(
       (`compare_recordings`): it judges the fit and takes no part in it.
     - Parameters of a joint that the logs do not identify are held at their nominal value, where
       `match` flags them (mode `gains`) or refuses them (mode `drive`).
-    - Of the settings, `estimator` and `coherence_min` are not used: responses come from the default
-      estimator, and frequencies of a coherence below `compared.COHERENCE_MIN` are not compared.
+    - Of the settings, `coherence_min` is not used: frequencies of a coherence below
+      `compared.COHERENCE_MIN` are not compared.
     - An incoherent band is no error. The joint then has no response, and the share of its motion
       that the simulation explains says whether it is a match (`check_explained_motion`).
 
@@ -307,7 +318,7 @@ def match_chains(
         simulation: The robot in its simulator.
         parameters: Names of the parameters to fit.
         torque_fits: Drives by a torque channel.
-        settings: The threads of the simulator are used.
+        settings: The threads of the simulator and the estimator are used.
         progress: Called with the stage and the share of it that is done.
 
     Raises:
@@ -353,6 +364,7 @@ def match_chains(
                     matched=joint_matched,
                     nominal=joint_positions(nominal_positions, column),
                     highest_hz=replay.trusted_hz[name],
+                    estimator=settings.estimator,
                 )
                 if compared is not None:
                     responses[name] = compared
@@ -472,6 +484,7 @@ def match_result(
         virtual=virtual,
         excluded=excluded or {},
         robot_path=robot_path(simulation.robot),
+        notes=match_notes(logs, joints),
     )
 
 
@@ -480,3 +493,15 @@ def robot_path(robot: RobotSpec) -> str:
     if robot.source in ROBOT_NAMES or not Path(robot.source).is_file():
         return ""
     return robot.source
+
+
+def match_notes(logs: Sequence[JointLog], joints: Mapping[str, JointResult]) -> tuple[str, ...]:
+    """Return what the readers remarked of the logs, and how coarse responses are."""
+    notes = []
+    for log in logs:
+        for note in log.notes:
+            notes.append(f"{Path(log.source or 'log').name}: {note}")
+    for joint in joints.values():
+        if joint.responses is not None:
+            notes.append(resolution_note(joint.responses.measured[0]))
+    return tuple(dict.fromkeys(note for note in notes if note))

@@ -18,9 +18,14 @@ from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import JointLog, group_repeats
 from pronk.identify.match.settings import MatchSettings
-from pronk.identify.response.estimate import estimate_response, log_rate, operator
+from pronk.identify.response.estimate import (
+    estimate_response,
+    fitting_estimator,
+    log_rate,
+    operator,
+)
 from pronk.identify.response.h1 import H1Operator
-from pronk.identify.response.response import FrequencyResponse
+from pronk.identify.response.response import FrequencyResponse, ShortExcitationError
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
@@ -32,6 +37,8 @@ DB = 20.0 / np.log(10.0)
 FLOOR_DB = 0.1
 """Smallest deviation of a measured gain that is used [dB]. Coherence near 1 would otherwise let a
 few frequencies outvote the band, though the model itself is not better than this."""
+_SAME_AMPLITUDE_RAD = 1e-4
+"""Difference of the amplitudes of two logs below which they are the same [rad]."""
 _TAIL = 2e-4
 """Absolute error of gain that leaving out the end of the log would cause in a joint that follows
 its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
@@ -180,18 +187,37 @@ def measured_joints(
         One response an amplitude, the largest amplitude first.
 
     Raises:
-        LogError: The joint was not excited or did not move, its unit is unknown, or one amplitude
-            has other frequencies in another log.
-        IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
+        LogError: The joint was not excited or did not move, or its unit is unknown.
+        IdentifiabilityError: Too little of the band is coherent at the largest amplitude of every
+            log.
+        ShortExcitationError: All excitations are too short for a response in the joint's band.
     """
-    amplitudes: dict[tuple[object, ...], list[MeasuredJoint]] = {}
+    targets: list[MeasuredJoint] = []
+    errors: list[IdentifiabilityError | ShortExcitationError] = []
     for log in logs:
-        for target in _responses_of_log(log, joint_name, robot, settings):
-            measured = target.measured
-            key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
-            amplitudes.setdefault(key, []).append(target)
-    merged = map(merged_repeats, amplitudes.values())
-    return sorted(merged, key=lambda target: -target.measured.amplitude)
+        try:
+            targets += _responses_of_log(log, joint_name, robot, settings)
+        except (IdentifiabilityError, ShortExcitationError) as error:
+            errors.append(error)
+    if not targets:
+        raise errors[0]
+    merged = [merged_repeats(repeats) for repeats in grouped(targets, _same_signal)]
+    merged.sort(key=lambda target: -target.measured.amplitude)
+    left_out = [f"a log has no response to compare: {error}" for error in errors]
+    merged[0] = replace(merged[0], warnings=(*merged[0].warnings, *left_out))
+    return merged
+
+
+def _same_signal(first: MeasuredJoint, second: MeasuredJoint) -> bool:
+    """Return whether two responses are of one amplitude and have the same frequencies."""
+    one = first.measured
+    other = second.measured
+    return (
+        abs(one.amplitude - other.amplitude) < _SAME_AMPLITUDE_RAD
+        and one.estimator == other.estimator
+        and len(one.omega) == len(other.omega)
+        and bool(np.allclose(one.omega, other.omega))
+    )
 
 
 def _responses_of_log(
@@ -209,7 +235,8 @@ def _responses_of_log(
     joint = robot.joint(joint_name)
     excitations = log.excitations(joint_name)
     rate_hz = log_rate(excitations)
-    responses = estimate_response(log, joint_name, settings.estimator)
+    estimator = fitting_estimator(excitations, settings.estimator)
+    responses = estimate_response(log, joint_name, estimator)
     targets: list[MeasuredJoint] = []
     warnings: list[str] = []
     for repeats, response in zip(group_repeats(excitations), responses, strict=True):
@@ -217,7 +244,7 @@ def _responses_of_log(
             fit_mask = _compared_frequencies(
                 response, joint.band_hz, settings.coherence_min, source
             )
-        except IdentifiabilityError as error:
+        except (IdentifiabilityError, ShortExcitationError) as error:
             # The largest amplitude must be usable; a smaller one only checks it.
             if not targets:
                 raise
@@ -229,7 +256,7 @@ def _responses_of_log(
                 trace=command_trace(repeats[0], robot),
                 sign=joint.original[1],
                 measured=response,
-                operator=operator(repeats[0], settings.estimator, rate_hz),
+                operator=operator(repeats[0], estimator, rate_hz),
                 fit_mask=fit_mask,
             )
         )
@@ -290,16 +317,17 @@ def _compared_frequencies(
     """Return the coherent frequencies of the band, shape (f,).
 
     Raises:
-        IdentifiabilityError: The band has fewer than three frequencies, the joint did not move, or
-            more than half of the band is incoherent.
+        ShortExcitationError: The band has fewer than three frequencies.
+        IdentifiabilityError: The joint did not move, or more than half of the band is incoherent.
     """
     low_hz, high_hz = band_hz
     band = response.band(low_hz, high_hz)
     count = int(band.sum())
     if count < 3:
-        raise IdentifiabilityError(
+        raise ShortExcitationError(
             f"{source}: {response.joint} has a response at {count} frequencies between "
-            f"{low_hz:g} and {high_hz:g} Hz; a match needs 3 or more, so sweep longer or higher."
+            f"{low_hz:g} and {high_hz:g} Hz; a comparison needs 3 or more, so sweep longer or "
+            "higher."
         )
     largest_gain = np.abs(response.response[band]).max()
     if not largest_gain > 1e-3:

@@ -40,6 +40,9 @@ SHORTEST_BLOCK_S = 2.5
 """Shortest block of the jackknife [s]: five times the joints' memory of half a second."""
 LONGEST_BLOCK_S = 20.0
 """Longest block of the jackknife [s]."""
+SHORTEST_OF_SHORT_S = 0.5
+"""Shortest block of recordings that are too short for `FEWEST_BLOCKS` of `SHORTEST_BLOCK_S` [s]:
+the joints' memory."""
 FEWEST_BLOCKS = 3
 """Fewest blocks that give an interval."""
 COHERENT = 0.95
@@ -180,19 +183,24 @@ def chain_recordings(simulation: ChainSimulation) -> ChainRecordings:
 
 
 def _chain_blocks(times: Sequence[Array]) -> list[NDArray[np.int64]]:
-    """Number of the block of each timestamp of some logs, blocks of 2.5 to 20 s."""
+    """Number of the block of each timestamp of some logs, blocks of 2.5 to 20 s.
+
+    Recordings of less than three blocks of 2.5 s are cut in three blocks of half a second or more.
+    """
     total_s = 0.0
     for time in times:
         total_s += float(time[-1] - time[0])
     length_s = LONGEST_BLOCK_S
     if total_s < FEWEST_BLOCKS * LONGEST_BLOCK_S:
         length_s = max(SHORTEST_BLOCK_S, total_s / PARTS)
+    if total_s < FEWEST_BLOCKS * SHORTEST_BLOCK_S:
+        length_s = max(SHORTEST_OF_SHORT_S, total_s / FEWEST_BLOCKS)
     blocks = time_blocks(times, length_s)
     count = int(blocks[-1][-1]) + 1
     if count < FEWEST_BLOCKS:
         raise LogError(
-            f"the recordings make {count} blocks of {SHORTEST_BLOCK_S:g} s or more; intervals need "
-            f"at least {FEWEST_BLOCKS}."
+            f"the recordings of {total_s:.2g} s make {count} blocks of {SHORTEST_OF_SHORT_S:g} s "
+            f"or more; intervals need at least {FEWEST_BLOCKS}: record longer, or give more logs."
         )
     return blocks
 

@@ -219,6 +219,8 @@ class MatchResult:
     """Reasons by joint for joints that moved and were not matched."""
     robot_path: str = ""
     """File of the robot; empty for a robot that ships with pronk."""
+    notes: tuple[str, ...] = ()
+    """Sentences on the logs: gaps, jitter, short excitations. They weaken no gain by themselves."""
 
     @property
     def gains(self) -> MatchedGains:

@@ -28,8 +28,7 @@ class MatchSettings:
     simulator_python: Path | None = None
     """Interpreter in which another simulator than MuJoCo runs; this interpreter if None."""
     estimator: Estimator = field(default_factory=Estimator)
-    """Estimator of the responses, the same for the log and the simulation. Not used for joints that
-    moved together (`match_chains`)."""
+    """Estimator of the responses, the same for the log and the simulation."""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot work.

@@ -13,14 +13,61 @@ from pronk.identify.logs.checks import check_motion
 from pronk.identify.logs.joint_log import Excitation, JointLog, group_repeats
 from pronk.identify.response.diagnostics import fit_delay, third_harmonic
 from pronk.identify.response.grid import analysis_rate
-from pronk.identify.response.h1 import H1Operator, estimate_averaged
+from pronk.identify.response.h1 import H1Operator, estimate_averaged, rests
 from pronk.identify.response.periodic import estimate_periodic, multisine_operator
-from pronk.identify.response.response import Estimator, FrequencyResponse
+from pronk.identify.response.response import LONGEST_SEGMENT_S, Estimator, FrequencyResponse
+
+_SEGMENTS_S = (8.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.8, 0.6, 0.5, 0.4, 0.3, 0.2)
+"""Lengths of segments to choose from [s]: logs of about one length then share frequencies."""
+_IN_MOTION = 1.5
+"""Least length of an excitation that does not end at rest, in the longest segments: two of them
+that overlap by half."""
+_SEGMENTS_IN_SHORT = 2.0
+"""Length of a shorter excitation in segments, which overlap: of one segment alone, or of two that
+hardly differ, the coherence says nothing."""
 
 
 def log_rate(excitations: Sequence[Excitation]) -> float:
     """Return one rate of the analysis grid for excitations, so that they share frequencies [Hz]."""
     return analysis_rate([excitation.time for excitation in excitations])
+
+
+def fitting_estimator(excitations: Sequence[Excitation], estimator: Estimator) -> Estimator:
+    """Choose the length of the segments by the shortest of some excitations, if none was chosen.
+
+    A shorter segment has fewer frequencies, further apart. Multisines and sine steps that say so
+    are read without segments.
+
+    Args:
+        excitations: Excitations of one joint.
+        estimator: The settings; with a length of the segments they are returned as they are.
+    """
+    if estimator.segment_s is not None:
+        return estimator
+    longest_s = LONGEST_SEGMENT_S
+    for excitation in excitations:
+        if excitation.segment.kind in ("multisine", "sine_steps"):
+            continue
+        span_s = float(excitation.time[-1] - excitation.time[0]) + 1.0 / excitation.rate_hz
+        at_rest = rests(excitation.command, excitation.rate_hz)
+        long_enough_s = LONGEST_SEGMENT_S if at_rest else _IN_MOTION * LONGEST_SEGMENT_S
+        fitting_s = span_s if span_s >= long_enough_s else span_s / _SEGMENTS_IN_SHORT
+        longest_s = min(longest_s, fitting_s)
+    for length_s in _SEGMENTS_S:
+        if length_s <= longest_s * (1.0 + 1e-6):
+            return replace(estimator, segment_s=length_s)
+    return replace(estimator, segment_s=longest_s)
+
+
+def resolution_note(response: FrequencyResponse) -> str:
+    """Say how coarse a response of a short excitation is; empty for one of full length."""
+    if response.estimator != "H1" or response.segment_s >= LONGEST_SEGMENT_S:
+        return ""
+    return (
+        f"{response.joint}: the response at {response.amplitude:.3g} rad is of segments of "
+        f"{response.segment_s:g} s, for the excitation is short: its frequencies are "
+        f"{1.0 / response.segment_s:.2g} Hz apart, from {response.frequency_hz[0]:.2g} Hz on"
+    )
 
 
 def estimate_response(
@@ -40,16 +87,18 @@ def estimate_response(
     Args:
         log: The log.
         joint: Name of an excited joint, one of `log.excited_joints`.
-        estimator: Segments, window and band; the defaults suit a chirp of 0.1 to 25 Hz in 20 s.
+        estimator: Segments, window and band; the defaults suit a chirp of 0.1 to 25 Hz in 20 s,
+            and have shorter segments for shorter excitations.
 
     Returns:
         One response an amplitude and kind of signal, the largest amplitude first.
 
     Raises:
-        LogError: The joint was not excited or did not move, or its segments are too short.
+        LogError: The joint was not excited or did not move.
+        ShortExcitationError: An excitation is too short for the segments that were chosen.
     """
-    settings = Estimator() if estimator is None else estimator
     excitations = log.excitations(joint)
+    settings = fitting_estimator(excitations, estimator or Estimator())
     rate_hz = log_rate(excitations)
     responses = []
     for repeats in group_repeats(excitations):
@@ -94,8 +143,8 @@ def operators(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
     """Return the `operator` of every repeat, a row for each response of `estimate_response`."""
-    settings = Estimator() if estimator is None else estimator
     excitations = log.excitations(joint)
+    settings = fitting_estimator(excitations, estimator or Estimator())
     rate_hz = log_rate(excitations)
     rows = []
     for repeats in group_repeats(excitations):

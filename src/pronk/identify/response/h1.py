@@ -21,7 +21,6 @@ from scipy import fft
 from scipy.signal import ShortTimeFFT, get_window
 
 from pronk.arrays import Array, ComplexArray, Mask
-from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.response.grid import (
     Grid,
@@ -32,7 +31,11 @@ from pronk.identify.response.grid import (
     pull_back,
     require_span,
 )
-from pronk.identify.response.response import Estimator, FrequencyResponse
+from pronk.identify.response.response import (
+    Estimator,
+    FrequencyResponse,
+    ShortExcitationError,
+)
 
 _TINY = np.finfo(np.float64).tiny
 _SILENT = 1e-4
@@ -104,15 +107,17 @@ def segment_layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Segment
         padded: True to let segments reach over the ends.
 
     Raises:
-        LogError: The grid is too short for two segments, or the band holds no frequency.
+        ShortExcitationError: The grid is too short for two segments, or the band holds no
+            frequency.
     """
     rate_hz = grid.rate_hz
-    samples = round(estimator.segment_s * rate_hz)
+    samples = round(estimator.length_s * rate_hz)
     span = grid.count / rate_hz
     if samples < 8 or grid.count < samples:
-        raise LogError(
+        raise ShortExcitationError(
             f"an excitation of {span:.2f} s ({grid.count} samples at {rate_hz:g} Hz) does not "
-            f"fill a segment of {estimator.segment_s:g} s; choose a shorter Estimator.segment_s."
+            f"fill a segment of {estimator.length_s:g} s and 8 samples; choose shorter segments "
+            "(--segment-s), or leave the option out."
         )
     window = get_window(estimator.window, samples, fftbins=True)
     transform = ShortTimeFFT(
@@ -128,18 +133,19 @@ def segment_layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Segment
         first = int(transform.lower_border_end[1])
         stop = int(transform.upper_border_begin(grid.count)[1])
     if stop - first < 2:
-        raise LogError(
-            f"an excitation of {span:.2f} s holds a single segment of {estimator.segment_s:g} s, "
-            "of which coherence is always 1; choose a shorter Estimator.segment_s."
+        raise ShortExcitationError(
+            f"an excitation of {span:.2f} s holds a single segment of {estimator.length_s:g} s, "
+            "of which coherence is always 1; choose shorter segments (--segment-s), or leave the "
+            "option out."
         )
     hz = np.asarray(transform.f)
     top_hz = estimator.top_hz(rate_hz)
     # From the second line on: the main lobe of the window at the first reaches the mean.
     chosen = (hz >= max(estimator.min_hz, hz[2]) - 1e-9) & (hz <= top_hz + 1e-9)
     if not chosen.any():
-        raise LogError(
+        raise ShortExcitationError(
             f"no frequency between {estimator.min_hz:g} and {top_hz:g} Hz with segments of "
-            f"{estimator.segment_s:g} s at {rate_hz:g} Hz."
+            f"{estimator.length_s:g} s at {rate_hz:g} Hz."
         )
     return SegmentLayout(
         grid=grid,
@@ -272,10 +278,10 @@ def estimate_averaged(
         repeats=np.array([sums.response(omega, rate_hz) for sums in sums_of_repeats]),
         estimator="H1",
         window=(
-            f"{estimator.window} {estimator.segment_s:g} s, {100.0 * estimator.overlap:.0f} % "
+            f"{estimator.window} {estimator.length_s:g} s, {100.0 * estimator.overlap:.0f} % "
             f"overlap, {ends}, mean of each segment removed"
         ),
-        segment_s=estimator.segment_s,
+        segment_s=estimator.length_s,
         virtual=first.log.virtual,
         source=first.source,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import stats
 
 from pronk.arrays import Array, ComplexArray, Mask
-from pronk.errors import ArtefactError, PronkError
+from pronk.errors import ArtefactError, LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.names import check_names
 
@@ -31,6 +31,18 @@ _NYQUIST_SHARE = 0.9
 the joint's own images fold back."""
 
 
+LONGEST_SEGMENT_S = 8.0
+"""Length of a segment where the excitation is long enough [s].
+
+Eight seconds hold the bias of a 20 s chirp of 0.1 to 25 Hz below 0.5 % of gain down to 0.25 Hz and
+at a resonance of damping ratio 0.2; four seconds leave 2 %.
+"""
+
+
+class ShortExcitationError(LogError):
+    """An excitation is too short for a response with the frequencies that are asked for."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimator:
     """Settings of the estimators.
@@ -39,12 +51,9 @@ class Estimator:
     (multisine, sine steps) are read line by line without a window and use the band alone.
     """
 
-    segment_s: float = 8.0
-    """Length of a segment [s]; its inverse is the spacing of the frequencies.
-
-    Eight seconds hold the bias of a 20 s chirp of 0.1 to 25 Hz below 0.5 % of gain down to 0.25 Hz
-    and at a resonance of damping ratio 0.2; four seconds leave 2 %.
-    """
+    segment_s: float | None = None
+    """Length of a segment [s]; its inverse is the spacing of the frequencies. If None, 8 s, or less
+    where the excitations are too short for it (`fitting_estimator`)."""
     overlap: float = 0.75
     """Share of a segment that the next one repeats."""
     window: str = "hann"
@@ -60,9 +69,10 @@ class Estimator:
             raise PronkError(
                 f"Estimator.window is {self.window!r}; expected one of {', '.join(WINDOWS)}."
             )
-        if not (np.isfinite(self.segment_s) and self.segment_s > 0.0):
+        given_s = self.segment_s
+        if given_s is not None and not (np.isfinite(given_s) and given_s > 0.0):
             raise PronkError(
-                f"Estimator.segment_s is {self.segment_s!r}; expected a positive number of seconds."
+                f"segment_s (--segment-s) is {given_s!r}; expected a positive number of seconds."
             )
         if not 0.0 <= self.overlap < 1.0:
             raise PronkError(
@@ -74,6 +84,11 @@ class Estimator:
                 f"Estimator.min_hz is {self.min_hz!r}; expected 0 <= min_hz < max_hz "
                 f"({self.max_hz})."
             )
+
+    @property
+    def length_s(self) -> float:
+        """Length of a segment [s], the longest where none was chosen."""
+        return LONGEST_SEGMENT_S if self.segment_s is None else self.segment_s
 
     def top_hz(self, rate_hz: float) -> float:
         """Highest frequency reported at this rate [Hz]."""
