@@ -164,12 +164,13 @@ def test_logs_without_a_response_are_refused() -> None:
     time, command, hz = steps_command(500.0, (1.0, 2.0))
     bare = make_log([(time, command, None)], KNEE_JOINT, kind="sine_steps")
     hurried = make_log([(time[:600], command[:600], hz[:600])], KNEE_JOINT, kind="sine_steps")
+    with pytest.raises(LogError, match="shorter segments"):
+        estimate_response(short, "knee", Estimator(segment_s=8.0))
     two_columns = np.repeat(stuck.command, 2, axis=1)
     two_joints = replace(stuck, joints=("knee", "hip"), command=two_columns, position=two_columns)
     for log, joint, words in (
         (stuck, "knee", "knee did not move"),
         (still, "knee", "stands still"),
-        (short, "knee", "choose a shorter"),
         (short, "hip", r"no joint 'hip'; it has knee"),
         (multisines(periods=2), "knee", "3 equal periods are needed"),
         (multisines(period=None), "knee", "no period_s"),

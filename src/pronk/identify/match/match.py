@@ -418,10 +418,12 @@ def response_flags(
     flags = list(
         check_response(target.measured, compared.matched, target.fit_mask, no_match_db(target))
     )
-    band_count = int(target.measured.band(*robot.joint(target.joint).band_hz).sum())
-    incoherent_count = band_count - int(target.fit_mask.sum())
+    excited_count = int(target.excited_mask.sum())
+    incoherent_count = excited_count - int(target.fit_mask.sum())
     if incoherent_count > 0:
-        flags.append(f"{incoherent_count} of {band_count} frequencies left out for low coherence")
+        flags.append(
+            f"{incoherent_count} of {excited_count} frequencies left out for low coherence"
+        )
     flags.extend(target.warnings)
     return flags
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.identify.logs.joint_log import JointLog, group_repeats
+from pronk.identify.logs.joint_log import Excitation, JointLog, group_repeats
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.estimate import (
     estimate_response,
@@ -25,7 +25,11 @@ from pronk.identify.response.estimate import (
     operator,
 )
 from pronk.identify.response.h1 import H1Operator
-from pronk.identify.response.response import FrequencyResponse, ShortExcitationError
+from pronk.identify.response.response import (
+    LONGEST_SEGMENT_S,
+    FrequencyResponse,
+    ShortExcitationError,
+)
 from pronk.identify.simulators.command_trace import CommandTrace, command_trace
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
@@ -37,6 +41,18 @@ DB = 20.0 / np.log(10.0)
 FLOOR_DB = 0.1
 """Smallest deviation of a measured gain that is used [dB]. Coherence near 1 would otherwise let a
 few frequencies outvote the band, though the model itself is not better than this."""
+EXCITED_POWER = 1e-3
+"""Power of the command over its largest from which on a frequency counts as excited: 30 dB."""
+FEWEST_EXCITED = 4
+"""Fewest excited frequencies of a sweep's response: a single sine has up to three."""
+_FOLLOWS = 0.1
+"""Share of the command by which a slow position may differ without being said."""
+_BINS_OF_A_SINE = 6
+"""Most frequencies over which the Hann window spreads a sine at 30 dB."""
+_HIGHEST_HZ = 25.0
+"""Frequency up to which commands are looked at [Hz]; above are the images of a held one."""
+MOST_SINES = 4
+"""Most single sines of a command that are listed one by one."""
 _SAME_AMPLITUDE_RAD = 1e-4
 """Difference of the amplitudes of two logs below which they are the same [rad]."""
 _TAIL = 2e-4
@@ -61,8 +77,10 @@ class MeasuredJoint:
     """Response that was measured, at f frequencies."""
     operator: H1Operator
     """Linear map from positions to the response."""
+    excited_mask: Mask
+    """Frequencies in the band that the command excites, shape (f,)."""
     fit_mask: Mask
-    """Frequencies that a fit compares: in the band and coherent enough, shape (f,)."""
+    """Frequencies that a fit compares: in the band, excited, coherent enough, shape (f,)."""
     warnings: tuple[str, ...] = ()
     """Sentences on smaller amplitudes that could not be used."""
 
@@ -240,9 +258,16 @@ def _responses_of_log(
     targets: list[MeasuredJoint] = []
     warnings: list[str] = []
     for repeats, response in zip(group_repeats(excitations), responses, strict=True):
+        response_operator = operator(repeats[0], estimator, rate_hz)
+        excited_mask = response.band(*joint.band_hz)
+        if response.estimator == "H1":
+            power = response_operator.excitation
+            # Frequencies beside a single line that only show its leakage have no coherence.
+            excited = (power >= EXCITED_POWER * power.max()) & (response.coherence > 0.0)
+            excited_mask = excited_mask & excited
         try:
             fit_mask = _compared_frequencies(
-                response, joint.band_hz, settings.coherence_min, source
+                response, excited_mask, joint.band_hz, settings.coherence_min, repeats[0]
             )
         except (IdentifiabilityError, ShortExcitationError) as error:
             # The largest amplitude must be usable; a smaller one only checks it.
@@ -250,13 +275,18 @@ def _responses_of_log(
                 raise
             warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
             continue
+        if response.estimator == "H1" and single_sines(repeats[0]):
+            excited_count = int(excited_mask.sum())
+            count = int(response.band(*joint.band_hz).sum())
+            warnings.append(few_frequencies(repeats[0], excited_count, count, joint.band_hz))
         # The commands of all repeats are the same, so that of the first stands for them.
         targets.append(
             MeasuredJoint(
                 trace=command_trace(repeats[0], robot),
                 sign=joint.original[1],
                 measured=response,
-                operator=operator(repeats[0], estimator, rate_hz),
+                operator=response_operator,
+                excited_mask=excited_mask,
                 fit_mask=fit_mask,
             )
         )
@@ -279,6 +309,7 @@ def merged_repeats(targets: Sequence[MeasuredJoint]) -> MeasuredJoint:
     repeats = []
     # Only frequencies that are coherent in all logs are compared.
     fit_mask = first.fit_mask
+    excited_mask = first.excited_mask
     sources: list[str] = []
     warnings: list[str] = []
     for target in targets:
@@ -294,6 +325,7 @@ def merged_repeats(targets: Sequence[MeasuredJoint]) -> MeasuredJoint:
         averages = averages + measured.averages
         repeats.append(measured.repeats)
         fit_mask = fit_mask & target.fit_mask
+        excited_mask = excited_mask & target.excited_mask
         if measured.source not in sources:
             sources.append(measured.source)
         for warning in target.warnings:
@@ -308,18 +340,30 @@ def merged_repeats(targets: Sequence[MeasuredJoint]) -> MeasuredJoint:
         repeats=all_repeats,
         source=", ".join(sources),
     )
-    return replace(first, measured=merged, fit_mask=fit_mask, warnings=tuple(warnings))
+    return replace(
+        first,
+        measured=merged,
+        excited_mask=excited_mask,
+        fit_mask=fit_mask,
+        warnings=tuple(warnings),
+    )
 
 
 def _compared_frequencies(
-    response: FrequencyResponse, band_hz: tuple[float, float], coherence_min: float, source: str
+    response: FrequencyResponse,
+    excited: Mask,
+    band_hz: tuple[float, float],
+    coherence_min: float,
+    excitation: Excitation,
 ) -> Mask:
-    """Return the coherent frequencies of the band, shape (f,).
+    """Return the coherent ones of the excited frequencies of a band, shape (f,).
 
     Raises:
         ShortExcitationError: The band has fewer than three frequencies.
-        IdentifiabilityError: The joint did not move, or more than half of the band is incoherent.
+        IdentifiabilityError: The command excites hardly any of them, the joint did not move, or
+            more than half of the excited ones are incoherent.
     """
+    source = excitation.source or "log"
     low_hz, high_hz = band_hz
     band = response.band(low_hz, high_hz)
     count = int(band.sum())
@@ -329,6 +373,20 @@ def _compared_frequencies(
             f"{low_hz:g} and {high_hz:g} Hz; a comparison needs 3 or more, so sweep longer or "
             "higher."
         )
+    excited_count = int(excited.sum())
+    if response.estimator == "H1" and excited_count < FEWEST_EXCITED:
+        sines = single_sines(excitation)
+        if not sines and response.segment_s < LONGEST_SEGMENT_S and excited_count > 0:
+            raise ShortExcitationError(
+                f"{source}: the response of {response.joint} shows {excited_count} of the "
+                f"frequencies that its command excites, for it has segments of "
+                f"{response.segment_s:g} s; a comparison needs {FEWEST_EXCITED} or more, so sweep "
+                "longer."
+            )
+        raise IdentifiabilityError(
+            f"{source}: {few_frequencies(excitation, excited_count, count, band_hz)}; sweep the "
+            "band, as `pronk sweep` does."
+        )
     largest_gain = np.abs(response.response[band]).max()
     if not largest_gain > 1e-3:
         raise IdentifiabilityError(
@@ -336,14 +394,85 @@ def _compared_frequencies(
             f"{low_hz:g} and {high_hz:g} Hz); check that its drive is on and that the column is "
             "the right one."
         )
-    coherent = response.band(low_hz, high_hz, coherence_min)
-    if 2 * int(coherent.sum()) < count:
+    coherent = excited & response.band(low_hz, high_hz, coherence_min)
+    if 2 * int(coherent.sum()) < excited_count:
         raise IdentifiabilityError(
             f"{source}: {response.joint} is coherent (at least {coherence_min:g}) at only "
-            f"{int(coherent.sum())} of {count} frequencies between {low_hz:g} and {high_hz:g} "
-            "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
+            f"{int(coherent.sum())} of the {excited_count} frequencies that the command excites "
+            f"between {low_hz:g} and {high_hz:g} Hz; repeat the sweep with a larger amplitude, a "
+            "stiffer base or more repeats."
         )
     return coherent
+
+
+def few_frequencies(
+    excitation: Excitation, excited_count: int, count: int, band_hz: tuple[float, float]
+) -> str:
+    """Say which frequencies a command excites alone.
+
+    Args:
+        excitation: The excitation.
+        excited_count: Number of frequencies in the band that it excites.
+        count: Number of frequencies in the band.
+        band_hz: The joint's band [Hz].
+    """
+    sines = single_sines(excitation)
+    if sines:
+        frequencies = f"{', '.join(f'{sine_hz:.2g}' for sine_hz in sines)} Hz"
+        motion = slow_motion(excitation)
+    else:
+        hz, power = _command_power(excitation)
+        loud = hz[power >= EXCITED_POWER * power.max()]
+        frequencies = f"{loud[0]:.2g} to {loud[-1]:.2g} Hz"
+        motion = ""
+    return (
+        f"the command of {excitation.joint} excites only {frequencies} ({excited_count} of {count} "
+        f"frequencies between {band_hz[0]:g} and {band_hz[1]:g} Hz{motion})"
+    )
+
+
+def single_sines(excitation: Excitation) -> list[float]:
+    """Return the frequencies of a command of up to `MOST_SINES` sines [Hz]; empty for others."""
+    hz, power = _command_power(excitation)
+    loud = np.flatnonzero(power >= EXCITED_POWER * power.max())
+    sines = np.split(loud, np.flatnonzero(np.diff(loud) > 2) + 1)
+    if len(sines) > MOST_SINES or max(len(sine) for sine in sines) > _BINS_OF_A_SINE:
+        return []
+    return [float(np.average(hz[sine], weights=power[sine])) for sine in sines]
+
+
+def slow_motion(excitation: Excitation) -> str:
+    """Say how a position differs from a command of few frequencies, to be put behind them.
+
+    Empty where the position follows to a tenth.
+    """
+    time = excitation.time
+    hz, power = _command_power(excitation)
+    omega = 2.0 * np.pi * hz[int(np.argmax(power))]
+    columns = np.stack([np.ones(len(time)), np.cos(omega * time), np.sin(omega * time)], axis=1)
+    pair = np.stack([excitation.command, excitation.position], axis=1)
+    offset, cosine, sine = np.linalg.lstsq(columns, pair, rcond=None)[0]
+    gain = float(np.hypot(cosine[1], sine[1]) / np.hypot(cosine[0], sine[0]))
+    difference = float(offset[1] - offset[0])
+    amplitude = float(np.hypot(cosine[0], sine[0]))
+    if abs(gain - 1.0) < _FOLLOWS and abs(difference) < _FOLLOWS * amplitude:
+        return ""
+    return (
+        f"; there the position is {gain:.2f} times the command, and its mean {difference:+.2g} rad "
+        "off that of the command"
+    )
+
+
+def _command_power(excitation: Excitation) -> tuple[Array, Array]:
+    """Return frequencies above 0 [Hz] and the power of a command at them, shapes (f,)."""
+    time = excitation.time
+    grid = np.linspace(time[0], time[-1], len(time))
+    held = np.interp(grid, time, excitation.command)
+    window = np.hanning(len(grid))
+    power = np.abs(np.fft.rfft((held - np.average(held, weights=window)) * window)) ** 2
+    hz = np.fft.rfftfreq(len(grid), float(grid[1] - grid[0]))
+    inside = (hz > 0.0) & (hz <= _HIGHEST_HZ)
+    return np.asarray(hz[inside]), np.asarray(power[inside])
 
 
 def simulated_response(
