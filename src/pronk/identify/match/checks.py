@@ -490,6 +490,6 @@ def check_explained_motion(
         return ()
     return (
         f"{NO_MATCH}the simulation explains {100.0 * max(explained, 0.0):.0f} % of the joint's "
-        f"motion, less than {100.0 * EXPLAINED_MIN:.0f} %, and no frequency of it is coherent with "
-        "its command; record a motion in which this joint moves more",
+        f"motion, less than {100.0 * EXPLAINED_MIN:.0f} %, and no response of it could be "
+        "compared; record a motion in which this joint moves more",
     )

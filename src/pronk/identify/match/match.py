@@ -180,6 +180,11 @@ def match(
         for name, fit in with_torque(fits, torque_fits, robot).items():
             if not measured.get(name):
                 flags = excitation_flags.get(name, ())
+                if name in measured:
+                    replay = JointReplay(rigs, excitations_of(sources[name], name))
+                    (simulated,) = replay.positions([{name: fit.values}])
+                    recorded = [recording.position for recording in replay.recordings]
+                    flags = (*check_explained_motion(recorded, simulated), *flags)
                 gains = joint_gains(fit, robot, flags=flags)
                 joints[name] = JointResult(joint=name, gains=gains, fit=fit)
                 continue
