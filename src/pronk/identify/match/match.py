@@ -210,7 +210,7 @@ def match(
                 zero_armature=zero_armature,
             )
             progress("responses", len(joints) / len(fits))
-        return match_result(simulation, simulation.info(rigs), joints, logs)
+        return match_result(simulation, simulation.info(rigs), joints, logs, method=method)
 
 
 def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
@@ -462,6 +462,7 @@ def match_result(
     joints: Mapping[str, JointResult],
     logs: Sequence[JointLog],
     excluded: Mapping[str, str] | None = None,
+    method: Method = "time",
 ) -> MatchResult:
     """Put the results of all joints together, with the training ranges of their groups.
 
@@ -471,12 +472,13 @@ def match_result(
         joints: Results by joint.
         logs: Every log that went in.
         excluded: Reasons by joint for joints that moved and were not matched.
+        method: Method of the match, which decides how training gains are rounded.
 
     Raises:
-        PronkError: The gains are not stable at the step of a framework.
+        PronkError: Gains of a joint that is a match are not stable at the step of a framework.
     """
     gains = {name: joint.gains for name, joint in joints.items()}
-    simulation.require_stable(gains)
+    simulation.require_stable({name: joint for name, joint in gains.items() if joint.matched})
     hashes = {}
     virtual = False
     for log in logs:
@@ -486,7 +488,7 @@ def match_result(
         robot=simulation.robot.name,
         simulator=simulator,
         joints=joints,
-        groups=group_gains(simulation.robot, gains),
+        groups=group_gains(simulation.robot, gains, method),
         logs=hashes,
         virtual=virtual,
         excluded=excluded or {},

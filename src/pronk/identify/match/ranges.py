@@ -1,7 +1,15 @@
 """Training gains and ranges of a joint group, from the matched gains of its joints.
 
-The paper trains with one pair of gains per joint group and a uniform range about it (Table I, D3,
-D4) and does not state how it rounded from the matched joints to the group. pronk's rule:
+The gain of a group is the median of its matched joints, with three significant digits, or with as
+many as it takes to stay inside their intervals. Its range is uniform and symmetric, and rests on
+the evidence: it covers every matched joint of the group with its 95 % interval, is `RANGE_FLOOR` of
+the gain or more, and ends above zero. `range_notes` says where it is wider or narrower than the
+evidence. A joint that is no match counts only where no joint of its group is one.
+
+For the paper's robot, matched by the paper's method, the gains are on the paper's own lattice. The
+paper trains with one pair of gains per joint group and a uniform range about it (Table I, D3, D4)
+and does not state how it rounded from the matched joints to the group. pronk's reading
+(`lattice_gains`):
 
 1. Damping is the middle of the joints' intervals, rounded to 0.05 N m s/rad.
 2. Stiffness keeps the joint's impedance. Rounding the damping changes |stiffness + j omega
@@ -20,37 +28,56 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
 from pronk.arrays import Array
-from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains
-from pronk.identify.simulators.info import SimulatorInfo
+from pronk.identify.match.gains import FittedValue, GroupGains, JointGains
 from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
+PAPER_ROBOT = "mini_cheetah"
+"""The robot of the paper, whose training gains are on the lattice of its Table I."""
 STIFFNESS_STEP = 0.5
 """Lattice of the paper's training stiffnesses: 20, 17.5, 21.5 N m/rad (Table I)."""
 DAMPING_STEP = 0.05
 """Lattice of the paper's training dampings: 0.45, 0.4, 0.55 N m s/rad (Table I)."""
+RANGE_FLOOR = 0.05
+"""Smallest half-width of a range over its gain. So much may the stiffness change between
+amplitudes without a flag (`result.SPREAD_MAX`); the paper's knees have 1 on 21.5."""
+LOWEST_OF_EVIDENCE = 0.5
+"""Lower end of a range over the lowest end of the joints' intervals, at least: a symmetric range
+whose upper end is far away must not reach zero."""
+LOWEST_OF_GAIN = 0.1
+"""Lower end of a range over its gain, at least."""
+DIGITS = 3
+"""Significant digits of training gains and ranges."""
+MOST_DIGITS = 9
+"""Most significant digits of a gain whose interval is narrower than its digits."""
 DIRECTIONS = 24
 """Points on the ellipse of each joint; the ellipse that encloses them misses less than 1 % of the
 area between them."""
 SMALLEST_DEVIATION = 1e-3
 """Smallest relative standard deviation of a gain, so that a single exact joint has an ellipse."""
+SAME_RANGE = 0.02
+"""Relative difference up to which a written range counts as that of `gain_and_range`: ranges are
+rounded, and a translation scales them."""
+SAME_GAIN = 1e-9
+"""Relative difference up to which gains are the same: joints without an interval show no range."""
 ROUNDING_SLACK = 1e-6
 """Share of a step by which a range may be too small: rounding of the last binary digit."""
 
 
-def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str, GroupGains]:
+def group_gains(
+    robot: RobotSpec, joints: Mapping[str, JointGains], method: str = "time"
+) -> dict[str, GroupGains]:
     """Compute training gains, ranges and ellipsoids of every group with a matched joint.
 
     Args:
         robot: The robot.
         joints: Matched gains by joint.
+        method: Method of the match; `paper` for the paper's robot puts them on its lattice.
 
     Returns:
         Training gains by group, in the robot's order.
@@ -62,69 +89,169 @@ def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str,
         robot.joint(name)  # raises RobotError for an unknown joint
     groups = {}
     for group in robot.groups:
-        members = [joint.name for joint in robot.group(group) if joint.name in joints]
-        if members:
-            matched = [joints[name] for name in members]
-            groups[group] = _training_gains(robot, members[0], matched)
+        members = trusted_joints([joint.name for joint in robot.group(group)], joints)
+        if not members:
+            continue
+        matched = [joints[name] for name in members]
+        if method == "paper" and robot.name == PAPER_ROBOT:
+            groups[group] = lattice_gains(robot, members[0], matched)
+        else:
+            groups[group] = evidence_gains(matched)
     return groups
 
 
-def matched_gains(
-    robot: RobotSpec,
-    joints: Mapping[str, JointGains],
-    logs: Sequence[JointLog],
-    simulator: SimulatorInfo,
-) -> MatchedGains:
-    """Put matched joints, their groups, the logs and the simulator together.
+def trusted_joints(names: Sequence[str], joints: Mapping[str, JointGains]) -> list[str]:
+    """Choose the joints of a group that its training gains come from.
+
+    They are those that are a match; where none is, all that were fitted.
 
     Args:
-        robot: The robot.
+        names: Names of the group's joints.
         joints: Matched gains by joint.
-        logs: Logs that the joints were matched with.
-        simulator: Simulator that the gains hold for.
+    """
+    fitted = [name for name in names if name in joints]
+    matched = [name for name in fitted if joints[name].matched]
+    return matched or fitted
+
+
+def evidence_gains(matched: Sequence[JointGains]) -> GroupGains:
+    """Return training gains and ranges that rest on the values and intervals of some joints."""
+    stiffness, stiffness_range = gain_and_range([gains.stiffness for gains in matched])
+    damping, damping_range = gain_and_range([gains.damping for gains in matched])
+    points = [interval_points(gains, floor=RANGE_FLOOR) for gains in matched]
+    return _group(matched, (stiffness, damping), (stiffness_range, damping_range), points)
+
+
+def gain_and_range(fitted: Sequence[FittedValue]) -> tuple[float, float]:
+    """Compute the training gain of some joints and the half-width of its range.
+
+    Args:
+        fitted: The gain of each joint, with its intervals.
 
     Returns:
-        What `save_gains` writes.
+        Gain and half-width, in the unit of the gain.
     """
-    hashes = {}
-    for log in logs:
-        hashes[Path(log.source or "log").name] = log.origin.sha256
-    return MatchedGains(
-        robot=robot.name,
-        simulator=simulator,
-        joints=joints,
-        groups=group_gains(robot, joints),
-        logs=hashes,
-        virtual=any(log.virtual for log in logs),
-    )
+    low, high = _covering_interval(fitted)
+    middle = rounded_inside(float(np.median([gain.value for gain in fitted])), low, high)
+    half_width = max(high - middle, middle - low, RANGE_FLOOR * middle)
+    lowest = max(LOWEST_OF_EVIDENCE * low, LOWEST_OF_GAIN * middle)
+    return middle, _rounded_up(min(half_width, middle - lowest))
 
 
-def _training_gains(robot: RobotSpec, joint: str, matched: Sequence[JointGains]) -> GroupGains:
-    """Return the training gains of a group whose first matched joint is `joint`."""
-    stiffnesses = []
-    dampings = []
-    frictions = []
-    point_sets = []
-    for gains in matched:
-        stiffnesses.append(gains.stiffness)
-        dampings.append(gains.damping)
-        frictions.append(gains.frictionloss.value)
-        point_sets.append(interval_points(gains))
-    stiffness_low, stiffness_high = _covering_interval(stiffnesses)
-    damping_low, damping_high = _covering_interval(dampings)
+def rounded_inside(value: float, low: float, high: float) -> float:
+    """Round a value to `DIGITS` significant digits, or to so many that it stays in an interval.
+
+    Args:
+        value: The value.
+        low: Lower end of its interval.
+        high: Upper end; the same as the lower one where no interval is known.
+
+    Returns:
+        The rounded value.
+    """
+    rounded = value
+    for digits in range(DIGITS, MOST_DIGITS + 1):
+        rounded = float(f"{value:.{digits}g}")
+        if low <= rounded <= high or low == high:
+            return rounded
+    return rounded
+
+
+def _rounded_up(value: float) -> float:
+    """Round a number that is not negative to the next with `DIGITS` significant digits."""
+    if value <= 0.0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(value)) - DIGITS + 1)
+    return float(f"{_next_multiple(value, step):.{DIGITS}g}")
+
+
+def range_notes(
+    groups: Mapping[str, GroupGains],
+    members: Mapping[str, Sequence[str]],
+    joints: Mapping[str, JointGains],
+) -> tuple[str, ...]:
+    """Say which ranges are wider or narrower than what the joints show.
+
+    Args:
+        groups: Training gains by group. Of those on the paper's lattice nothing is said.
+        members: Names of the joints of each group.
+        joints: Matched gains by joint.
+
+    Returns:
+        At most one sentence on wider and one on narrower ranges.
+    """
+    wider = []
+    narrower = []
+    for group, gains in groups.items():
+        trusted = trusted_joints(members[group], joints)
+        stiffnesses = [joints[name].stiffness for name in trusted]
+        dampings = [joints[name].damping for name in trusted]
+        for name, written, fitted in (
+            ("stiffness", gains.stiffness_range, stiffnesses),
+            ("damping", gains.damping_range, dampings),
+        ):
+            if not fitted or not math.isclose(
+                written, gain_and_range(fitted)[1], rel_tol=SAME_RANGE
+            ):
+                continue
+            low, high = _covering_interval(fitted)
+            middle, half_width = gain_and_range(fitted)
+            reach = max(high - middle, middle - low)
+            if reach > 1.01 * half_width:
+                narrower.append(f"{name} of {group} ({low:.3g} to {high:.3g})")
+            elif SAME_GAIN * middle < reach < RANGE_FLOOR * middle:
+                wider.append(f"{name} of {group} ({100.0 * reach / middle:.2g} %)")
+    notes = []
+    if wider:
+        notes.append(
+            f"Ranges are {100.0 * RANGE_FLOOR:g} % of the gain where joints and intervals reach "
+            f"less far: {', '.join(wider)}."
+        )
+    if narrower:
+        notes.append(
+            "Ranges are symmetric and stay above 0, so that they do not cover all joints and "
+            f"intervals of {', '.join(narrower)}; use the gains of each joint, or match again."
+        )
+    return tuple(notes)
+
+
+def lattice_gains(robot: RobotSpec, joint: str, matched: Sequence[JointGains]) -> GroupGains:
+    """Return the training gains of a group on the paper's lattice.
+
+    Args:
+        robot: The paper's robot.
+        joint: The first matched joint of the group, whose inertia counts.
+        matched: Gains of the group's matched joints.
+    """
+    stiffness_low, stiffness_high = _covering_interval([gains.stiffness for gains in matched])
+    damping_low, damping_high = _covering_interval([gains.damping for gains in matched])
     damping = _nearest_multiple(0.5 * (damping_low + damping_high), DAMPING_STEP)
-    stiffness = _training_stiffness(robot, joint, matched, damping)
+    stiffness = _lattice_stiffness(robot, joint, matched, damping)
     stiffness_reach = max(stiffness_high - stiffness, stiffness - stiffness_low)
     damping_reach = max(damping_high - damping, damping - damping_low)
+    ranges = (
+        _next_multiple(stiffness_reach, STIFFNESS_STEP),
+        _next_multiple(damping_reach, DAMPING_STEP),
+    )
+    points = [interval_points(gains) for gains in matched]
+    return _group(matched, (stiffness, damping), ranges, points)
 
-    center, shape = enclosing_ellipsoid(np.concatenate(point_sets))
+
+def _group(
+    matched: Sequence[JointGains],
+    gain_pair: tuple[float, float],
+    ranges: tuple[float, float],
+    points: Sequence[Array],
+) -> GroupGains:
+    """Return training gains with the mean friction of the joints and their ellipsoid."""
+    center, shape = enclosing_ellipsoid(np.concatenate(points))
     stiffness_row, damping_row = shape.tolist()
     return GroupGains(
-        stiffness=stiffness,
-        damping=damping,
-        stiffness_range=_next_multiple(stiffness_reach, STIFFNESS_STEP),
-        damping_range=_next_multiple(damping_reach, DAMPING_STEP),
-        frictionloss=float(np.mean(frictions)),
+        stiffness=gain_pair[0],
+        damping=gain_pair[1],
+        stiffness_range=ranges[0],
+        damping_range=ranges[1],
+        frictionloss=float(np.mean([gains.frictionloss.value for gains in matched])),
         ellipsoid=(tuple(stiffness_row), tuple(damping_row)),
         ellipsoid_center=(float(center[0]), float(center[1])),
     )
@@ -142,7 +269,7 @@ def _covering_interval(fitted: Sequence[FittedValue]) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _training_stiffness(
+def _lattice_stiffness(
     robot: RobotSpec, joint: str, matched: Sequence[JointGains], damping: float
 ) -> float:
     """Return the stiffness that keeps the impedance of a group at its rounded damping (step 2).
@@ -176,7 +303,7 @@ def _next_multiple(value: float, step: float) -> float:
     return round(count * step, 9)
 
 
-def interval_points(gains: JointGains, level: float = 0.95) -> Array:
+def interval_points(gains: JointGains, level: float = 0.95, floor: float = 0.0) -> Array:
     """Compute points on the ellipse that holds a joint's true gains with some probability.
 
     Where no covariance is known, so that it is not finite, the gains are taken for exact.
@@ -184,6 +311,8 @@ def interval_points(gains: JointGains, level: float = 0.95) -> Array:
     Args:
         gains: Matched gains of a joint.
         level: Probability that the true gains are inside.
+        floor: Smallest half-width of the ellipse over each gain. Above 0 the ellipse is also as
+            wide as the intervals of each gain, up to where it would reach zero.
 
     Returns:
         (stiffness, damping) of each point, shape (24, 2).
@@ -194,6 +323,15 @@ def interval_points(gains: JointGains, level: float = 0.95) -> Array:
         covariance = np.zeros((2, 2))
     covariance = covariance + np.diag((SMALLEST_DEVIATION * center) ** 2)
     radius = np.sqrt(stats.chi2.ppf(level, 2))
+    if floor > 0.0:
+        half_widths = radius * np.sqrt(np.diag(covariance))
+        scales = np.ones(2)
+        for index, gain in enumerate((gains.stiffness, gains.damping)):
+            low, high = _covering_interval([gain])
+            reach = max(high - gain.value, gain.value - low, floor * gain.value)
+            reach = min(reach, (1.0 - LOWEST_OF_GAIN) * gain.value)
+            scales[index] = reach / half_widths[index]
+        covariance = covariance * np.outer(scales, scales)
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return np.asarray(center + radius * (np.linalg.cholesky(covariance) @ circle).T)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pronk.identify.match.parameters import PARAMETERS
+from pronk.identify.match.ranges import range_notes
 from pronk.identify.match.result import MatchResult
 from pronk.identify.match.torque_fit import UNITS
 from pronk.tables import Cell, Column, Table
@@ -32,7 +33,13 @@ def gains_table(result: MatchResult) -> Table:
         has_grid = has_grid or joint.grid is not None
 
     columns = [Column(heading="joint")]
-    for name, unit, digits in (("stiffness", "N m/rad", 2), ("damping", "N m s/rad", 3)):
+    stiffnesses = [joint.gains.stiffness.value for joint in result.joints.values()]
+    dampings = [joint.gains.damping.value for joint in result.joints.values()]
+    for name, unit, values, fewest in (
+        ("stiffness", "N m/rad", stiffnesses, 2),
+        ("damping", "N m s/rad", dampings, 3),
+    ):
+        digits = decimals(values, fewest)
         columns.append(Column(heading=name, unit=unit, digits=digits))
         columns.append(Column(heading="repeat 95 %" if has_total else "95 %", digits=digits))
         if has_total:
@@ -87,6 +94,14 @@ def gains_table(result: MatchResult) -> Table:
     )
 
 
+def decimals(values: Sequence[float], fewest: int) -> int:
+    """Return how many decimals show three significant digits of the smallest of some values."""
+    positive = [value for value in values if value > 0.0]
+    if not positive:
+        return fewest
+    return max(fewest, 2 - int(np.floor(np.log10(min(positive)))))
+
+
 def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> Table:
     """Make the table of what training draws from, one joint group a row.
 
@@ -96,8 +111,8 @@ def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> T
     """
     rows: list[tuple[Cell, ...]] = []
     for name, group in result.groups.items():
-        stiffness = f"{group.stiffness:.2f} ± {group.stiffness_range:.2f}"
-        damping = f"{group.damping:.3f} ± {group.damping_range:.3f}"
+        stiffness = f"{group.stiffness:.4g} ± {group.stiffness_range:.3g}"
+        damping = f"{group.damping:.4g} ± {group.damping_range:.3g}"
         rows.append((name, stiffness, damping, ", ".join(members[name])))
     columns = (
         Column(heading="group"),
@@ -105,7 +120,8 @@ def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> T
         Column(heading="damping", unit="N m s/rad"),
         Column(heading="joints"),
     )
-    return Table(title="Training ranges", columns=columns, rows=tuple(rows))
+    notes = range_notes(result.groups, members, result.gains.joints)
+    return Table(title="Training ranges", columns=columns, rows=tuple(rows), notes=notes)
 
 
 def drives_table(result: MatchResult) -> Table:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pronk.errors import PronkError, RobotError
 from pronk.identify.match.gains import JointGains, MatchedGains
+from pronk.identify.match.ranges import gain_and_range
 from pronk.identify.simulators.profiles import Profile, load_profiles, profile_of
 from pronk.robots import load_robot
 from pronk.robots.robot import Drive, Joint, RobotSpec
@@ -80,8 +81,8 @@ def exported_actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group"
     Args:
         gains: Matched gains.
         robot: The robot that they were matched for.
-        per: `group` for an actuator with the gains of each group; `joint` for one with the gains
-            of each joint, or with those of its group where the joint was not matched.
+        per: `group` for an actuator with the gains and ranges of each group; `joint` for one with
+            those of each joint, or of its group where the joint was not matched.
 
     Returns:
         Actuators. A group has the means of its joints for armature, friction and delay.
@@ -116,6 +117,7 @@ def _group_actuator(gains: MatchedGains, group: str, members: Sequence[Joint]) -
         name=group,
         joints=members,
         gain_pair=(group_gains.stiffness, group_gains.damping),
+        half_widths=(group_gains.stiffness_range, group_gains.damping_range),
         sources=_matched_gains(gains, members),
     )
 
@@ -124,17 +126,29 @@ def _joint_actuator(gains: MatchedGains, joint: Joint, members: Sequence[Joint])
     """Return the actuator of one joint of a group; of its group if it was not matched."""
     group_gains = gains.groups[joint.group]
     gain_pair = (group_gains.stiffness, group_gains.damping)
+    half_widths = (group_gains.stiffness_range, group_gains.damping_range)
     sources = _matched_gains(gains, members)
     if joint.name in gains.joints:
         joint_gains = gains.joints[joint.name]
         gain_pair = (joint_gains.stiffness.value, joint_gains.damping.value)
+        _, stiffness_range = gain_and_range([joint_gains.stiffness])
+        _, damping_range = gain_and_range([joint_gains.damping])
+        half_widths = (stiffness_range, damping_range)
         sources = [joint_gains]
-    return _actuator(gains, name=joint.name, joints=[joint], gain_pair=gain_pair, sources=sources)
+    return _actuator(
+        gains,
+        name=joint.name,
+        joints=[joint],
+        gain_pair=gain_pair,
+        half_widths=half_widths,
+        sources=sources,
+    )
 
 
 def _matched_gains(gains: MatchedGains, joints: Sequence[Joint]) -> list[JointGains]:
-    """Return the gains of those joints that were matched."""
-    return [gains.joints[joint.name] for joint in joints if joint.name in gains.joints]
+    """Return the gains of those joints that are a match; where none is, of all that were fitted."""
+    fitted = [gains.joints[joint.name] for joint in joints if joint.name in gains.joints]
+    return [joint_gains for joint_gains in fitted if joint_gains.matched] or fitted
 
 
 def _actuator(
@@ -143,12 +157,21 @@ def _actuator(
     name: str,
     joints: Sequence[Joint],
     gain_pair: tuple[float, float],
+    half_widths: tuple[float, float],
     sources: Sequence[JointGains],
 ) -> Actuator:
-    """Return an actuator with a pair of gains, and the mean of what else the sources have."""
+    """Return an actuator with a pair of gains, and the mean of what else the sources have.
+
+    Args:
+        gains: Matched gains.
+        name: Name of the actuator.
+        joints: Its joints.
+        gain_pair: Stiffness [N m/rad] and damping [N m s/rad].
+        half_widths: Half-widths of the ranges of both, in the same units.
+        sources: Matched gains that armature, friction and delay are the means of.
+    """
     stiffness, damping = gain_pair
     drive = joints[0].drive
-    group_gains = gains.groups[joints[0].group]
     names = []
     maker_names = []
     unmatched = []
@@ -178,8 +201,8 @@ def _actuator(
         no_match=no_match,
         stiffness=stiffness,
         damping=damping,
-        stiffness_range=_range_about(stiffness, group_gains.stiffness_range),
-        damping_range=_range_about(damping, group_gains.damping_range),
+        stiffness_range=_range_about(stiffness, half_widths[0]),
+        damping_range=_range_about(damping, half_widths[1]),
         armature=_mean(armatures, drive.armature),
         frictionloss=_mean(frictions, drive.frictionloss),
         stribeck=_mean(stribecks, 0.0),

@@ -39,6 +39,7 @@ from pronk.identify.match.export.python_config import (
 )
 from pronk.identify.match.export.target import ExportTarget
 from pronk.identify.match.gains import MatchedGains, require_matched
+from pronk.identify.match.ranges import range_notes
 from pronk.identify.simulators.profiles import Profile, profile
 from pronk.identify.simulators.stability import require_stable
 from pronk.robots.robot import RobotSpec
@@ -274,6 +275,7 @@ def export(
         *_conditions(gains, export_target, gains_profile, simulated_robot),
         *_stability(gains_profile, limit_share),
         *_losses(export_target, actuators, gains_profile),
+        *_range_sentences(export_target, gains, simulated_robot, per),
         *_origin(gains, actuators, simulated_robot),
     ]
     lines = [
@@ -377,6 +379,18 @@ def _losses(
     if gains_profile.friction != "N m":
         sentences.append(f"No dry friction: {gains_profile.framework} has none in N m.")
     return sentences
+
+
+def _range_sentences(
+    target: ExportTarget, gains: MatchedGains, robot: RobotSpec, per: Per
+) -> tuple[str, ...]:
+    """Say which ranges of the text are wider or narrower than what the joints show."""
+    if per == "joint" or target.write not in (mjlab_config, isaaclab_config):
+        return ()
+    members = {}
+    for group in gains.groups:
+        members[group] = [joint.name for joint in robot.group(group)]
+    return range_notes(gains.groups, members, gains.joints)
 
 
 def _delay_sentence(target: ExportTarget, delayed: Sequence[Actuator], timestep_s: float) -> str:
