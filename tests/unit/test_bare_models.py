@@ -316,7 +316,7 @@ TENDON = '<tendon><fixed name="t"><joint joint="j" coef="3"/></fixed></tendon>'
             ("position", 70.0, 0.9, 8.0),
         ),
         ('<intvelocity joint="j" kp="50" actrange="-1 1"/>', "", ("position", 50.0, 0.0, None)),
-        ('<velocity joint="j" kv="4" ctrlrange="-9 9"/>', "", ("velocity", None, None, None)),
+        ('<velocity joint="j" kv="4" ctrlrange="-9 9"/>', "", ("velocity", None, 4.0, None)),
         ('<motor joint="j" gear="20" ctrlrange="-0.5 0.5"/>', "", ("motor", None, None, 10.0)),
         (
             '<general joint="j" gainprm="5" gear="3" ctrlrange="-1 1"/>',

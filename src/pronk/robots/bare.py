@@ -232,7 +232,7 @@ def _held_joints(
             held_joints[name] = f"follows {source.mimics[name]} in the URDF"
         elif not source.has_mass(index):
             held_joints[name] = "hinge with no mass behind it [rad]"
-        elif has_actuators and not servo.actuators:
+        elif has_actuators and not servo.actuators and not model.jnt_actfrclimited[index]:
             held_joints[name] = "hinge without an actuator [rad]"
     return held_joints
 
@@ -282,18 +282,26 @@ def _joint_entries(
             remarks["stiffness"] = shared
             remarks["damping"] = shared
     else:
-        stiffness = inertia * (2.0 * math.pi * NATURAL_HZ) ** 2
+        natural = 2.0 * math.pi * NATURAL_HZ
+        stiffness = inertia * natural**2
         rule = f"assumed, {NATURAL_HZ:g} Hz with {inertia:.3g} kg m^2"
+        if servo.damping * natural > stiffness:
+            stiffness = servo.damping * natural
+            rule = f"assumed, {NATURAL_HZ:g} Hz with the damping"
         if has_limit:
             available = max(servo.effort_limit - gravity, 0.2 * servo.effort_limit) / SWING
             if available < stiffness:
                 stiffness = available
                 rule = f"assumed, the effort limit less gravity at {SWING:g} rad"
-        damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
         remarks["stiffness"] = Remark(mark="CHECK", text=rule)
-        remarks["damping"] = Remark(mark="CHECK", text=f"assumed, damping ratio {DAMPING_RATIO:g}")
+        damping = servo.damping
+        remarks["damping"] = Remark(mark="read", text=f"kv x gear^2 of {names}")
+        if not damping:
+            damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
+            text = f"assumed, damping ratio {DAMPING_RATIO:g}"
+            remarks["damping"] = Remark(mark="CHECK", text=text)
         if servo.servo_type == "velocity":
-            text = f"velocity servo {names} holds no position and damps by {servo.damping:.4g}"
+            text = f"velocity servo {names} holds no position"
         elif servo.servo_type == "motor":
             text = f"{names} is a motor, its gains are in no model"
         else:
@@ -346,7 +354,7 @@ def _joint_entries(
     )
     if servo.servo_type != "position":
         stiffness = _short(stiffness)
-        damping = _short(damping)
+        damping = damping if servo.damping else _short(damping)
     group = GroupEntry(
         drive=name, stiffness=stiffness, damping=damping, band_hz=BAND_HZ, servo=servo.servo_type
     )
