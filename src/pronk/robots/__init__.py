@@ -41,7 +41,7 @@ def load_robot(name: str | Path) -> RobotSpec:
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> robot.joint("FR_knee").drive.effort_limit
     """
-    path = robot_path(name)
+    path = robot_file_path(name)
     try:
         robot = _read(path.resolve(), path.stat().st_mtime_ns)
     except OSError:
@@ -50,7 +50,7 @@ def load_robot(name: str | Path) -> RobotSpec:
     return replace(robot, source=str(name) if shipped else str(path.resolve()))
 
 
-def robot_path(name: str | Path) -> Path:
+def robot_file_path(name: str | Path) -> Path:
     """Return the robot.yaml or the model of a robot; see `load_robot`."""
     if str(name) in ROBOT_NAMES:
         return Path(__file__).parent / str(name) / "robot.yaml"
@@ -82,4 +82,4 @@ def _read(path: Path, _modified_ns: int) -> RobotSpec:
     return read_robot(path)
 
 
-__all__ = ["ROBOT_NAMES", "Drive", "Joint", "RobotSpec", "load_robot", "robot_path"]
+__all__ = ["ROBOT_NAMES", "Drive", "Joint", "RobotSpec", "load_robot", "robot_file_path"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from pronk.robots import MODEL_SUFFIXES, robot_path
+from pronk.robots import MODEL_SUFFIXES, robot_file_path
 from pronk.robots.bare import describe_model
 from pronk.robots.load import read_robot_file
 from pronk.robots.model import free_spec
@@ -33,7 +33,7 @@ def problems_of(robot: RobotSpec) -> list[str]:
     with the ranges. Named are the lines of the robot.yaml that are still marked CHECK, rotor
     inertia and dry friction of 0, and joints without a position servo in the model.
     """
-    path = robot_path(robot.source)
+    path = robot_file_path(robot.source)
     model_path = path
     problems = []
     if path.suffix in MODEL_SUFFIXES:
