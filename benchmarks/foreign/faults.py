@@ -7,7 +7,8 @@ none. A log counts as
 
     right   a named cause is one that the fault accepts, and no other is named
     none    nothing is named, and the log is refused or is no match, or a list is given
-    silent  nothing is named, and the log counts as matched
+    silent  nothing is named, and the log counts as matched; `trials` tells whether its gains are
+            harmless or wrong
     wrong   a named cause is none that the fault accepts
 """
 
@@ -255,10 +256,11 @@ def flip_sign(case: LogCase, rng: np.random.Generator) -> LogCase:
 
 
 def rest_instead(case: LogCase, rng: np.random.Generator) -> LogCase:
-    """Log the position of a joint that rests, moved by a hundredth by the one that is excited."""
+    """Log a joint that rests, which the excited one moves by 0.1 to 3 % of its own motion."""
     position = case.columns["position"]
     noise = rng.normal(0.0, case.recording.noise, len(position))
-    resting = 0.2 + 0.01 * (position - position[0]) + noise
+    share = float(np.exp(rng.uniform(math.log(0.001), math.log(0.03))))
+    resting = 0.2 + share * (position - position[0]) + noise
     resolution = case.recording.resolution
     return with_column(case, "position", resolution * np.round(resting / resolution))
 

@@ -300,8 +300,9 @@ def recorded(case: LogCase) -> LogCase:
     count = int(duration_s * recording.rate_hz) - 1
     time = np.arange(count) / recording.rate_hz
     if recording.jitter_s:
-        time = np.maximum.accumulate(time + rng.normal(0.0, recording.jitter_s, count))
-        time = np.clip(time + 1e-7 * np.arange(count), 0.0, duration_s - STEP_S)
+        # A tenth of a sample at most, so that instants stay in order.
+        deviations = rng.normal(0.0, recording.jitter_s, count)
+        time = time + np.clip(deviations, -0.1 / recording.rate_hz, 0.1 / recording.rate_hz)
     fine = np.arange(len(position)) * STEP_S
     measured = np.interp(time, fine, position) + rng.normal(0.0, recording.noise, count)
     measured = recording.resolution * np.round(measured / recording.resolution)
@@ -322,7 +323,7 @@ def write_csv(path: Path, case: LogCase) -> Path:
         if name != "time":
             header.append(name if "." in name else f"{name}.{NAME}")
     table = np.column_stack(list(case.columns.values()))
-    np.savetxt(path, table, fmt="%.7g", delimiter=",", header=",".join(header), comments="")
+    np.savetxt(path, table, fmt="%.10g", delimiter=",", header=",".join(header), comments="")
     return path
 
 

@@ -128,7 +128,7 @@ def _honest_cells(name: str, rows: Sequence[Row]) -> tuple[Cell, ...]:
 
 def faults_table(rows: Sequence[Row], seed: int) -> list[Table]:
     """Return a table of logs with faults by fault, and one of the wrong causes."""
-    outcomes = ("right", "none", "silent", "wrong", "defect")
+    outcomes = ("right", "none", "harmless", "wrong gains", "wrong", "defect")
     cells: list[tuple[Cell, ...]] = []
     for name in (*(fault.name for fault in FAULTS), "all"):
         of_fault = [row for row in rows if name in ("all", row["fault"])]
@@ -137,18 +137,25 @@ def faults_table(rows: Sequence[Row], seed: int) -> list[Table]:
     columns = tuple(Column(heading=heading) for heading in ("fault", "logs", *outcomes))
     wrong: list[tuple[Cell, ...]] = []
     for row in rows:
-        if row["verdict"] in ("wrong", "defect"):
-            wrong.append((row["number"], row["fault"], row["robot"], _words(row)))
+        if row["verdict"] in ("wrong", "defect", "wrong gains"):
+            gains = ""
+            if row["verdict"] == "wrong gains":
+                factors = [row[name][0] / row["true"][name][0] for name in ("stiffness", "damping")]
+                gains = f"{factors[0]:.2f}, {factors[1]:.2f}"
+            wrong.append((row["number"], row["fault"], row["robot"], gains, _words(row)))
     note = (
-        "right: the cause is named; none: refused or no match without a cause; silent: matched "
-        "without a cause; wrong: another cause is named; defect: a traceback."
+        "right: the cause is named; none: refused or no match without a cause; harmless, wrong "
+        "gains: matched without a cause, and the drive's gains are found or are not; wrong: another "
+        "cause is named; defect: a traceback."
     )
     title = f"Logs with one fault, seed {seed}"
     tables = [Table(title=title, columns=columns, rows=tuple(cells), notes=(note,))]
     if wrong:
-        headings = ("log", "fault", "joint", "what is said")
+        headings = ("log", "fault", "joint", "gains over true", "what is said")
         wrong_columns = tuple(Column(heading=heading) for heading in headings)
-        tables.append(Table(title="Wrong causes", columns=wrong_columns, rows=tuple(wrong)))
+        tables.append(
+            Table(title="Wrong causes and gains", columns=wrong_columns, rows=tuple(wrong))
+        )
     return tables
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.foreign.faults import FAULTS, faulty_log, honest_log, named_causes, verdict
 from benchmarks.foreign.joints import NAME, RigidJoint
-from benchmarks.foreign.logs import LogCase, true_gains, write_case
+from benchmarks.foreign.logs import LogCase, draw_case, linear_gains, true_gains, write_case
 from benchmarks.foreign.plain import rigid_joint
 from benchmarks.foreign.population import Candidate
 from pronk.errors import PronkError
@@ -24,6 +24,9 @@ from pronk.identify.match.settings import MatchSettings
 from pronk.robots import load_robot
 
 Row = dict[str, Any]
+RIGHT_SHARE = 0.15
+"""Share by which gains of a log with a fault may be off and still be right: that of the torque
+constants of drives."""
 DRAWS = 20
 """Hinges that are tried for one log until one has a mass and is in a model that loads."""
 
@@ -65,8 +68,9 @@ def log_trial(
     begin = time.perf_counter()
     joint = joint_of_log(packages, drawn, seed, number)
     fault = FAULTS[number % len(FAULTS)] if kind == "faults" else None
-    case = honest_log(seed, number, joint)
-    if fault is not None:
+    if fault is None:
+        case = honest_log(seed, number, joint)
+    else:
         case = faulty_log(seed, number, fault, joint)
     row = described(case)
     row["kind"] = kind
@@ -77,6 +81,11 @@ def log_trial(
     row["named"] = sorted(named_causes(flags, row["refusal"]))
     if fault is not None:
         row["verdict"] = verdict(fault, flags, row["refusal"])
+        # What the drive has without the fault, by which a silent match is harmless or not.
+        stiffness, damping, _ = linear_gains(draw_case(seed, number, joint))
+        row["true"] = {"stiffness": (stiffness, stiffness), "damping": (damping, damping)}
+        if row["verdict"] == "silent":
+            row["verdict"] = silent_verdict(row)
     if row["defect"]:
         row["verdict"] = "defect"
     if kind == "honest":
@@ -86,6 +95,21 @@ def log_trial(
             row[f"{name}_inside"] = overlaps(row.get(name), row["true"][name])
     row["seconds"] = time.perf_counter() - begin
     return row
+
+
+def silent_verdict(row: Row) -> str:
+    """Tell a match without a cause whose gains are right from one whose gains are not.
+
+    Gains are right if the total interval reaches the drive's, or they are within `RIGHT_SHARE` of
+    them. A damping that is wrong counts where it is wrong by that share of the larger of the two.
+    """
+    for name in ("stiffness", "damping"):
+        true = row["true"][name]
+        value = row[name][0]
+        near = abs(value - true[0]) <= RIGHT_SHARE * max(value, true[0])
+        if not near and not overlaps(row[name], true):
+            return "wrong gains"
+    return "harmless"
 
 
 def described(case: LogCase) -> Row:
