@@ -145,8 +145,8 @@ def faults_table(rows: Sequence[Row], seed: int) -> list[Table]:
             wrong.append((row["number"], row["fault"], row["robot"], gains, _words(row)))
     note = (
         "right: the cause is named; none: refused or no match without a cause; harmless, wrong "
-        "gains: matched without a cause, and the drive's gains are found or are not; wrong: another "
-        "cause is named; defect: a traceback."
+        "gains: matched without a cause, and the drive's gains are found or are not; wrong: "
+        "another cause is named; defect: a traceback."
     )
     title = f"Logs with one fault, seed {seed}"
     tables = [Table(title=title, columns=columns, rows=tuple(cells), notes=(note,))]
