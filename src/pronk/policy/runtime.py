@@ -167,7 +167,7 @@ def load_policy(path: Path | str) -> Policy:
             than this pronk builds observations.
         PronkError: ONNX Runtime is not installed.
 
-    Example:
+    Examples:
         >>> policy = pronk.load_policy("policies/matched/policy.onnx")
         >>> policy.contract.robot
         'mini_cheetah'

@@ -36,7 +36,7 @@ def load_robot(name: str | Path) -> RobotSpec:
     Raises:
         RobotError: There is no such robot, or its files are inconsistent; the message says where.
 
-    Example:
+    Examples:
         >>> import pronk
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> robot.joint("FR_knee").drive.effort_limit

@@ -115,7 +115,7 @@ def match(
             identify a parameter; the message says what to record.
         PronkError: A choice is not known, or the simulator cannot be used here.
 
-    Example:
+    Examples:
         >>> import pronk
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> log = pronk.read_log("logs/FR_knee.mcap", robot=robot)

@@ -178,7 +178,7 @@ def predict(
         LogError: The log excites no joint that has matched gains, or is of another robot.
         PronkError: The simulator is unknown, or cannot replay joints that move together.
 
-    Example:
+    Examples:
         >>> import pronk
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> result = pronk.match([pronk.read_log("logs/FR_knee.mcap", robot=robot)], robot)

@@ -254,7 +254,7 @@ def export(
         PronkError: The target is unknown or has another drive law or step than the gains, the
             gains hold no group or are not stable, or the robot is unknown.
 
-    Example:
+    Examples:
         >>> import pronk
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> result = pronk.match([pronk.read_log("logs/FR_knee.mcap", robot=robot)], robot)
