@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from pronk.robots.robot import RobotSpec
 
 ROBOT = "mini_cheetah"
+QUICK_LEG = "FR"
+"""The leg that `--quick` sweeps."""
 FILMED = "forward 2"
 """The command of which one jump is filmed."""
 
@@ -36,10 +38,12 @@ def demo(
     jumps: int = 2,
     repeats: int = 3,
     seed: int = 0,
+    quick: bool = False,
 ) -> console.Outcome:
     """Sweep and match all joints of the virtual robot, let trained policies jump on it, report.
 
     Args:
+        quick: One leg, two repeats, one policy and one jump with each command: half a minute.
         out: Folder for everything.
         policies: Folder of policies to try; those that come with pronk if left out.
         jumps: Jumps with each of the paper's commands.
@@ -60,10 +64,16 @@ def demo(
     begin = time.perf_counter()
     robot = load_robot(ROBOT)
     tried = find_policies(policies, robot)
+    joints = robot.joint_names
+    if quick:
+        joints = tuple(name for name in joints if name.startswith(f"{QUICK_LEG}_"))
+        repeats = min(repeats, 2)
+        jumps = 1
+        tried = tried[:1]
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
     with console.progress() as report, pool(1) as process:
         jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed)
-        result, replays = sweep_and_match(robot, out, repeats, seed, report)
+        result, replays = sweep_and_match(robot, joints, out, repeats, seed, report)
         report("jumps and film", 0.0)
         trial, films = jumping.result()
         report("jumps and film", 1.0)
@@ -106,7 +116,7 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     """Return the policies of a folder, or of pronk's source if None; the matched one first."""
     from pronk.jump.trial.trial import load_subjects
 
-    policies_folder = folder or Path(__file__).parents[3] / "policies"
+    policies_folder = folder or Path(__file__).parents[1] / "policies"
     policies = [
         *policies_folder.glob("policy.onnx"),
         *policies_folder.glob("*/policy.onnx"),
@@ -151,9 +161,14 @@ def jump_and_film(
 
 
 def sweep_and_match(
-    robot: RobotSpec, out: Path, repeats: int, seed: int, report: console.Reporter
+    robot: RobotSpec,
+    joints: Sequence[str],
+    out: Path,
+    repeats: int,
+    seed: int,
+    report: console.Reporter,
 ) -> tuple[MatchResult, list[JointPrediction]]:
-    """Sweep all joints, match them, and predict a sweep that was not matched.
+    """Sweep joints, match them, and predict a sweep that was not matched.
 
     The smaller amplitude only shows whether the gains hold there too; it has one repeat.
     """
@@ -184,8 +199,8 @@ def sweep_and_match(
         )
 
     repeats_by_amplitude = (repeats, *[1] * len(AMPLITUDES[1:]))
-    sweep = make_plan(robot, signal=Chirp(), amplitudes=AMPLITUDES, repeats=repeats_by_amplitude)
-    fresh_sweep = make_plan(robot, signal=LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
+    sweep = make_plan(robot, joints, Chirp(), amplitudes=AMPLITUDES, repeats=repeats_by_amplitude)
+    fresh_sweep = make_plan(robot, joints, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     log_paths = record("logs", sweep, seed)
     fresh_paths = record("fresh", fresh_sweep, seed + 1)
     logs = read_logs(log_paths, processes=processes, robot=robot)
