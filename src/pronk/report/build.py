@@ -20,9 +20,9 @@ from pronk.report.page import Part, page
 PAGE_NAME = "report.html"
 LOGS = "*.mcap"
 PART_MAKERS: dict[str, Callable[[Path], Part]] = {
+    "match.npz": match_page.match_part,
     SUMMARY: trial_page.trial_part,
     LOGS: deploy_page.deploy_part,
-    "match.npz": match_page.match_part,
 }
 """How the part of each file is made, in the order of the page."""
 

@@ -13,6 +13,7 @@ from pronk.identify.match import tables
 from pronk.identify.match.predict import Prediction, load_prediction
 from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult, load_match
 from pronk.report import figures
+from pronk.report.charts import bode_chart
 from pronk.report.page import Part
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import joint_words, picture
@@ -23,6 +24,8 @@ from pronk.tables import Cell, Column, Table
 _GAINS_SCHEMA = "schema: pronk/gains/"
 """Text near the beginning of every gains file."""
 JOINT = Column(heading="joint")
+FILES = {"mjlab": "py", "mjcf": "xml"}
+"""Ending of what an export writes."""
 
 
 def match_part(path: Path) -> Part:
@@ -39,7 +42,7 @@ def match_part(path: Path) -> Part:
         if joint.responses is not None:
             compared[name] = joint
     if compared or not any(joint.gains.torque for joint in result.joints.values()):
-        summary = f"{matched} of {len(result.joints)} joints matched."
+        summary = _headline(result, matched)
     else:
         summary = f"Drives of {len(result.joints)} joints fitted by torque."
     return Part(
@@ -51,6 +54,24 @@ def match_part(path: Path) -> Part:
         content=_content(result, compared, gains_path),
         figures=result.summary(),
     )
+
+
+def _headline(result: MatchResult, matched: int) -> str:
+    """Return the outcome of a match in words: joints, largest error, flags."""
+    count = len(result.joints)
+    plural = "" if count == 1 else "s"
+    phrases = [f"{count} joint{plural} matched"]
+    if matched < count:
+        phrases = [f"{matched} of {count} joint{plural} matched"]
+    if result.worst_joint:
+        error_db = result.joints[result.worst_joint].gains.quality.error_db
+        phrases.append(f"largest error {error_db:.2f} dB ({joint_words(result.worst_joint)})")
+    flagged = len(result.flags)
+    if flagged == 0:
+        phrases.append("no flags")
+    else:
+        phrases.append(f"{flagged} joint{'' if flagged == 1 else 's'} flagged")
+    return f"{'; '.join(phrases)}."
 
 
 def find_gains(folder: Path) -> Path:
@@ -93,9 +114,15 @@ def _content(
     members = _members(result, robot_joints)
     drive_gains = {name: (joint.stiffness, joint.damping) for name, joint in robot_joints.items()}
     order = figures.knees_first(list(compared))
-    bode_plots = {}
+    charts = {}
+    chart_notes = {}
     for name in order:
-        bode_plots[name] = picture(figures.bode(compared[name]))
+        responses = figures.compared_responses(compared[name])
+        charts[name] = bode_chart(responses, joint_words(name))
+        chart_notes[name] = (
+            f"error {responses.error_db:.2f} dB, with nominal gains "
+            f"{responses.nominal_error_db:.2f} dB"
+        )
     without_armature = [name for name in order if compared[name].zero_armature is not None]
     estimators = set()
     for joint in compared.values():
@@ -112,12 +139,14 @@ def _content(
         "gains_file": gains_path.name,
         "where": "the virtual robot" if result.virtual else "the robot",
         "in_time": fitted_together,
-        "gains_table": tables.gains_table(result),
+        "gains_table": _gains_table(result),
+        "gains_details": tables.gains_table(result),
         "published_table": _published_table(result),
         "drives": tables.drives_table(result),
         "held_out": _held_out_table(result),
         "overview": picture(figures.overview(compared)) if compared else None,
-        "bode": bode_plots,
+        "charts": charts,
+        "chart_notes": chart_notes,
         "maps": picture(figures.error_maps(result, drive_gains)) if has_grid else None,
         "ranges": picture(figures.ranges(gains, members)) if members else None,
         "ranges_table": tables.ranges_table(result, members),
@@ -132,7 +161,40 @@ def _content(
         "excitation": _excitation_table(compared),
         "amplitudes": _amplitude_table(compared),
         "logs": _logs_table(result),
+        "usage": _usage(result, gains_path),
     }
+
+
+def _gains_table(result: MatchResult) -> Table:
+    """Make the table of the matched gains with the quality of each joint first."""
+    table = tables.gains_summary_table(result)
+    columns = (
+        table.columns[0],
+        Column(heading="nominal error", unit="dB", digits=2),
+        Column(heading="error", unit="dB", digits=2),
+        *table.columns[1:-1],
+    )
+    rows: list[tuple[Cell, ...]] = []
+    for (name, joint), row in zip(result.joints.items(), table.rows, strict=True):
+        label = f"{joint_words(name)} (flagged)" if joint.gains.flags else joint_words(name)
+        rows.append((label, joint.gains.quality.nominal_error_db, row[-1], *row[1:-1]))
+    note = (
+        "Behind +-: half of the 95 % interval, with what the model does not explain. The gains are "
+        "equivalent gains of this simulator at its step, not those of the drive itself."
+    )
+    return Table(title=table.title, columns=columns, rows=tuple(rows), notes=(note,))
+
+
+def _usage(result: MatchResult, gains_path: Path) -> list[str]:
+    """Return command lines that use the gains; each runs as it stands in the folder of the page."""
+    framework = "mjlab" if result.simulator.law == "explicit" else "mjcf"
+    lines = [f"pronk export {gains_path.name} --to {framework} --out actuators.{FILES[framework]}"]
+    if framework != "mjcf":
+        lines.append(f"pronk export {gains_path.name} --to mjcf --out robot.{FILES['mjcf']}")
+    translated = "pronk translate {0} --to isaaclab-implicit --out isaaclab.yaml"
+    lines.append(translated.format(gains_path.name))
+    lines.append("pronk export isaaclab.yaml --to isaaclab-implicit --out isaaclab.py")
+    return lines
 
 
 def _robot_joints(result: MatchResult) -> dict[str, Joint]:
@@ -295,8 +357,15 @@ def _prediction_section(prediction: Prediction) -> dict[str, Any]:
         Column(heading="R² matched"),
     )
     figure = figures.prediction_figure(by_joint[drawn_joint], virtual=prediction.virtual)
+    ratios = [float(row[5]) for row in rows if isinstance(row[5], float)]
+    summary = f"{prediction.source}: errors of the position, nominal and matched"
+    if ratios:
+        summary = (
+            f"{prediction.source}: the error with matched gains is {min(ratios):.2f} to "
+            f"{max(ratios):.2f} of that with nominal gains"
+        )
     return {
-        "source": prediction.source,
+        "summary": summary,
         "joint": drawn_joint,
         "figure": picture(figure),
         "table": Table(title="", columns=columns, rows=tuple(rows)),

@@ -10,7 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jinja2
+import msgspec
+from markupsafe import Markup
 
+from pronk.report.charts import chart_library
 from pronk.version import VERSION
 
 
@@ -68,6 +71,13 @@ def _alignment(text_rows: Sequence[Sequence[str]], column: int) -> str:
     return ""
 
 
+def _as_json(value: Any) -> Markup:
+    """Return a value as JSON that can stand in a script element of a page."""
+    text = msgspec.json.encode(value).decode("utf-8")
+    # An element of a page ends at "</", also within a text of JSON.
+    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
 def page(title: str, parts: Sequence[Part]) -> str:
     """Return a whole page as HTML; text of the parts is escaped."""
     environment = jinja2.Environment(
@@ -81,10 +91,19 @@ def page(title: str, parts: Sequence[Part]) -> str:
     environment.filters["signs"] = _signs
     environment.filters["words"] = _words
     environment.filters["align"] = _alignment
+    environment.filters["as_json"] = _as_json
     rendered = []
     for part in parts:
         template = environment.get_template(f"{part.kind}.html.j2")
         html = template.render(part.content, part=part, many=len(parts) > 1, sections=[])
         rendered.append(html)
+    charts = any(part.content.get("charts") for part in parts)
     template = environment.get_template("page.html.j2")
-    return template.render(version=VERSION, title=title, parts=parts, rendered=rendered)
+    return template.render(
+        version=VERSION,
+        title=title,
+        parts=parts,
+        rendered=rendered,
+        charts=charts,
+        library=chart_library() if charts else "",
+    )

@@ -38,6 +38,8 @@ _PAPER: dict[str, Any] = {
     "markeredgecolor": style.PAPER,
     "markeredgewidth": 1.4,
 }
+FEWEST_JUMPS = 5
+"""Jumps of a command from which on a standard deviation is drawn; the paper has five."""
 
 
 def looks(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -143,7 +145,7 @@ def _draw_measured(axes: Axes, place: float, jumps: Array, look: Mapping[str, An
     spread = Spread.of(jumps)
     marks = place + np.linspace(-0.05, 0.03, len(jumps))
     axes.plot(marks, jumps, linestyle="none", alpha=0.45, markersize=4.5, **look)
-    std = spread.std if spread.n > 1 else 0.0
+    std = spread.std if spread.n >= FEWEST_JUMPS else 0.0
     axes.errorbar(
         place + 0.06,
         spread.mean,

@@ -28,7 +28,7 @@ from pronk.report import style
 from pronk.report.page import Part, page
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture
-from pronk.report.trial_figures import JumpPanel, Values, draw_jumps, draw_traces
+from pronk.report.trial_figures import FEWEST_JUMPS, JumpPanel, Values, draw_jumps, draw_traces
 from pronk.tables import Cell, Column, Table
 
 BEFORE_S = 0.5
@@ -132,12 +132,14 @@ def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
 # ---- films ----
 
 
-def film_pictures(folder: Path) -> dict[str, str]:
-    """Return the pictures in a trial's folder as `data:` addresses, by caption."""
-    pictures = {}
-    for path in [*_films(folder, "png"), *_films(folder, "gif")]:
-        pictures[f"{path.stem} ({path.suffix[1:]})"] = _picture_address(path)
-    return pictures
+def film_pictures(folder: Path, ending: str) -> dict[str, str]:
+    """Return the pictures of one kind in a trial's folder as `data:` addresses, by caption.
+
+    Films of the same command stand beside each other, those of nominal gains first.
+    """
+    paths = _films(folder, ending)
+    paths.sort(key=lambda path: (path.stem.partition("_")[2], not path.stem.startswith("naive")))
+    return {path.stem.replace("_", " "): _picture_address(path) for path in paths}
 
 
 def film_names(folder: Path) -> list[str]:
@@ -208,7 +210,9 @@ def trial_part(path: Path) -> Part:
         "table_iii": [tables.paper_table(trial, "height"), tables.paper_table(trial, "distance")],
         "criteria": tables.criteria_table(trial),
         "scatter_tables": scatter_tables,
-        "pictures": film_pictures(folder),
+        "moving": film_pictures(folder, "gif"),
+        "stills": film_pictures(folder, "png"),
+        "enough": all(cell.n >= FEWEST_JUMPS for cell in trial.cells_of(policy)),
         "films": film_names(folder),
         "landings": tables.landings(trial),
         "more": other_figures,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pronk.identify.match.gains import FittedValue
 from pronk.identify.match.parameters import PARAMETERS
 from pronk.identify.match.ranges import range_notes
 from pronk.identify.match.result import MatchResult
@@ -100,6 +102,59 @@ def decimals(values: Sequence[float], fewest: int) -> int:
     if not positive:
         return fewest
     return max(fewest, 2 - int(np.floor(np.log10(min(positive)))))
+
+
+def gains_summary_table(result: MatchResult) -> Table:
+    """Make the table of the matched gains that fits a terminal of 80 columns.
+
+    Values are with half the width of their total 95 % interval, or of that by repeats where there
+    is no total one.
+    """
+    rows: list[tuple[Cell, ...]] = []
+    for name, joint in result.joints.items():
+        gains = joint.gains
+        row = (
+            name,
+            value_and_interval(gains.stiffness),
+            value_and_interval(gains.damping),
+            value_and_interval(gains.frictionloss),
+            value_and_interval(gains.delay_s.scaled(1000.0), digits=1),
+            gains.quality.error_db,
+        )
+        rows.append(row)
+    columns = (
+        Column(heading="joint"),
+        Column(heading="stiffness", unit="N m/rad"),
+        Column(heading="damping", unit="N m s/rad"),
+        Column(heading="friction", unit="N m"),
+        Column(heading="delay", unit="ms"),
+        Column(heading="error", unit="dB", digits=2),
+    )
+    return Table(title="Matched gains", columns=columns, rows=tuple(rows))
+
+
+def value_and_interval(fitted: FittedValue, digits: int | None = None) -> str:
+    """Return a value with half the width of its 95 % interval, as in `25.20 +- 0.18`.
+
+    Args:
+        fitted: The value with its intervals.
+        digits: Digits after the point; two significant digits of the interval if None, or four
+            significant digits of a value without one.
+    """
+    if not math.isfinite(fitted.value):
+        return "-"
+    half_width = math.nan
+    for low, high in (fitted.total95, fitted.repeat95):
+        if not math.isfinite(half_width):
+            half_width = 0.5 * (high - low)
+    if not math.isfinite(half_width):
+        return f"{fitted.value:.4g}" if digits is None else f"{fitted.value:.{digits}f}"
+    if digits is None:
+        size = half_width if half_width > 0.0 else 1e-3 * abs(fitted.value)
+        digits = 3
+        if size > 0.0:
+            digits = min(max(1 - math.floor(math.log10(size)), 0), 6)
+    return f"{fitted.value:.{digits}f} +- {half_width:.{digits}f}"
 
 
 def ranges_table(result: MatchResult, members: Mapping[str, Sequence[str]]) -> Table:
