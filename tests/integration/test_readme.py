@@ -16,13 +16,15 @@ from pronk.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 LABELS = {"S": 7, "M": 5, "F": 13, "N": 3, "C": 4, "P": 2, "D": 10, "E": 7, "R": 8, "L": 4, "A": 23}
 """Items of the paper and readings of its unclear places, by their first letter."""
 
 
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    page = (DOCS / "python.md").read_text(encoding="utf-8")
+    code = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0]
     monkeypatch.chdir(tmp_path)
     shutil.copytree(ROOT / "policies", "policies")
     # Two repeats give intervals, and a replay needs one excitation.
@@ -31,7 +33,7 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     once = ("--repeats", "1", "--amplitude", ".25")
     accepted(*sweep, "fresh", "--signal", "log-chirp", "--seed", "1", *once)
     names: dict[str, Any] = {}
-    exec(compile(code, "README.md", "exec"), names)
+    exec(compile(code, "python.md", "exec"), names)
     knee = names["result"].gains.joints["FR_knee"]
     # The paper's Table I, from which the virtual robot's hidden parameters derive; two grid cells.
     assert knee.stiffness.value == pytest.approx(21.8, abs=2 * 14 / 49)
@@ -49,8 +51,8 @@ def test_every_command_of_the_documentation_exists() -> None:
     assert set(COMMANDS) - {"demo"} <= documented
 
 
-def test_the_readme_lists_the_commands_of_the_help() -> None:
-    table = README.split("## Commands")[1].split("\n## ")[0]
+def test_the_page_of_commands_lists_those_of_the_help() -> None:
+    table = (DOCS / "commands.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `pronk ([a-z]+)", table, flags=re.MULTILINE)
     assert listed == list(COMMANDS)
 
@@ -76,7 +78,7 @@ def test_the_tables_of_robots_and_formats_are_up_to_date() -> None:
 def test_every_label_of_the_checklist_has_its_place() -> None:
     text = ""
     for name in ("paper.md", "readings.md"):
-        text += (ROOT / "docs" / name).read_text(encoding="utf-8")
+        text += (DOCS / "evidence" / name).read_text(encoding="utf-8")
     labels = set(re.findall(r"\b([A-Z]\d+)\b", text))
     for letter, first, final in re.findall(r"\b([A-Z])(\d+) to [A-Z](\d+)\b", text):
         labels |= {f"{letter}{number}" for number in range(int(first), int(final) + 1)}

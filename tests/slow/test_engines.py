@@ -1,7 +1,7 @@
 """Drive laws beside the real engines of `examples/engines`, where they are installed.
 
 With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`: MJX, Newton,
-Genesis and ovphysx too (docs/simulators.md has the results).
+Genesis and ovphysx too (docs/evidence/simulators.md has the results).
 """
 
 from __future__ import annotations

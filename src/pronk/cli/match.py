@@ -252,7 +252,7 @@ def profiles() -> console.Outcome:
     )
     notes = (
         "law E: explicit; IF: implicit damping; In: implicit stiffness and damping, n iterations.",
-        "Gains of one law do not give the same joint in another; see docs/simulators.md.",
+        "Gains of one law do not give the same joint in another; see docs/evidence/simulators.md.",
     )
     console.show(Table(title="Frameworks", columns=columns, rows=tuple(rows), notes=notes))
     return console.Outcome(

@@ -1,6 +1,6 @@
 """A robot whose state is one message and whose command is one message.
 
-It needs only a `Codec` and a `Transport`; docs/hardware.md has an example.
+It needs only a `Codec` and a `Transport`; docs/evidence/hardware.md has an example.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `Limits.of` takes the ranges, drives and operating limits of a robot's file. The other groups have
 the values that were measured with the virtual Mini Cheetah: 10.02 h of walking, running and 8,665
-jumps without a false alarm (`python -m benchmarks supervision`, docs/hardware.md).
+jumps without a false alarm (`python -m benchmarks supervision`, docs/evidence/hardware.md).
 """
 
 from __future__ import annotations
