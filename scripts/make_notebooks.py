@@ -72,7 +72,6 @@ WHERE_IT_MATTERS = [
 
 The same gains are put into several simulators. Each is another joint; the gains that respond alike differ.""",
     """
-import numpy as np
 import pronk
 from pronk.identify.match.translate import stated_gains, translate
 from pronk.identify.simulators.profiles import load_profiles, profile

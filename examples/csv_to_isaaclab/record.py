@@ -1,7 +1,7 @@
 """Record `chirp.csv` and `fresh.csv` on a simulated leg that stands in for a robot.
 
-The leg is plain MuJoCo at 0.1 ms with the drive written out below. It differs from what `robot.yaml`
-states: the motors give 0.9 of the stated torque, commands arrive 6 ms late, the joints have dry
+The leg is plain MuJoCo at 0.1 ms with the drive written out below. It differs from what
+`robot.yaml` states: the motors give 0.9 of the stated torque, commands arrive 6 ms late, the joints have dry
 friction, and the encoders have 14 bits and 0.2 mrad of noise. pronk never reads this file.
 
     python record.py        # writes chirp.csv (hip, then knee) and fresh.csv, beside this file
@@ -53,7 +53,7 @@ def linear_chirp(amplitude: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def random_steps(amplitude: float, rng: np.random.Generator) -> np.ndarray:
-    """Return random positions that are held for 0.1 to 0.5 s, at the rate of the log [rad], (n,)."""
+    """Return random positions, held for 0.1 to 0.5 s, at the rate of the log [rad], (n,)."""
     signal = []
     while len(signal) < CHIRP_S * RATE_HZ:
         samples = int(rng.uniform(0.1, 0.5) * RATE_HZ)
