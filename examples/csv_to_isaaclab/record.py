@@ -2,7 +2,8 @@
 
 The leg is plain MuJoCo at 0.1 ms with the drive written out below. It differs from what
 `robot.yaml` states: the motors give 0.9 of the stated torque, commands arrive 6 ms late, the
-joints have dry friction, and the encoders have 14 bits and 0.2 mrad of noise. pronk never reads this file.
+joints have dry friction, and the encoders have 14 bits and 0.2 mrad of noise. pronk never
+reads this file.
 
     python record.py        # writes chirp.csv (hip, then knee) and fresh.csv, beside this file
 """
