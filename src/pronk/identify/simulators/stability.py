@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import mujoco
@@ -13,6 +14,9 @@ from pronk.errors import PronkError
 from pronk.identify.simulators.profiles import Profile
 from pronk.robots.model import free_spec
 from pronk.robots.robot import RobotSpec
+
+SMALLEST_STEP_S = 1e-5
+"""Smallest step of a profile [s]."""
 
 
 class JointDrives(Protocol):
@@ -87,10 +91,30 @@ def require_stable(profile: Profile, robot: RobotSpec, drives: Sequence[JointDri
     """
     share = stability_share(robot, drives)
     if share >= 1.0:
-        step = profile.timestep_s
+        stable_step = _stable_step(robot, drives)
+        if stable_step > 0.0:
+            way_out = f"take a smaller step, as {profile.name},timestep_s={stable_step:g}"
+        else:
+            way_out = (
+                f"no step down to {1000.0 * SMALLEST_STEP_S:g} ms is stable; lower the damping, "
+                "raise the armature, or take a framework whose drives are implicit"
+            )
         raise PronkError(
-            f"the gains of {robot.name} are not stable in {profile.name}: at {1000.0 * step:g} ms "
-            f"they are {share:.2f} times the limit of drive law {profile.drive_law.label}; take a "
-            f"smaller step, as {profile.name},timestep_s={step / 2.0:g}."
+            f"the gains of {robot.name} are not stable in {profile.name}: at "
+            f"{1000.0 * profile.timestep_s:g} ms they are {share:.3g} times the limit of drive law "
+            f"{profile.drive_law.label}; {way_out}."
         )
     return share
+
+
+def _stable_step(robot: RobotSpec, drives: Sequence[JointDrives]) -> float:
+    """Find the largest step, a half of the robot's, a quarter and so on, that is stable [s].
+
+    It is 0 where none is.
+    """
+    step = 0.5 * robot.timestep_s
+    while step >= SMALLEST_STEP_S:
+        if stability_share(replace(robot, timestep_s=step), drives) < 1.0:
+            return step
+        step *= 0.5
+    return 0.0
