@@ -5,12 +5,14 @@ The logs are those of `joint_mechanisms`, whose integrator shares nothing with t
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from joint_mechanisms import (
+    FAULTS,
     Mechanism,
     chirp_commands,
     draw_mechanism,
@@ -68,3 +70,27 @@ def test_their_true_gains_are_in_the_total_interval(
         inside += low <= damping <= high
         assert high < 1.5 * low
     assert inside >= 0.9 * 2 * len(honest)
+
+
+def test_a_wrong_torque_limit_is_named_first_and_gives_no_wrong_gains(tmp_path: Path) -> None:
+    mechanisms = drawn(5, ("saturation, limit wrong",) * 3)
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        first = gains.flags[0]
+        assert first.startswith("effort limit:")
+        assert not any("So would look" in flag for flag in gains.flags)
+        stiffness, _ = equivalent_gains(mechanism)
+        low, high = gains.stiffness.total95
+        assert low <= stiffness <= high
+        # The limit and the recommended amplitude are in the sentence.
+        numbers = [float(word) for word in re.findall(r"\d+\.?\d*(?:e[-+]\d+)?", first)]
+        assert any(abs(number / mechanism.true_limit - 1.0) < 0.1 for number in numbers)
+        fitting = 0.9 * mechanism.true_limit / stiffness
+        assert any(abs(number / fitting - 1.0) < 0.15 for number in numbers)
+
+
+def test_no_other_mechanism_is_taken_for_a_torque_limit(tmp_path: Path) -> None:
+    faults = tuple(fault for fault in FAULTS[4:] if fault != "speed limit")
+    mechanisms = drawn(2, faults)
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        limited = [flag for flag in gains.flags if flag.startswith("effort limit")]
+        assert limited == [], mechanism

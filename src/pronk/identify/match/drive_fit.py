@@ -167,7 +167,11 @@ def nominal_drives(
     for joint in joints:
         log = next(log for log in logs if joint in log.joints)
         stiffness, damping = gains_on_drive(log, joint, robot)
-        drives[joint] = published(robot, joint) | {"stiffness": stiffness, "damping": damping}
+        drives[joint] = published(robot, joint) | {
+            "stiffness": stiffness,
+            "damping": damping,
+            "effort_limit": robot.joint(joint).drive.effort_limit,
+        }
     return drives
 
 

@@ -10,7 +10,12 @@ from typing import Literal, get_args
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.match.checks import check_excitations, check_explained_motion, check_response
+from pronk.identify.match.checks import (
+    EFFORT_LIMIT,
+    check_excitations,
+    check_explained_motion,
+    check_response,
+)
 from pronk.identify.match.compared import (
     COHERENCE_MIN,
     ComparedResponses,
@@ -52,6 +57,7 @@ from pronk.identify.match.result import (
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
+from pronk.identify.match.torque_limit import fit_torque_limit
 from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.response.estimate import resolution_note
 from pronk.identify.response.response import ShortExcitationError
@@ -69,6 +75,10 @@ Mode = Literal["gains", "drive"]
 NO_MATCH_DB = 1.0
 """Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
 of a good log stays below."""
+LEFT_OUT = 0.25
+"""Share of the frequencies of the band left out for low coherence that is worth a flag: the lowest
+ones of a chirp of 20 s and those above three times the resonance are incoherent on good logs too.
+`MatchQuality.coherence_min` has the lowest coherence."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 
@@ -167,13 +177,19 @@ def match(
             if method == "paper":
                 fits[name] = fit_magnitude(rigs, responses, grids[name])
             else:
-                joint_fits = fit_drives(
-                    JointReplay(rigs, excitations_of(sources[name], name)),
+                excitations = excitations_of(sources[name], name)
+                replay = JointReplay(rigs, excitations)
+                fit = fit_drives(
+                    replay,
                     parameters=parameters,
                     nominal={name: nominal[name]},
                     unidentified="refuse" if mode == "drive" else "flag",
-                )
-                fits[name] = with_step_uncertainty(joint_fits[name], rigs.robot)
+                )[name]
+                if rigs.sets_effort_limit:
+                    fit = fit_torque_limit(
+                        replay, excitations, rigs.robot, fit, parameters, nominal[name]
+                    )
+                fits[name] = with_step_uncertainty(fit, rigs.robot)
             progress("fit", len(fits) / len(measured))
 
         joints: dict[str, JointResult] = {}
@@ -200,7 +216,7 @@ def match(
                 zero_armature = search_without_armature(
                     rigs, target, compared.error_db, no_match_db(target)
                 )
-            flags = (*response_flags(target, compared, robot), *excitation_flags[name])
+            flags = joint_flags(fit, target, compared, excitation_flags[name])
             joints[name] = JointResult(
                 joint=name,
                 gains=joint_gains(fit, robot, compared, flags),
@@ -416,16 +432,42 @@ def no_match_db(target: MeasuredJoint) -> float:
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * target.measurement_error_db())
 
 
-def response_flags(
-    target: MeasuredJoint, compared: ComparedResponses, robot: RobotSpec
+def joint_flags(
+    fit: DriveFit,
+    target: MeasuredJoint,
+    compared: ComparedResponses,
+    excitation_flags: Sequence[str],
 ) -> list[str]:
-    """Warn of a simulated response that is not the measured one, and of what was left out."""
-    flags = list(
-        check_response(target.measured, compared.matched, target.fit_mask, no_match_db(target))
-    )
+    """Return what warns of a joint beside its fit: the torque limit first, then its response.
+
+    Args:
+        fit: Fit of the joint, whose flags may say that the torque was limited.
+        target: Measured response.
+        compared: Measured and simulated response.
+        excitation_flags: Flags of its excitations.
+    """
+    limit_is_named = any(flag.startswith(EFFORT_LIMIT) for flag in fit.flags)
+    limit_flags = []
+    other_flags = []
+    for flag in excitation_flags:
+        if not flag.startswith(EFFORT_LIMIT):
+            other_flags.append(flag)
+        elif not limit_is_named:
+            limit_flags.append(flag)
+    flags = [
+        *limit_flags,
+        *check_response(
+            target.measured,
+            compared.matched,
+            target.fit_mask,
+            no_match_db(target),
+            cause_is_named=limit_is_named or bool(limit_flags),
+        ),
+        *other_flags,
+    ]
     excited_count = int(target.excited_mask.sum())
     incoherent_count = excited_count - int(target.fit_mask.sum())
-    if incoherent_count > 0:
+    if incoherent_count > LEFT_OUT * excited_count:
         flags.append(
             f"{incoherent_count} of {excited_count} frequencies left out for low coherence"
         )

@@ -489,9 +489,12 @@ def simulated_response(
     Returns:
         Response at all frequencies of the measured one, shape (f,); NaN where it diverged.
     """
+    names = set(rigs.parameters)
+    if rigs.sets_effort_limit:
+        names.add("effort_limit")
     settable = {}
     for name, value in values.items():
-        if name in rigs.parameters and name != "delay":
+        if name in names and name != "delay":
             settable[name] = np.array([value])
     response = np.full(len(target.measured.omega), np.nan, dtype=np.complex128)
     for _, position in rigs.run([target.trace], settable, len(target.trace.command)):

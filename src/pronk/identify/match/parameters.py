@@ -98,6 +98,15 @@ PARAMETERS: Mapping[str, Parameter] = {
         log=False,
         may_vanish=True,
     ),
+    "effort_limit": Parameter(
+        unit="N m",
+        # `search_range` gives the bounds, by the torque scale.
+        low=1e-3,
+        high=100.0,
+        start=1e-3,
+        step=0.02,
+        remedy="a larger amplitude, at which the drive is at its torque limit, gives the limit",
+    ),
     "delay": Parameter(
         unit="s",
         # Below zero where the log has the command later than the drive had it.
@@ -158,6 +167,8 @@ def search_range(name: str, nominal: float, torque_scale: float) -> SearchRange:
             high=max(parameter.high, torque_scale),
             start=parameter.start * torque_scale,
         )
+    if name == "effort_limit":
+        return SearchRange(low=1e-3 * torque_scale, high=10.0 * torque_scale, start=0.0)
     if parameter.log and nominal > 0.0:
         low = min(parameter.low, nominal / WIDEST_FACTOR)
         return SearchRange(

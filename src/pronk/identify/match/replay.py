@@ -94,6 +94,8 @@ class JointReplay(Replay):
         for name, parameter in PARAMETERS.items():
             if parameter.acts_on == "drive" and name in rigs.parameters:
                 self._names.append(name)
+        if rigs.sets_effort_limit:
+            self._names.append("effort_limit")
         self._tracks: dict[tuple[float, ...], list[PPoly]] = {}
 
     def fittable(self, joint: str, parameters: Sequence[str]) -> tuple[str, ...]:

@@ -145,6 +145,8 @@ class Chain(Closing):
         stiffness = values.get("stiffness", joint.stiffness)
         damping = values.get("damping", joint.damping)
         set_drive_gains(model, name, joint.drive, stiffness, damping, self.robot.law)
+        limit = values.get("effort_limit", joint.drive.effort_limit)
+        model.actuator_forcerange[self.model.actuator(name).id] = (-limit, limit)
         # The constants that MuJoCo derives are computed anew only where a value changes.
         dof = self.joints.index(name)
         armature = values.get("armature", float(self.model.dof_armature[dof]))
@@ -281,6 +283,7 @@ class MujocoSimulator(JointRigs):
         self.info = mujoco_info(robot)
         self.joints = robot.joint_names
         self.parameters = frozenset(SETTABLE_PARAMETERS)
+        self.sets_effort_limit = True
         self._threads = threads
         self._rigs: dict[str, JointTestRig] = {}
 

@@ -82,6 +82,8 @@ class JointRigs(Closing, ABC):
     """The engine and its settings."""
     parameters: frozenset[str]
     """Which of `SETTABLE_PARAMETERS` can be set."""
+    sets_effort_limit: bool = False
+    """True if the torque limit of a drive, `effort_limit` [N m], can be set too."""
     steps: int = 0
     """Physics steps done so far."""
 
