@@ -79,6 +79,10 @@ LEFT_OUT = 0.25
 """Share of the frequencies of the band left out for low coherence that is worth a flag: the lowest
 ones of a chirp of 20 s and those above three times the resonance are incoherent on good logs too.
 `MatchQuality.coherence_min` has the lowest coherence."""
+LIMITED_FACTOR = 3.0
+"""What the step leaves open of gains that were fitted with the torque limit, over what it leaves
+open of others: a limited joint shows its gains between two limits alone. Measured on 12 joints of
+`tests/joint_mechanisms.py` (saturation, limit wrong, seed 5)."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 
@@ -233,6 +237,8 @@ def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
     """Widen the total intervals of the gains by what the simulator's step leaves open."""
     inertia, _ = bench_inertia(robot, robot.joint(fit.joint).original[0])
     step_share = fit.values["damping"] * robot.timestep_s / (2.0 * inertia)
+    if "effort_limit" in fit.sd:
+        step_share *= LIMITED_FACTOR
     return replace(fit, total95=widen_by_step(fit.total95, fit.values, step_share))
 
 
@@ -404,7 +410,7 @@ def match_chains(
 
 
 def compared_flags(compared: ComparedResponses) -> tuple[str, ...]:
-    """Check the response of a joint that moved together with others, as `response_flags` does."""
+    """Check the response of a joint that moved together with others, as `joint_flags` does."""
     measured = compared.measured[0]
     used = measured.band(*compared.band_hz, COHERENCE_MIN)
     relative = measured.relative_error(0.95)[used]
