@@ -443,7 +443,7 @@ def joint_flags(
     target: MeasuredJoint,
     compared: ComparedResponses,
     excitation_flags: Sequence[str],
-) -> list[str]:
+) -> tuple[str, ...]:
     """Return what warns of a joint beside its fit: the torque limit first, then its response.
 
     Args:
@@ -478,7 +478,7 @@ def joint_flags(
             f"{incoherent_count} of {excited_count} frequencies left out for low coherence"
         )
     flags.extend(target.warnings)
-    return flags
+    return tuple(flags)
 
 
 def match_by_torque(

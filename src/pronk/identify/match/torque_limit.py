@@ -80,7 +80,8 @@ def drive_torques(
     asked = []
     for excitation in excitations:
         time = excitation.time
-        grid, step = np.linspace(time[0], time[-1], len(time), retstep=True)
+        grid = np.linspace(float(time[0]), float(time[-1]), len(time))
+        step = (time[-1] - time[0]) / (len(time) - 1)
         position = np.interp(grid, time, excitation.position)
         # Without the line between its ends the position has no jump where a period would end.
         line = np.linspace(position[0], position[-1], len(position))
