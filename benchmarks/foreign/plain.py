@@ -73,7 +73,7 @@ def spec_of(path: Path) -> mujoco.MjSpec:
     """Read a model; a URDF that MuJoCo refuses is read without visuals, collisions, materials.
 
     Raises:
-        ValueError: MuJoCo refuses it.
+        ValueError: MuJoCo refuses that too.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -87,6 +87,7 @@ def spec_of(path: Path) -> mujoco.MjSpec:
                 if child.tag in ("visual", "collision", "material", "gazebo", "transmission"):
                     parent.remove(child)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.copy().compile()
     return spec
 
 
@@ -173,7 +174,7 @@ def _mjcf_numbers(path: Path) -> dict[str, Numbers]:
 
 
 def peaks(
-    path: Path,
+    spec: mujoco.MjSpec,
     joint: str,
     chain: Mapping[str, Held],
     pose: Mapping[str, float],
@@ -187,7 +188,7 @@ def peaks(
     no equality constraints.
 
     Args:
-        path: The model.
+        spec: The model; it is changed.
         joint: Name of the excited joint.
         chain: Drives of the joints that move with it, and its own, by name.
         pose: Default position of each joint [rad]; joints that it lacks are at their reference.
@@ -198,7 +199,6 @@ def peaks(
     Raises:
         ValueError: MuJoCo refuses the model.
     """
-    spec = spec_of(path)
     spec.compiler.fusestatic = False
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -221,6 +221,9 @@ def peaks(
         )
         actuator.set_to_position(kp=held.stiffness, kv=held.damping)
         actuator.forcerange = [-held.effort_limit, held.effort_limit]
+        # The model's defaults may have other ranges, gears and dynamics.
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     model = spec.compile()
     data = mujoco.MjData(model)

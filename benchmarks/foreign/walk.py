@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.foreign.plain import Held, Numbers, differences, numbers_of, peaks
+from benchmarks.foreign.plain import Held, Numbers, differences, numbers_of, peaks, spec_of
 from benchmarks.foreign.population import Candidate, copy_model
 from pronk.errors import PronkError
 from pronk.identify.excitation.plan import make_plan
@@ -164,9 +164,16 @@ def compare_peaks(robot_file: Path, model: Path, joint: str, sweep: Path, row: R
     planned = figures["plan"][0]
     plan = make_plan(robot, [joint], amplitudes=(planned["amplitude_rad"],), repeats=1)
     offsets = plan.excitations[0].offsets(plan.rate_hz)
+    imported = False
+    try:
+        spec = spec_of(model)
+    except ValueError:
+        # MuJoCo refuses the file; pronk has mended it.
+        spec = robot.build_spec()
+        imported = True
     try:
         simulated = peaks(
-            model,
+            spec,
             joint,
             drives_of(robot, joint),
             {other.name: other.default_position for other in robot.joints},
@@ -181,6 +188,7 @@ def compare_peaks(robot_file: Path, model: Path, joint: str, sweep: Path, row: R
     planned_reach = max(planned["nominal_highest_rad"] - pose, pose - planned["nominal_lowest_rad"])
     simulated_reach = max(simulated.highest - pose, pose - simulated.lowest)
     row["peaks"] = {
+        "imported": imported,
         "amplitude": planned["amplitude_rad"],
         "torque": [planned["nominal_torque_nm"], simulated.torque],
         "speed": [planned["nominal_speed_rad_s"], simulated.speed],
