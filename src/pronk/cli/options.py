@@ -14,6 +14,7 @@ from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.identify.logs.joint_log import JointLog
+    from pronk.identify.logs.options import ReadOptions
     from pronk.robots.robot import RobotSpec
 
 Value = TypeVar("Value")
@@ -24,16 +25,16 @@ class Reading:
     """How logs are read."""
 
     unit: str | None = None
-    """Unit of all angles, rad or deg; required for CSV."""
+    """Unit of all angles, rad or deg; required for CSV, if chirp.log.yaml does not say it."""
     time_unit: str | None = None
     """Unit of the timestamps: s, ms, us or ns."""
     columns: tuple[str, ...] = ()
     """CSV: OURS=THEIRS, as in position.FR_knee=q3; a name or a number from 0; with commas between
     several, or repeat it. Three columns without names are time, command, position of one joint."""
     joint_names: tuple[str, ...] = ()
-    """THEIRS=OURS for joints of other names; repeat it."""
+    """THEIRS=OURS for joints of other names; with commas between several, or repeat it."""
     joint_order: str | None = None
-    """NAME,NAME,... of columns without joint names (PACE); default for the robot's order."""
+    """NAME,NAME,... of columns or messages without joint names; default for the robot's order."""
     drop_duplicates: bool = False
     """Drop rows that repeat the one before in full."""
     scale: tuple[str, ...] = ()
@@ -41,22 +42,21 @@ class Reading:
     rate_hz: float | None = None
     """Rate that the log is expected to have; another one is an error."""
     log_format: Annotated[str | None, tyro.conf.arg(name="format")] = None
-    """mcap, csv, sage, pace, npz or a plugin's; from the name if left out."""
+    """mcap, rosbag, csv, sage, pace, npz or a plugin's; from the name if left out."""
     measured_topic: str | None = None
-    """rosbag2: topic of the measured JointState; /joint_states if left out."""
+    """Bags: topic of the measured states; guessed by its type if left out."""
     command_topic: str | None = None
-    """rosbag2: topic of the commands."""
+    """Bags: topic of the commands; guessed by its type if left out."""
     command_field: str | None = None
-    """rosbag2: field of the positions in a command message, as in points.0.positions."""
+    """Bags: field of the positions in a command message, as in points.0.positions."""
     reader_options: Annotated[tuple[str, ...], tyro.conf.arg(name="reader-option")] = ()
     """NAME=VALUE for a reader of another package; repeat it."""
 
-    def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
-        """Read every log that some paths stand for, on all cores."""
+    def options(self) -> ReadOptions:
+        """Return the options as the readers take them."""
         from pronk.identify.logs.options import ReadOptions
-        from pronk.identify.logs.readers import read_logs
 
-        options = ReadOptions(
+        return ReadOptions(
             format=self.log_format,
             rate_hz=self.rate_hz,
             unit=self.unit,
@@ -71,7 +71,13 @@ class Reading:
             command_field=self.command_field,
             reader_options=named_values("--reader-option", self.reader_options, str),
         )
-        return read_logs(paths, robot=robot, options=options, processes=os.cpu_count() or 1)
+
+    def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
+        """Read every log that some paths stand for, on all cores."""
+        from pronk.identify.logs.readers import read_logs
+
+        processes = os.cpu_count() or 1
+        return read_logs(paths, robot=robot, options=self.options(), processes=processes)
 
 
 def _columns(entries: Sequence[str]) -> Mapping[str, str] | Sequence[str]:

@@ -22,6 +22,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError, printable
 from pronk.files import sha256
 from pronk.identify.logs.bag import MessageDecoder, bag_files, message_type, read_bag
+from pronk.identify.logs.checks import position_follows
 from pronk.identify.logs.columns import (
     Columns,
     command_index,
@@ -31,7 +32,7 @@ from pronk.identify.logs.columns import (
 )
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record
-from pronk.identify.logs.options import ReadOptions
+from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
 from pronk.identify.logs.segmentation import MOVED_RAD
 from pronk.identify.logs.unitree import COMMAND_TYPES, STATE_TYPES, motor_joints
 from pronk.robots.robot import RobotSpec
@@ -66,13 +67,6 @@ _CONSTANT_SHARE = 0.5
 """Share of the travel of a command that has to lie where the gains do not change."""
 _FEED_FORWARD = 1e-3
 """Range of the target speed [rad/s] or the added torque [N m] below which it is constant."""
-
-_LAGS_S = (0.0, 0.02, 0.04, 0.08, 0.15, 0.3)
-"""Delays of a position behind its command that are tried where a topic is guessed [s]."""
-_LEAST_CORRELATION = 0.5
-"""Least correlation of a guessed command, delayed, with the position."""
-_TRAVEL_RATIOS = (0.2, 5.0)
-"""Travel of a position over that of its guessed command."""
 
 
 @dataclass(frozen=True)
@@ -245,10 +239,11 @@ def _choose_topics(path: Path, records: Sequence[Record], options: ReadOptions) 
     if measured is None:
         measured = _guess_measured(types, options.command_topic)
         if not measured:
-            raise LogError(
-                f"{path}: no topic, or several, that could hold measured states; it holds "
+            raise NeedsOptionsError(
+                path,
+                "no topic, or several, that could hold measured states; it holds "
                 f"{listed}; name one with --measured-topic (types that are read: "
-                f"{', '.join(MEASURED_TYPES)})."
+                f"{', '.join(MEASURED_TYPES)})",
             )
         notes.append(f"states are read from {measured} ({types[measured]})")
     if types.get(measured) not in MEASURED_TYPES:
@@ -260,10 +255,11 @@ def _choose_topics(path: Path, records: Sequence[Record], options: ReadOptions) 
     if command is None:
         command = _guess_command(types, measured)
         if not command:
-            raise LogError(
-                f"{path}: --command-topic is missing, as no topic, or several, could hold the "
+            raise NeedsOptionsError(
+                path,
+                "--command-topic is missing, as no topic, or several, could hold the "
                 f"commands to {measured}; it holds {listed}; name the topic of the commands (and "
-                "--command-field where the positions are in a field of another name)."
+                "--command-field where the positions are in a field of another name)",
             )
         notes.append(f"commands are read from {command} ({types[command]})")
     is_both = types[measured] in CONTROLLER_STATES
@@ -792,28 +788,16 @@ def _check_guess(path: Path, topic: str, columns: Columns) -> None:
     The topic of a forward command controller holds positions, velocities or torques alike.
     """
     assert columns.command is not None
-    time = columns.time
     for column, joint in enumerate(columns.joints):
         command = columns.command[:, column]
         position = columns.position[:, column]
-        travel = float(np.ptp(command))
-        moved = float(np.ptp(position))
-        if travel <= MOVED_RAD or moved == 0.0:
-            continue
-        offset = abs(float(np.median(command) - np.median(position)))
-        correlations = []
-        for lag in _LAGS_S:
-            delayed = np.interp(time - lag, time, command)
-            if np.ptp(delayed) > 0.0:
-                correlations.append(float(np.corrcoef(delayed, position)[0, 1]))
-        low, high = _TRAVEL_RATIOS
-        alike = max(correlations, default=0.0) > _LEAST_CORRELATION
-        if offset > 0.5 * max(travel, moved) or not low < moved / travel < high or not alike:
+        if np.ptp(command) > MOVED_RAD and not position_follows(columns.time, command, position):
             raise LogError(
                 f"{path}: the numbers on {topic} were taken for positions and may be torques or "
-                f"velocities: for {joint} they travel {travel:.3g} about {np.median(command):.3g} "
-                f"and its position {moved:.3g} about {np.median(position):.3g}; if they are "
-                f"positions, say so with --command-topic {topic}."
+                f"velocities: for {joint} they travel {np.ptp(command):.3g} about "
+                f"{np.median(command):.3g} and its position {np.ptp(position):.3g} about "
+                f"{np.median(position):.3g}; if they are positions, say so with --command-topic "
+                f"{topic}."
             )
 
 

@@ -43,6 +43,13 @@ _LONGEST_TURN_S = 0.1
 _SATURATED = 0.05
 """Share of the time at an end that makes a joint saturated."""
 
+_LAGS_S = (0.0, 0.02, 0.04, 0.08, 0.15, 0.3)
+"""Delays of a position behind its command that are tried where a command is guessed [s]."""
+_LEAST_CORRELATION = 0.5
+"""Least correlation of a guessed command, delayed, with the position."""
+_TRAVEL_RATIOS = (0.2, 5.0)
+"""Travel of a position over that of its guessed command."""
+
 CORRELATION_LIMIT = 0.1
 """Highest absolute correlation of two simultaneous commands that passes without a warning."""
 _LONGEST_LAG_S = 0.5
@@ -169,6 +176,32 @@ def check_motion(excitation: Excitation) -> None:
             f"{commanded:.3g} {unit}, its position {travel:.3g}; check that its drive was enabled, "
             "the joint free, and the columns named right."
         )
+
+
+def position_follows(time: Array, command: Array, position: Array) -> bool:
+    """Return True if a position moves as if some numbers were the commands to it.
+
+    Numbers that do not move are accepted. Torques and speeds differ from the position in size, in
+    their middle, or in phase.
+
+    Args:
+        time: Timestamps [s], shape (n,).
+        command: The numbers, shape (n,).
+        position: Position in the same unit, shape (n,).
+    """
+    travel = float(np.ptp(command))
+    moved = float(np.ptp(position))
+    if travel == 0.0:
+        return True
+    low, high = _TRAVEL_RATIOS
+    offset = abs(float(np.median(command) - np.median(position)))
+    if not low < moved / travel < high or offset > 0.5 * max(travel, moved):
+        return False
+    for lag in _LAGS_S:
+        delayed = np.interp(time - lag, time, command)
+        if np.ptp(delayed) > 0.0 and np.corrcoef(delayed, position)[0, 1] > _LEAST_CORRELATION:
+            return True
+    return False
 
 
 def saturation_note(log: JointLog, joint: str) -> str:

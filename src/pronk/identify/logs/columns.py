@@ -12,7 +12,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.checks import check_unit, correlation_note
 from pronk.identify.logs.joint_log import JointLog, LogOrigin, check_increasing
-from pronk.identify.logs.options import ANGLE_UNITS, TIME_UNITS, ReadOptions
+from pronk.identify.logs.options import ANGLE_UNITS, TIME_UNITS, NeedsOptionsError, ReadOptions
 from pronk.names import check_names
 from pronk.robots.robot import RobotSpec
 
@@ -72,9 +72,10 @@ def import_columns(columns: Columns, robot: RobotSpec | None, options: ReadOptio
     unit = options.unit or columns.unit
     time_unit = options.time_unit or columns.time_unit
     if unit is None:
-        raise LogError(
-            f"{source}: the file does not say whether its angles are radians or degrees; give "
-            "--unit rad or --unit deg."
+        raise NeedsOptionsError(
+            source,
+            "the file does not say whether its angles are radians or degrees; give --unit rad or "
+            "--unit deg",
         )
     if columns.command is None and columns.torque is None:
         raise LogError(
@@ -223,9 +224,11 @@ def ordered_joints(
         default = "default with --robot"
         if robot_joints:
             default = f"default if that is {','.join(robot_joints)}"
-        raise LogError(
-            f"{values} have no joint names; give --joint-order NAME,NAME,... in the file's order, "
-            f"or --joint-order {default}."
+        path, _, words = values.partition(": ")
+        raise NeedsOptionsError(
+            path,
+            f"{words} have no joint names; give --joint-order NAME,NAME,... in the file's order, "
+            f"or --joint-order {default}",
         )
     if stated and names and stated != tuple(names):
         raise LogError(

@@ -16,7 +16,7 @@ from pronk.files import check_archive, check_size, sha256
 from pronk.identify.logs.columns import Columns, import_columns
 from pronk.identify.logs.csv_table import MAX_COLUMNS, CsvTable, read_table, read_text
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
-from pronk.identify.logs.options import ReadOptions
+from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
 from pronk.robots.robot import RobotSpec
 
 QUANTITIES = ("command", "position", "velocity", "torque")
@@ -88,10 +88,10 @@ def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
         example = ",".join(
             f"{name}={k if not table.header else 'NAME'}" for k, name in enumerate(missing)
         )
-        raise LogError(
-            f"{path}: no column called {', '.join(missing)}; {table.names}; say which they are "
-            f"with --columns {example} (a name, or the number of a column from 0), or "
-            f"`pronk log inspect {path}` guesses them."
+        raise NeedsOptionsError(
+            path,
+            f"no column called {', '.join(missing)}; {table.names}; say which they are with "
+            f"--columns {example} (a name, or the number of a column from 0)",
         )
     indices: dict[str, int] = {}
     absent = []
@@ -102,10 +102,10 @@ def read_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Joint
         else:
             indices[name] = index
     if absent:
-        raise LogError(
-            f"{path}: no column called {', '.join(absent)}; {table.names}, and the columns have "
-            f"the numbers 0 to {table.width - 1}; `pronk log inspect {path}` guesses which is "
-            "which."
+        raise NeedsOptionsError(
+            path,
+            f"no column called {', '.join(absent)}; {table.names}, and the columns have the "
+            f"numbers 0 to {table.width - 1}",
         )
     arrays: dict[str, Array] = {}
     for quantity in QUANTITIES:

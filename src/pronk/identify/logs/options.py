@@ -24,6 +24,19 @@ COLUMN_OPTIONS = (
 """Options of every format that is a table of columns."""
 
 
+class NeedsOptionsError(LogError):
+    """A log that cannot be read without options; `question` says which, without the path."""
+
+    def __init__(self, path: object, question: str) -> None:
+        super().__init__(f"{path}: {question}.")
+        self.path = str(path)
+        self.question = question
+
+    def __reduce__(self) -> tuple[type[NeedsOptionsError], tuple[str, str]]:
+        """Build the error again in another process."""
+        return NeedsOptionsError, (self.path, self.question)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
     """How a log is read; an option that its format does not have is refused."""
@@ -50,12 +63,12 @@ class ReadOptions:
     """The CSV file's own column names, or numbers from 0, by those of pronk, as in
     `{"position.FR_knee": "q3"}`; or those of time, command and position of a single joint."""
     measured_topic: str | None = None
-    """Topic of the measured JointStates in a rosbag2; `/joint_states` if None."""
+    """Topic of the measured states in a bag; guessed by its type if None."""
     command_topic: str | None = None
-    """Topic of the commands in a rosbag2, which does not say which one it is."""
+    """Topic of the commands in a bag; guessed by its type if None."""
     command_field: str | None = None
     """Field of the positions in a command message, as in `points.0.positions` (dots between names,
-    numbers for indices); `position` if None."""
+    numbers for indices); that of the type if None."""
     reader_options: Mapping[str, str] = field(default_factory=dict)
     """Options of a reader from another package, as text by name."""
 

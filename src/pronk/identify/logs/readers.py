@@ -9,6 +9,8 @@ from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import numpy as np
+
 from pronk.errors import LogError, PronkError, RobotError
 from pronk.files import check_regular
 from pronk.identify.logs.bag import METADATA
@@ -21,11 +23,17 @@ from pronk.identify.logs.checks import (
     saturation_note,
 )
 from pronk.identify.logs.csv_npz_reader import read_csv, read_npz
+from pronk.identify.logs.description import (
+    description_path,
+    read_description,
+    with_description,
+)
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap_reader import read_mcap
-from pronk.identify.logs.options import COLUMN_OPTIONS, ReadOptions
+from pronk.identify.logs.options import COLUMN_OPTIONS, NeedsOptionsError, ReadOptions
 from pronk.identify.logs.pace_reader import read_pace
 from pronk.identify.logs.sage_reader import is_sage, read_sage
+from pronk.identify.logs.segmentation import MOVED_RAD
 from pronk.plugins import load_entry_point
 from pronk.processes import in_processes
 from pronk.robots.robot import RobotSpec
@@ -109,9 +117,13 @@ def readers() -> dict[str, Reader]:
 
 
 def read_log(
-    path: Path | str, *, robot: RobotSpec | None = None, options: ReadOptions | None = None
+    path: Path | str,
+    *,
+    robot: RobotSpec | None = None,
+    options: ReadOptions | None = None,
+    described: bool = True,
 ) -> JointLog:
-    """Read a log: MCAP (pronk's or rosbag2), CSV, SAGE folder, PACE `.pt`, NPZ, or a plug-in's.
+    """Read a log: MCAP, a bag of ROS, CSV, SAGE folder, PACE `.pt`, NPZ, or a plug-in's.
 
     The log has its excitations, found in the commands where the file does not name them, and the
     remarks of its checks in `notes`.
@@ -123,7 +135,9 @@ def read_log(
     Args:
         path: File or folder.
         robot: The robot, to check the joint names against.
-        options: Format, units and names, where the file does not tell them; see `ReadOptions`.
+        options: Format, units and names, where the file does not tell them; see `ReadOptions`. They
+            take precedence over those in the description beside the log, as in `chirp.log.yaml`.
+        described: False to leave that description out.
 
     Returns:
         The log, in seconds and radians.
@@ -135,6 +149,8 @@ def read_log(
     path = Path(path)
     check_regular(path, LogError)
     stated = ReadOptions() if options is None else options
+    description = read_description(path) if described else None
+    stated = with_description(stated, description)
     by_format = readers()
     format_name = stated.format or _format_of(path, by_format)
     if format_name not in by_format:
@@ -150,7 +166,15 @@ def read_log(
         log = reader.read(path, robot, stated)
         if not isinstance(log, JointLog):
             raise LogError(f"{path}: the reader {format_name} returned {type(log).__name__}.")
-        notes = _examine(path, log, robot, stated.rate_hz)
+        notes: list[str] = []
+        if robot is not None:
+            log = _without_held_joints(path, log, robot)
+        notes += _examine(path, log, robot, stated.rate_hz)
+    except NeedsOptionsError as error:
+        question = " ".join(error.question.split())
+        if described:
+            question += f"; `pronk log inspect {path}` guesses what it can and writes it down"
+        raise NeedsOptionsError(path, question) from None
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__
@@ -158,7 +182,43 @@ def read_log(
         # Parsers fail in many ways on a damaged file.
         reason = f"{type(error).__name__} {' '.join(str(error).split())[:120]}".rstrip()
         raise LogError(f"{path}: not readable as {format_name} ({reason}).") from error
+    if description is not None:
+        notes.append(f"read as {description_path(path).name} says")
     return replace(log, notes=(*log.notes, *notes)).segmented()
+
+
+def _without_held_joints(path: Path, log: JointLog, robot: RobotSpec) -> JointLog:
+    """Leave out joints that are held in the robot's model, such as a gripper's slides.
+
+    Raises:
+        LogError: The command of such a joint moves.
+    """
+    kept = [column for column, name in enumerate(log.joints) if name not in robot.held_joints]
+    held = [name for name in log.joints if name in robot.held_joints]
+    if not held:
+        return log
+    for name in held:
+        if np.ptp(log.command[:, log.column(name)]) > MOVED_RAD:
+            raise LogError(
+                f"{path}: the command of {name} moves, a joint that is held in {robot.name}; "
+                "record with it at rest, or leave its columns out."
+            )
+    if not kept:
+        raise LogError(f"{path}: no joint but those that are held in {robot.name}.")
+    columns = np.array(kept)
+    return replace(
+        log,
+        joints=tuple(log.joints[column] for column in kept),
+        command=log.command[:, columns],
+        position=log.position[:, columns],
+        velocity=None if log.velocity is None else log.velocity[:, columns],
+        torque=None if log.torque is None else log.torque[:, columns],
+        stiffness=None if log.stiffness is None else log.stiffness[columns],
+        damping=None if log.damping is None else log.damping[columns],
+        pose=None if log.pose is None else log.pose[columns],
+        units=None if log.units is None else tuple(log.units[column] for column in kept),
+        notes=(*log.notes, f"{', '.join(held)} are held in {robot.name} and left out"),
+    )
 
 
 def _examine(
@@ -277,6 +337,16 @@ def _format_of(path: Path, by_format: Mapping[str, Reader]) -> str:
             f"{', '.join(formats)} or a SAGE folder, or a format, one of {', '.join(by_format)}."
         )
     return formats[suffix]
+
+
+def format_of(path: Path) -> str:
+    """Return the format of a log by its name, or by the content of a folder.
+
+    Raises:
+        LogError: There is no such file, or its name says no format; the message lists them.
+    """
+    check_regular(path, LogError)
+    return _format_of(path, readers())
 
 
 def _ending(path: Path) -> str:
