@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from command_line import accepted, invoke, refused
+from pronk.deploy.runtime.limits import Limits
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.robots.bare import describe_model, yaml_of_model
@@ -542,3 +543,23 @@ def test_a_model_that_cannot_be_is_refused(text: str, tmp_path: Path) -> None:
     path.write_text(text)
     refused("robot", "new", path)
     assert [file.name for file in tmp_path.iterdir()] == ["robot.xml"]
+
+
+def test_limits_that_are_not_stated_leave_room_for_the_gains_and_the_smallest_range(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "big.xml"
+    actuators = '<position joint="j" kp="900" kv="60" forcerange="-500 500"/>'
+    text = ACTUATED.format(actuators=actuators, joint="", tendon="")
+    path.write_text(text.replace('range="-1 1"', 'range="-0.03 0.04"'))
+    robot = load_robot(path)
+    limits = Limits.of(robot)
+    joint = robot.joint("j")
+    assert (limits.gains > [joint.stiffness, joint.damping]).all()
+    assert 2.0 * limits.operating.margin < 0.07
+    assert limits.operating.power_w >= 500.0 * joint.drive.no_load_speed
+    accepted("robot", "new", path)
+    file = tmp_path / "robot.yaml"
+    file.write_text(file.read_text() + "limits: {stiffness: 950.0, margin: 0.01}\n")
+    stated = load_robot(file).limits
+    assert (stated.stiffness, stated.margin) == (950.0, 0.01)

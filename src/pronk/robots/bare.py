@@ -27,7 +27,9 @@ NATURAL_HZ = 3.0
 freely, so that the joint holds its pose."""
 DAMPING_RATIO = 0.7
 """Damping ratio of such a joint: the step response overshoots by 5 %."""
-SWING = 0.2
+SAG = 0.05
+"""Largest angle by which gravity moves a joint under assumed gains from its command [rad]."""
+SWING = 0.1
 """Angle at which assumed gains ask for all the torque that gravity leaves of the effort limit
 [rad]."""
 NO_LOAD_SPEED = 30.0
@@ -86,7 +88,8 @@ def describe_model(path: Path) -> ModelDescription:
     """Describe a bare model: each hinge that something drives is a group of its own.
 
     Gains are those of the model's position servos. Joints without one get gains that give a natural
-    frequency of 3 Hz and a damping ratio of 0.7 in the default pose. Effort limits are those of
+    frequency of 3 Hz and a damping ratio of 0.7 in the default pose, or stiffer ones where the
+    joint is damped or gravity pulls at it, within its effort limit. Effort limits are those of
     actuators or joints, else twice the torque of gravity and of 0.5 rad of stiffness. The default
     pose is the keyframe `home` or the first one, else zero, moved away from the stops. Slides, ball
     joints, joints that follow another one, and hinges without an actuator in a model with
@@ -283,16 +286,20 @@ def _joint_entries(
             remarks["damping"] = shared
     else:
         natural = 2.0 * math.pi * NATURAL_HZ
-        stiffness = inertia * natural**2
-        rule = f"assumed, {NATURAL_HZ:g} Hz with {inertia:.3g} kg m^2"
-        if servo.damping * natural > stiffness:
-            stiffness = servo.damping * natural
-            rule = f"assumed, {NATURAL_HZ:g} Hz with the damping"
+        passive_damping = servo.damping + float(model.dof_damping[dof])
+        candidates = {
+            f"{NATURAL_HZ:g} Hz with {inertia:.3g} kg m^2": inertia * natural**2,
+            f"{NATURAL_HZ:g} Hz with {passive_damping:.3g} N m s/rad": passive_damping * natural,
+            f"{SAG:g} rad under gravity": gravity / SAG,
+        }
+        rule = max(candidates, key=lambda name: candidates[name])
+        stiffness = candidates[rule]
         if has_limit:
             available = max(servo.effort_limit - gravity, 0.2 * servo.effort_limit) / SWING
             if available < stiffness:
                 stiffness = available
-                rule = f"assumed, the effort limit less gravity at {SWING:g} rad"
+                rule = f"the effort limit less gravity at {SWING:g} rad"
+        rule = f"assumed, {rule}"
         remarks["stiffness"] = Remark(mark="CHECK", text=rule)
         damping = servo.damping
         remarks["damping"] = Remark(mark="read", text=f"kv x gear^2 of {names}")

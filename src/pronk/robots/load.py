@@ -151,27 +151,38 @@ class AboutEntry(_Entry, frozen=True):
 class LimitsEntry(_Entry, frozen=True):
     """Limits of commands and measurements, as `pronk.robots.limits.OperatingLimits` has them."""
 
-    stiffness: _Positive = OperatingLimits.stiffness
-    damping: _Positive = OperatingLimits.damping
-    margin: _Positive = OperatingLimits.margin
+    stiffness: _Positive | None = None
+    damping: _Positive | None = None
+    margin: _Positive | None = None
     horizon_s: _Positive = OperatingLimits.horizon_s
     change: _Positive = OperatingLimits.change
-    power_w: _Positive = OperatingLimits.power_w
+    power_w: _Positive | None = None
     overrun: _Positive = OperatingLimits.overrun
     tilt: _Positive = OperatingLimits.tilt
     temperature: _Positive = OperatingLimits.temperature
     far_target: _Positive = OperatingLimits.far_target
     bus_voltage: float = OperatingLimits.bus_voltage
 
-    def limits(self) -> OperatingLimits:
-        """Return the limits of the robot."""
+    def limits(self, joints: Sequence[Joint]) -> OperatingLimits:
+        """Return the limits of a robot with some joints.
+
+        Where the file states no limit of gains, margin or power, it is that of a legged robot of
+        the size of a Mini Cheetah, or what these joints need if that is not enough: twice their
+        largest gains, a twentieth of the smallest range, all effort at all speed.
+        """
+        stiffness = max(OperatingLimits.stiffness, 2.0 * max(joint.stiffness for joint in joints))
+        damping = max(OperatingLimits.damping, 2.0 * max(joint.damping for joint in joints))
+        smallest_range = min(joint.range[1] - joint.range[0] for joint in joints)
+        power_w = 0.0
+        for joint in joints:
+            power_w += joint.drive.effort_limit * joint.drive.no_load_speed
         return OperatingLimits(
-            stiffness=self.stiffness,
-            damping=self.damping,
-            margin=self.margin,
+            stiffness=self.stiffness or stiffness,
+            damping=self.damping or damping,
+            margin=self.margin or min(OperatingLimits.margin, 0.05 * smallest_range),
             horizon_s=self.horizon_s,
             change=self.change,
-            power_w=self.power_w,
+            power_w=self.power_w or max(OperatingLimits.power_w, power_w),
             overrun=self.overrun,
             tilt=self.tilt,
             temperature=self.temperature,
@@ -281,7 +292,7 @@ def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> Robot
         decimation=file.decimation,
         grid_stiffness=file.grid_stiffness or _grid(joint.stiffness for joint in joints),
         grid_damping=file.grid_damping or _grid(joint.damping for joint in joints),
-        limits=file.limits.limits(),
+        limits=file.limits.limits(joints),
     )
     _verify_mirrors(robot, model, source)
     return robot

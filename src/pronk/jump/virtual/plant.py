@@ -208,7 +208,9 @@ class Plant:
             fastest = math.sqrt(
                 max(joint.belt_stiffness * belts[k], joint.presliding_stiffness * rotors[k])
             )
-            largest = min(largest, _STABLE / fastest, _DAMPED / (damping[k] * rotors[k]))
+            largest = min(largest, _STABLE / fastest)
+            if damping[k]:
+                largest = min(largest, _DAMPED / (damping[k] * rotors[k]))
         return largest
 
     def check_springs(self) -> None:

@@ -321,7 +321,8 @@ def default_sim_params(robot: RobotSpec) -> SimParams:
         joints[joint.name] = _default_joint(joint, link)
         rotor = joints[joint.name].rotor_inertia * joint.drive.gear_ratio**2
         # The lag of a drive is shorter than the time in which its damping stops its rotor.
-        lag_s = min(lag_s, 0.5 * rotor / joint.damping)
+        if joint.damping:
+            lag_s = min(lag_s, 0.5 * rotor / joint.damping)
     machine = replace(
         shipped.machine,
         drive_lag_s=lag_s,
