@@ -64,7 +64,7 @@ class StudyOptions:
 class OutputOptions:
     """What is kept and printed."""
 
-    out: Path
+    out: Path = Path("out/trial")
     """Folder for tables, captures, videos and the page."""
     video: bool = True
     """MP4, GIF and strip of each command, where this machine can render."""
@@ -99,7 +99,7 @@ def trial(
 
     paths = [*policies, *also]
     if not paths:
-        raise PronkError("no policy; give one or more, as in `pronk trial policy.onnx --out DIR`.")
+        raise PronkError("no policy; give one or more, as in `pronk trial policy.onnx`.")
     plan = TrialPlan(
         cases=parse_cases(jump.commands or ["paper"]),
         jumps=jump.jumps,
