@@ -33,6 +33,7 @@ def match_command(
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
     segment_s: float | None = None,
+    gain_uncertainty: float = 0.2,
     frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
@@ -53,6 +54,8 @@ def match_command(
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         segment_s: Length of the segments of a response in s, whose inverse is the spacing of its
             frequencies; 8, or less for shorter excitations, if left out.
+        gain_uncertainty: Share by which the stated gains and the torque constant may be wrong
+            (--mode drive); it counts in the intervals. On recordings of AK80-6 drives it is 0.2.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
             repeat it. A name of `pronk profiles`, or NAME,timestep_s=S,iterations=N,friction=none.
@@ -86,6 +89,7 @@ def match_command(
         zero_armature=zero_armature,
         simulator_python=simulator_python,
         estimator=Estimator(segment_s=segment_s),
+        gain_uncertainty=gain_uncertainty,
     )
     results: dict[str, MatchResult] = {}
     written: list[Path] = []

@@ -126,6 +126,9 @@ class JointGains:
     """Agreement of the simulated with the measured response."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
     """The drive by a torque channel (mode `drive`), by the names of `match.torque_fit.UNITS`."""
+    physical: Mapping[str, FittedValue] = field(default_factory=dict)
+    """Damping, armature, frictionloss and delay [s] of the drive itself (mode `drive`), where the
+    values above are equivalents in the simulator's law at its step (`match.physical`)."""
     flags: tuple[str, ...] = ()
     """Warnings about this match, one sentence each: of its excitations and response (`checks`), of
     amplitudes and frequencies left out (`measured`, `match`), and of its fit (`drive_fit` or
@@ -386,6 +389,10 @@ def _joint_entry(joint: JointGains) -> dict[str, Any]:
         entry["torque"] = {}
         for name, parameter in joint.torque.items():
             entry["torque"][name] = _torque_entry(parameter)
+    if joint.physical:
+        entry["physical"] = {}
+        for name, fitted in joint.physical.items():
+            entry["physical"][name] = _value_entry(fitted)
     if joint.flags:
         entry["flags"] = list(joint.flags)
     return entry

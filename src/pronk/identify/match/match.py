@@ -23,6 +23,7 @@ from pronk.identify.match.compared import (
     compare_recordings,
 )
 from pronk.identify.match.drive_fit import fit_drives, nominal_drives
+from pronk.identify.match.gains import FittedValue
 from pronk.identify.match.magnitude import (
     fit_magnitude,
     grid_axes,
@@ -45,6 +46,7 @@ from pronk.identify.match.parameters import (
     WITHOUT_FRICTION,
     checked_names,
 )
+from pronk.identify.match.physical import physical_drives
 from pronk.identify.match.ranges import group_gains
 from pronk.identify.match.replay import ChainReplay, JointReplay
 from pronk.identify.match.result import (
@@ -177,6 +179,7 @@ def match(
             grids = search_grids(rigs, measured, settings.grid_points, progress)
 
         fits: dict[str, DriveFit] = {}
+        physical: dict[str, dict[str, FittedValue]] = {}
         for name, responses in measured.items():
             if method == "paper":
                 fits[name] = fit_magnitude(rigs, responses, grids[name])
@@ -193,6 +196,12 @@ def match(
                     fit = fit_torque_limit(
                         replay, excitations, rigs.robot, fit, parameters, nominal[name]
                     )
+                if mode == "drive" and simulation.name == "mujoco":
+                    widened_fits, drive_values = physical_drives(
+                        replay, {name: fit}, rigs.robot, settings.gain_uncertainty
+                    )
+                    fit = widened_fits[name]
+                    physical |= drive_values
                 fits[name] = with_step_uncertainty(fit, rigs.robot)
             progress("fit", len(fits) / len(measured))
 
@@ -206,6 +215,7 @@ def match(
                     recorded = [recording.position for recording in replay.recordings]
                     flags = (*check_explained_motion(recorded, simulated), *flags)
                 gains = joint_gains(fit, robot, flags=flags)
+                gains = replace(gains, physical=physical.get(name, {}))
                 joints[name] = JointResult(joint=name, gains=gains, fit=fit)
                 continue
             target = measured[name][0]
@@ -221,16 +231,18 @@ def match(
                     rigs, target, compared.error_db, no_match_db(target)
                 )
             flags = joint_flags(fit, target, compared, excitation_flags[name])
+            gains = joint_gains(fit, robot, compared, flags)
             joints[name] = JointResult(
                 joint=name,
-                gains=joint_gains(fit, robot, compared, flags),
+                gains=replace(gains, physical=physical.get(name, {})),
                 fit=fit,
                 responses=compared,
                 grid=grids.get(name),
                 zero_armature=zero_armature,
             )
             progress("responses", len(joints) / len(fits))
-        return match_result(simulation, simulation.info(rigs), joints, logs, method=method)
+        result = match_result(simulation, simulation.info(rigs), joints, logs, method=method)
+        return replace(result, gain_uncertainty=settings.gain_uncertainty)
 
 
 def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
@@ -345,7 +357,8 @@ def match_chains(
         simulation: The robot in its simulator.
         parameters: Names of the parameters to fit.
         torque_fits: Drives by a torque channel.
-        settings: The threads of the simulator and the estimator are used.
+        settings: The threads of the simulator, the estimator and the uncertainty of the stated
+            gains are used.
         progress: Called with the stage and the share of it that is done.
 
     Raises:
@@ -359,6 +372,7 @@ def match_chains(
     for name, joint_logs in logs_by_joint(logs_in_motion, robot).items():
         excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
     fits: dict[str, DriveFit] = {}
+    physical: dict[str, dict[str, FittedValue]] = {}
     responses: dict[str, ComparedResponses] = {}
     motion_flags: dict[str, tuple[str, ...]] = {}
     excluded: dict[str, str] = {}
@@ -399,14 +413,21 @@ def match_chains(
                 else:
                     measured = [log.position[:, log.column(name)] for log in chain.logs]
                     motion_flags[name] = check_explained_motion(measured, joint_matched)
+            if "stiffness" not in parameters:
+                chain_fits, drive_values = physical_drives(
+                    replay, chain_fits, robot, settings.gain_uncertainty
+                )
+                physical |= drive_values
             fits.update(chain_fits)
             excluded.update(chain.excluded)
     joints = {}
     for name, fit in with_torque(fits, torque_fits, robot).items():
         flags = (*motion_flags.get(name, ()), *excitation_flags.get(name, ()))
         gains = joint_gains(fit, robot, responses.get(name), flags)
+        gains = replace(gains, physical=physical.get(name, {}))
         joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
-    return match_result(simulation, simulation.info(), joints, logs, excluded)
+    result = match_result(simulation, simulation.info(), joints, logs, excluded)
+    return replace(result, gain_uncertainty=settings.gain_uncertainty)
 
 
 def compared_flags(compared: ComparedResponses) -> tuple[str, ...]:

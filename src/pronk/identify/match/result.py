@@ -219,6 +219,9 @@ class MatchResult:
     """Reasons by joint for joints that moved and were not matched."""
     robot_path: str = ""
     """File of the robot; empty for a robot that ships with pronk."""
+    gain_uncertainty: float = NAN
+    """Relative uncertainty of the stated gains in the intervals of physical values (mode `drive`).
+    """
     notes: tuple[str, ...] = ()
     """Sentences on the logs: gaps, jitter, short excitations. They weaken no gain by themselves."""
 
