@@ -46,6 +46,7 @@ from pronk.deploy.runtime.records import STEP, TICK
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.files import write_text
+from pronk.identify.logs.description import write_description
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import Record, records
 from pronk.identify.logs.options import ReadOptions
@@ -152,6 +153,10 @@ def _write(folder: Path) -> None:
         recording["des_dof_pos"] = positions.clone()
         torch.save(recording, folder / "a.pt")
     _write_bag(folder / "bag.mcap", chirp)
+    _write_other_bags(folder, chirp)
+    described = {"time": "time", "command.FR_knee": "u", "position.FR_knee": "q"}
+    np.savetxt(folder / "own.csv", rows, "%.6f", delimiter=",", header="time,u,q", comments="# ")
+    write_description(folder / "own.csv", ReadOptions(unit="rad", columns=described))
     robot = cases.ROBOT
     _write_deploy_log(folder / "deploy.mcap", robot)
     shutil.copytree(Path(load_robot.__code__.co_filename).parent / robot.name, folder / "robot")
@@ -198,6 +203,25 @@ def _write_bag(path: Path, positions: Array) -> None:
             }
             for topic in ("/joint_states", "/command"):
                 writer.write_message(topic, state, message, 10**9 + k * 10**7, 0)
+
+
+def _write_other_bags(folder: Path, positions: Array) -> None:
+    """Write the same bag into SQLite and as a bag of ROS 1."""
+    ros_bags = importlib.import_module("ros_bags")
+
+    def build(builder: Any) -> list[Any]:
+        messages = []
+        for k in range(200):
+            nano = 10**9 + k * 10**7
+            state = builder.joint_state(nano, ["knee"], [float(positions[k])])
+            for topic in ("/joint_states", "/command"):
+                messages.append((topic, "sensor_msgs/msg/JointState", nano, state))
+        return messages
+
+    sqlite = ros_bags.write_bag(folder / "sqlite", build, "sqlite3")
+    shutil.copy(next(sqlite.glob("*.db3")), folder / "bag.db3")
+    ros1 = ros_bags.write_bag(folder / "ros1", build, "ros1 bz2")
+    shutil.copy(ros1, folder / "bag.bag")
 
 
 def _write_deploy_log(path: Path, robot: RobotSpec) -> None:
@@ -281,6 +305,10 @@ def _formats() -> dict[str, _Format]:
         "csv": _Format(("a.csv",), log(unit="rad")),
         "mcap": _Format(("a.mcap",), log(), True),
         "bag": _Format(("bag.mcap",), log(command_topic="/command"), True),
+        "sqlite bag": _Format(("bag.db3",), log(command_topic="/command")),
+        "ros1 bag": _Format(("bag.bag",), log(command_topic="/command")),
+        "description": _Format(("own.log.yaml",), lambda path: read_log(path.with_name("own.csv"))),
+        "pronk log inspect": _Format(("chirp.csv",), command("log", "inspect", "{0}")),
         "sage": _Format(sage_files, lambda path: read_log(path.parent)),
         "pace": _Format(("a.pt",), log(joint_order="hip,knee"), True),
         "pronk response": _Format(("chirp.csv",), command(*response)),

@@ -78,6 +78,7 @@ def check_archive(path: Path, kind: type[PronkError]) -> None:
 
     The module zipfile holds the archive to what it claims.
     """
+    check_regular(path, kind)
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(member.file_size for member in archive.infolist())
     check_size(path, unpacked, kind)

@@ -69,6 +69,7 @@ def commanded(
     clock_offset_ns: int = 0,
     degrees: bool = False,
     stamped: bool = True,
+    stuck: bool = False,
 ) -> Build:
     """The same arm, commanded by JointStates in another order than the states'."""
     scale = 180.0 / np.pi if degrees else 1.0
@@ -83,7 +84,7 @@ def commanded(
             numbers = [scale * values[name] for name in reversed(NAMES)]
             command = builder.joint_state(stamp, [*reversed(names)], numbers)
             messages.append(("/joint_command", STATE, nano(k) + late, command))
-            stamp = nano(k) if stamped else 0
+            stamp = nano(0 if stuck else k) if stamped else 0
             measured = [scale * value for value in (POSITION[k], -0.2, 0.3)]
             state = builder.joint_state(stamp, names, measured, [0.5, 0.0, 0.0], [1.0, 2.0, 3.0])
             messages.append(("/joint_states", STATE, nano(k) + 4_000_000, state))
@@ -171,6 +172,9 @@ def test_header_stamps_of_two_clocks_are_not_compared(tmp_path: Path) -> None:
     assert len(log.time) >= COUNT - 1
     unstamped = read(write_bag(tmp_path / "other", commanded(stamped=False)))
     assert any("times of reception" in note for note in unstamped.notes)
+    stuck = read(write_bag(tmp_path / "stuck", commanded(stuck=True)))
+    assert any("stand still" in note for note in stuck.notes)
+    assert_elbow(stuck)
     # Received in this order, each state follows the command of its own tick.
     assert_elbow(unstamped)
 

@@ -100,6 +100,7 @@ FORMS: dict[str, str] = {
     "dos": body(end="\r\n"),
     "blank lines": body(end="\n\n"),
     "spaces": body(" , "),
+    "quoted names after spaces": body(", ").replace("t, u, q", '"t", "u", "q"'),
     "trailing delimiter": body(end=",\n"),
     "sep of Excel": "sep=;\n" + body(";"),
     "index": with_index(""),

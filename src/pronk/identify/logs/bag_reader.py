@@ -63,6 +63,8 @@ _LARGEST_CLOCK_OFFSET_NS = 20_000_000
 """Largest difference between how long after their header stamps the messages of two topics are
 received [ns]. Messages on one machine take 1 ms or so, and clocks of two machines differ at
 will."""
+_LEAST_DISTINCT_STAMPS = 0.2
+"""Share of header stamps that differ from one another; several publishers may stamp alike."""
 _CONSTANT_SHARE = 0.5
 """Share of the travel of a command that has to lie where the gains do not change."""
 _FEED_FORWARD = 1e-3
@@ -158,26 +160,35 @@ def join_topics(
     topics = _choose_topics(path, records, options)
     notes = list(topics.notes)
     decoder = MessageDecoder(path)
-    messages = {}
-    received = {}
-    stamps = {}
-    for topic in dict.fromkeys((topics.measured, topics.command)):
-        chosen = [record for record in records if record.topic == topic]
-        messages[topic] = [decoder.decode(record) for record in chosen]
-        received[topic] = np.array([record.log_time for record in chosen], dtype=np.int64)
-        stamps[topic] = np.array([_stamp(message) for message in messages[topic]], dtype=np.int64)
-    times, clock = _times(topics, received, stamps)
-    notes.append(clock)
-
-    unit_joints = _joints_of_motors(path, topics, messages, robot, options)
-    states = _measured_samples(path, topics, messages[topics.measured], unit_joints, options)
-    state_series = _series(states, times[topics.measured])
+    state_records = [record for record in records if record.topic == topics.measured]
+    command_records = [record for record in records if record.topic == topics.command]
+    motor_names = _joints_of_motors(path, topics, decoder, state_records, robot, options)
+    # A message is kept as the few numbers that are read of it.
+    states = []
+    state_stamps = []
+    for record in state_records:
+        message = decoder.decode(record)
+        states.append(_measured_sample(path, topics, message, motor_names, options))
+        state_stamps.append(_stamp(message))
     state_joints: list[str] = []
-    for series in state_series:
-        state_joints += [joint for joint in series.joints if joint not in state_joints]
-    command_reader = _CommandReader(path, topics, tuple(state_joints), robot, options, unit_joints)
-    commands = [command_reader.sample(message) for message in messages[topics.command]]
-    command_series = _series(commands, times[topics.command])
+    for joints in dict.fromkeys(state.joints for state in states):
+        state_joints += [joint for joint in joints if joint not in state_joints]
+    command_reader = _CommandReader(path, topics, tuple(state_joints), robot, options, motor_names)
+    commands = []
+    command_stamps = []
+    for record in command_records:
+        message = decoder.decode(record)
+        commands.append(command_reader.sample(message))
+        command_stamps.append(_stamp(message))
+    state_time, command_time, clock = _times(
+        np.array([record.log_time for record in state_records], dtype=np.int64),
+        np.array(state_stamps, dtype=np.int64),
+        np.array([record.log_time for record in command_records], dtype=np.int64),
+        np.array(command_stamps, dtype=np.int64),
+    )
+    notes.append(clock)
+    state_series = _series(states, state_time)
+    command_series = _series(commands, command_time)
     if not state_series or not command_series:
         raise LogError(f"{path}: no positions on {topics.measured} or on {topics.command}.")
     log = _join(path, state_series, command_series, notes, robot, options)
@@ -319,33 +330,43 @@ def _stamp(message: Any) -> int:
 
 
 def _times(
-    topics: _Topics,
-    received: Mapping[str, NDArray[np.int64]],
-    stamps: Mapping[str, NDArray[np.int64]],
-) -> tuple[Mapping[str, NDArray[np.int64]], str]:
-    """Times of the messages by topic [ns], all of one clock, and which clock it is in words."""
-    measured_stamps = stamps[topics.measured]
-    command_stamps = stamps[topics.command]
-    if not (measured_stamps > 0).all() or not (command_stamps > 0).all():
-        return received, (
-            "message headers hold no stamps on both topics; times of reception were used, which "
-            "hold the jitter of the network and the recorder"
+    received: NDArray[np.int64],
+    stamps: NDArray[np.int64],
+    command_received: NDArray[np.int64],
+    command_stamps: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
+    """Times of states and commands on one clock, and which clock it is in words.
+
+    Args:
+        received: When the states were received [ns], shape (states,).
+        stamps: Header stamps of the states [ns], 0 where there are none.
+        command_received: When the commands were received [ns], shape (commands,).
+        command_stamps: Header stamps of the commands [ns], 0 where there are none.
+    """
+    if not (stamps > 0).all() or not (command_stamps > 0).all():
+        reason = "message headers hold no stamps on both topics"
+    elif len(np.unique(stamps)) < _LEAST_DISTINCT_STAMPS * len(stamps):
+        reason = "the header stamps of the states stand still"
+    else:
+        latency = float(np.median(received - stamps))
+        command_latency = float(np.median(command_received - command_stamps))
+        difference_ns = abs(latency - command_latency)
+        if difference_ns <= _LARGEST_CLOCK_OFFSET_NS:
+            words = "times are the header stamps, which do not hold the jitter of the recorder"
+            return stamps, command_stamps, words
+        reason = (
+            f"the header stamps of the two topics are {1e-9 * difference_ns:.3f} s apart, as of "
+            "two clocks"
         )
-    latency = np.median(received[topics.measured] - measured_stamps)
-    command_latency = np.median(received[topics.command] - command_stamps)
-    if abs(latency - command_latency) > _LARGEST_CLOCK_OFFSET_NS:
-        return received, (
-            "the header stamps of the two topics are "
-            f"{1e-9 * abs(latency - command_latency):.3f} s apart, as of two clocks; times of "
-            "reception were used"
-        )
-    return stamps, "times are the header stamps, which do not hold the jitter of the recorder"
+    words = f"{reason}; times of reception were used, with the jitter of the recorder"
+    return received, command_received, words
 
 
 def _joints_of_motors(
     path: Path,
     topics: _Topics,
-    messages: Mapping[str, Sequence[Any]],
+    decoder: MessageDecoder,
+    records: Sequence[Record],
     robot: RobotSpec | None,
     options: ReadOptions,
 ) -> tuple[str, ...]:
@@ -354,8 +375,8 @@ def _joints_of_motors(
         return ()
     used_motors = 0
     if topics.measured_type in STATE_TYPES:
-        for message in messages[topics.measured][:: max(1, len(messages[topics.measured]) // 50)]:
-            for index, motor in enumerate(_motors(message)):
+        for record in records[:: max(1, len(records) // 50)]:
+            for index, motor in enumerate(_motors(decoder.decode(record))):
                 if float(motor.q) != 0.0:
                     used_motors = max(used_motors, index + 1)
     try:
@@ -382,55 +403,47 @@ def _motor_number(motor: Any, *names: str) -> float:
     return math.nan
 
 
-def _measured_samples(
+def _measured_sample(
     path: Path,
     topics: _Topics,
-    messages: Sequence[Any],
+    message: Any,
     motor_names: tuple[str, ...],
     options: ReadOptions,
-) -> list[_Sample]:
-    """What each state says of its joints."""
-    samples = []
-    for message in messages:
-        if topics.measured_type in STATE_TYPES:
-            motors = _motors(message)[: len(motor_names)]
-            samples.append(
-                _Sample(
-                    motor_names[: len(motors)],
-                    [float(motor.q) for motor in motors],
-                    [_motor_number(motor, "dq") for motor in motors],
-                    [_motor_number(motor, "tau_est", "tauEst") for motor in motors],
-                )
-            )
-            continue
-        state = message
-        names = getattr(message, "name", None)
-        if topics.measured_type in CONTROLLER_STATES:
-            state = _first_field(message, ("feedback", "actual"))
-            names = message.joint_names
-        positions = _numbers(path, state, topics.measured, _field_of(state), "--measured-topic")
-        joints = tuple(str(name) for name in names or ())
-        if not joints:
-            values = f"{path}: the {len(positions)} values of a message on {topics.measured}"
-            joints = ordered_joints(values, len(positions), None, options.joint_order)
-        if len(joints) != len(positions):
-            raise LogError(
-                f"{path}: a message on {topics.measured} has {len(joints)} names and "
-                f"{len(positions)} positions."
-            )
-        velocity = getattr(state, "velocity", getattr(state, "velocities", ()))
-        effort = getattr(state, "effort", ())
-        has_velocity = len(velocity) == len(joints)
-        has_effort = len(effort) == len(joints)
-        samples.append(
-            _Sample(
-                joints,
-                positions,
-                [float(value) for value in velocity] if has_velocity else None,
-                [float(value) for value in effort] if has_effort else None,
-            )
+) -> _Sample:
+    """What a state says of its joints."""
+    if topics.measured_type in STATE_TYPES:
+        motors = _motors(message)[: len(motor_names)]
+        return _Sample(
+            motor_names[: len(motors)],
+            [float(motor.q) for motor in motors],
+            [_motor_number(motor, "dq") for motor in motors],
+            [_motor_number(motor, "tau_est", "tauEst") for motor in motors],
         )
-    return samples
+    state = message
+    names = getattr(message, "name", None)
+    if topics.measured_type in CONTROLLER_STATES:
+        state = _first_field(message, ("feedback", "actual"))
+        names = message.joint_names
+    positions = _numbers(path, state, topics.measured, _field_of(state), "--measured-topic")
+    joints = tuple(str(name) for name in names or ())
+    if not joints:
+        values = f"{path}: the {len(positions)} values of a message on {topics.measured}"
+        joints = ordered_joints(values, len(positions), None, options.joint_order)
+    if len(joints) != len(positions):
+        raise LogError(
+            f"{path}: a message on {topics.measured} has {len(joints)} names and "
+            f"{len(positions)} positions."
+        )
+    velocity = getattr(state, "velocity", getattr(state, "velocities", ()))
+    effort = getattr(state, "effort", ())
+    has_velocity = len(velocity) == len(joints)
+    has_effort = len(effort) == len(joints)
+    return _Sample(
+        joints,
+        positions,
+        [float(value) for value in velocity] if has_velocity else None,
+        [float(value) for value in effort] if has_effort else None,
+    )
 
 
 def _field_of(state: Any) -> str:

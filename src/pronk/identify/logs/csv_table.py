@@ -291,7 +291,9 @@ def read_table(path: Path) -> CsvTable:
     rows = []
     lines = []
     try:
-        reader = csv.reader(_prepared(content, delimiter), delimiter=delimiter)
+        reader = csv.reader(
+            _prepared(content, delimiter), delimiter=delimiter, skipinitialspace=True
+        )
         for row in reader:
             if any(cell.strip() for cell in row):
                 rows.append(row)
@@ -411,7 +413,9 @@ def _delimiter(path: Path, content: Sequence[str]) -> str:
     best_share = -1.0
     for delimiter in _DELIMITERS:
         try:
-            rows = list(csv.reader(_prepared(sample, delimiter), delimiter=delimiter))
+            rows = list(
+                csv.reader(_prepared(sample, delimiter), delimiter=delimiter, skipinitialspace=True)
+            )
         except csv.Error:
             continue
         counts = Counter(len(row) for row in rows if len(row) > 1)
@@ -465,7 +469,7 @@ def _header_in_comments(
     for number, comment in reversed(comments):
         if number > first_line:
             continue
-        names = next(csv.reader([comment], delimiter=delimiter), [])
+        names = next(csv.reader([comment], delimiter=delimiter, skipinitialspace=True), [])
         if delimiter == _SPACE:
             names = re.split(r"\t|\s{2,}|,", comment)
             if len(names) != width:
