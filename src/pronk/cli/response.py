@@ -44,6 +44,7 @@ def response(
             frequencies; 8, or less for shorter excitations, if left out.
         reading: How logs are read.
     """
+    from pronk.identify.logs.velocity import velocity_note
     from pronk.identify.response.estimate import resolution_note
     from pronk.identify.response.response import Estimator, save_responses
     from pronk.robots import load_robot
@@ -60,6 +61,10 @@ def response(
             folder = source.parent if out is None else out
             by_joint = _responses_by_joint(log, estimator)
             notes += [f"{source.name}: {note}" for note in log.notes]
+            for joint in by_joint:
+                velocity = velocity_note(log, joint, source.name)
+                if velocity:
+                    notes.append(velocity)
             if plots:
                 written += _write_plots(by_joint, folder, source.stem)
             responses = []

@@ -22,6 +22,7 @@ import numpy as np
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation
+from pronk.identify.logs.velocity import velocity_column
 from pronk.identify.match.measured import DB
 from pronk.identify.match.result import NO_MATCH
 from pronk.identify.response.response import FrequencyResponse
@@ -423,7 +424,8 @@ def _drive_torque(excitation: Excitation) -> Array | None:
         return None
     column = log.column(excitation.joint)
     velocity = excitation.velocity
-    if velocity is None:
+    comparison = velocity_column(log, excitation.joint)
+    if velocity is None or (comparison is not None and not comparison.usable):
         velocity = np.gradient(excitation.position, excitation.time)
     error = excitation.command - excitation.position
     return np.asarray(log.stiffness[column] * error - log.damping[column] * velocity)

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
+from pronk.identify.logs.velocity import velocity_note
 from pronk.identify.match.checks import (
     EFFORT_LIMIT,
     check_excitations,
@@ -574,11 +575,15 @@ def robot_path(robot: RobotSpec) -> str:
 
 
 def match_notes(logs: Sequence[JointLog], joints: Mapping[str, JointResult]) -> tuple[str, ...]:
-    """Return what the readers remarked of the logs, and how coarse responses are."""
+    """Return what the readers remarked of the logs, wrong velocities, and coarse responses."""
     notes = []
     for log in logs:
+        source = Path(log.source or "log").name
         for note in log.notes:
-            notes.append(f"{Path(log.source or 'log').name}: {note}")
+            notes.append(f"{source}: {note}")
+        for name in joints:
+            if name in log.excited_joints:
+                notes.append(velocity_note(log, name, source))
     for joint in joints.values():
         if joint.responses is not None:
             notes.append(resolution_note(joint.responses.measured[0]))

@@ -17,6 +17,7 @@ import numpy as np
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.identify.logs.joint_log import Excitation, JointLog, group_repeats
+from pronk.identify.logs.velocity import velocity_column
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.estimate import (
     estimate_response,
@@ -383,9 +384,13 @@ def _compared_frequencies(
                 f"{response.segment_s:g} s; a comparison needs {FEWEST_EXCITED} or more, so sweep "
                 "longer."
             )
+        velocity = velocity_column(excitation.log, response.joint)
+        velocity_words = ""
+        if velocity is not None and not velocity.usable:
+            velocity_words = f" Note: {velocity.note(response.joint)}."
         raise IdentifiabilityError(
             f"{source}: {few_frequencies(excitation, excited_count, count, band_hz)}; sweep the "
-            "band, as `pronk sweep` does."
+            f"band, as `pronk sweep` does.{velocity_words}"
         )
     largest_gain = np.abs(response.response[band]).max()
     if not largest_gain > 1e-3:
