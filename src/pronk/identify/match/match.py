@@ -562,12 +562,12 @@ def match_result(
         logs=hashes,
         virtual=virtual,
         excluded=excluded or {},
-        robot_path=robot_path(simulation.robot),
+        robot_path=file_of_robot(simulation.robot),
         notes=match_notes(logs, joints),
     )
 
 
-def robot_path(robot: RobotSpec) -> str:
+def file_of_robot(robot: RobotSpec) -> str:
     """Return the file of a robot; empty for one that ships with pronk or has no file."""
     if robot.source in ROBOT_NAMES or not Path(robot.source).is_file():
         return ""

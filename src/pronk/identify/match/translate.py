@@ -38,12 +38,19 @@ from pronk.robots.robot import RobotSpec
 
 LOW_HZ = 1.0
 """Lowest frequency compared [Hz]: below it a joint follows its command in every drive law."""
+DELAY_SCALE_S = 0.01
+"""Unit of the delay in the search with phase [s]."""
 POINTS = 60
 """Frequencies compared, evenly spaced."""
 NOT_ALIKE_DB = 0.5
 """Error above which the joints are not alike [dB]: what a match of a good log stays below."""
 NOT_ALIKE = "not alike"
 """Beginning of the flag of a joint that the other framework cannot give."""
+CRITERIA_SPREAD_MAX = 0.02
+"""Relative difference of gains by magnitude alone and by magnitude and phase from which on the
+joint is flagged: a match, which weighs phase and frequencies by its log, ends between them."""
+NOT_UNIQUE = "gains depend on what is compared"
+"""Beginning of the flag of a joint whose gains differ by more than `CRITERIA_SPREAD_MAX`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +70,15 @@ class JointTranslation:
     """Time by which the other joint responds earlier with the translated gains [s]."""
     rest_s: float
     """Part of the lead that remains because a delay cannot be negative [s]; 0 or less."""
+    with_phase: Pair
+    """Stiffness and damping with which magnitude and phase together are most alike, whatever the
+    delay. Laws that can be alike give the same gains as `after`."""
+
+    @property
+    def criteria_spread(self) -> float:
+        """Largest relative difference between `after` and `with_phase`."""
+        differences = np.divide(self.with_phase, self.after) - 1.0
+        return float(np.abs(differences).max())
 
 
 def translate(
@@ -152,6 +168,16 @@ def translated(
     solution = least_squares(error_db, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
     stiffness = float(np.exp(solution.x[0]))
     damping = float(np.exp(solution.x[1]))
+
+    def complex_error(point: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):
+            gain_pair = np.exp(point[:2])
+            turned = np.exp(-1j * other.omega * DELAY_SCALE_S * point[2])
+            difference = other.response(gain_pair[0], gain_pair[1])[0] * turned - goal
+        return np.concatenate([difference.real, difference.imag])
+
+    phase_solution = least_squares(complex_error, np.append(solution.x, 0.0), x_scale=0.1)
+    with_phase = np.exp(phase_solution.x[:2])
     phase = np.unwrap(np.angle(other.response(stiffness, damping)[0] / goal))
     # Slope of a straight line through zero by least squares.
     lead_s = float(phase @ first.omega / (first.omega @ first.omega))
@@ -162,6 +188,7 @@ def translated(
         after_db=rms(solution.fun),
         lead_s=lead_s,
         rest_s=min(delay_s + lead_s, 0.0),
+        with_phase=(float(with_phase[0]), float(with_phase[1])),
     )
 
 
@@ -226,9 +253,17 @@ def _translated_joint(joint: JointGains, translation: JointTranslation, begin: s
     """
     stiffness_scale = translation.after[0] / translation.before[0]
     damping_scale = translation.after[1] / translation.before[1]
-    flags = [flag for flag in joint.flags if not flag.startswith(NOT_ALIKE)]
+    flags = [flag for flag in joint.flags if not flag.startswith((NOT_ALIKE, NOT_UNIQUE))]
     if translation.after_db > NOT_ALIKE_DB:
         flags.append(f"{NOT_ALIKE}: {translation.after_db:.2f} dB from {begin}")
+    elif translation.criteria_spread > CRITERIA_SPREAD_MAX:
+        stiffness_with_phase, damping_with_phase = translation.with_phase
+        flags.append(
+            f"{NOT_UNIQUE}: {translation.after[0]:.4g} N m/rad and {translation.after[1]:.4g} "
+            f"N m s/rad by the magnitude, {stiffness_with_phase:.4g} and {damping_with_phase:.4g} "
+            f"by magnitude and phase: with the held joints of its chain no gains of this drive law "
+            f"answer quite as those of {begin}; a match of logs may end at either"
+        )
     stiffness = replace(joint.stiffness.scaled(stiffness_scale), value=translation.after[0])
     damping = replace(joint.damping.scaled(damping_scale), value=translation.after[1])
     return replace(

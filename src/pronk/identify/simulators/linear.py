@@ -10,8 +10,8 @@ for any gains without simulating anything. Gains are translated between drive la
 damping is implicit (`pronk.robots.drive_law`) it acts on the speed at the end of the step, `z P_v`.
 `c = 4 f / (pi |speed|)` is the describing function of the joint's dry friction `f` (Gelb and
 Vander Velde, *Multiple-Input Describing Functions*, 1968, table of appendix B: ideal relay) at
-the amplitude of the response. The closed form does not have the coupling through held joints that
-slip, and friction near sticking.
+the amplitude of the response. The closed form does not have the dry friction of held joints, and
+friction near sticking.
 """
 
 from __future__ import annotations
@@ -93,7 +93,10 @@ def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
         pose: Pose of its chain [rad], shape (n,).
         omega: Frequencies [rad/s], shape (f,).
     """
-    # The excited joint takes a torque in place of its drive, and has no dry friction.
+    # The excited joint takes a torque in place of its drive. No joint has dry friction: MuJoCo's
+    # friction is a stiff damper where a joint sticks and a constant where it slips, so that a held
+    # joint near its breakaway would give derivatives that hold for no motion at all. A stop that
+    # the pose touches and a contact are as stiff.
     model = copy.copy(rig.model)
     actuator = rig.actuator
     model.actuator_gaintype[actuator] = mujoco.mjtGain.mjGAIN_FIXED
@@ -103,7 +106,11 @@ def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
     model.actuator_gainprm[actuator, 0] = 1.0
     model.actuator_ctrllimited[actuator] = False
     model.actuator_forcelimited[actuator] = False
-    model.dof_frictionloss[rig.index] = 0.0
+    model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+        | mujoco.mjtDisableBit.mjDSBL_LIMIT
+        | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     data.ctrl[:] = rig.control(pose)
