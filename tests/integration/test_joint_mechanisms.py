@@ -20,6 +20,7 @@ from joint_mechanisms import (
     mechanism_log,
     mechanism_robot,
     simulate_mechanisms,
+    with_fault,
 )
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
@@ -94,3 +95,21 @@ def test_no_other_mechanism_is_taken_for_a_torque_limit(tmp_path: Path) -> None:
     for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
         limited = [flag for flag in gains.flags if flag.startswith("effort limit")]
         assert limited == [], mechanism
+
+
+@pytest.mark.parametrize("fault", ["compliance, motor encoder", "compliance, link encoder"])
+def test_a_compliance_is_named_with_its_stiffness(fault: str, tmp_path: Path) -> None:
+    mechanisms = [with_fault(joint, fault, 0.6) for joint in drawn(8, ("", "", ""))]
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        assert not gains.matched
+        named = [flag for flag in gains.flags if "compliance:" in flag]
+        assert len(named) == 1
+        assert not any("So would look" in flag for flag in gains.flags)
+        numbers = [float(word) for word in re.findall(r"\d+\.?\d*(?:e[-+]\d+)?", named[0])]
+        assert any(abs(number / mechanism.spring - 1.0) < 0.05 for number in numbers)
+
+
+def test_no_other_mechanism_is_taken_for_a_compliance(tmp_path: Path) -> None:
+    mechanisms = drawn(11, FAULTS[4:])
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        assert not any("compliance:" in flag for flag in gains.flags), mechanism

@@ -23,6 +23,7 @@ from pronk.identify.match.compared import (
     compare,
     compare_recordings,
 )
+from pronk.identify.match.compliance import JointDynamics, find_compliance
 from pronk.identify.match.drive_fit import fit_drives, nominal_drives
 from pronk.identify.match.gains import FittedValue
 from pronk.identify.match.magnitude import (
@@ -60,7 +61,7 @@ from pronk.identify.match.result import (
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
-from pronk.identify.match.torque_limit import fit_torque_limit
+from pronk.identify.match.torque_limit import MISFIT, fit_torque_limit
 from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.response.estimate import resolution_note
 from pronk.identify.response.response import ShortExcitationError
@@ -231,7 +232,8 @@ def match(
                 zero_armature = search_without_armature(
                     rigs, target, compared.error_db, no_match_db(target)
                 )
-            flags = joint_flags(fit, target, compared, excitation_flags[name])
+            compliance = compliance_flag(fit, target, compared, rigs.robot, nominal[name])
+            flags = joint_flags(fit, target, compared, excitation_flags[name], compliance)
             gains = joint_gains(fit, robot, compared, flags)
             joints[name] = JointResult(
                 joint=name,
@@ -460,11 +462,48 @@ def no_match_db(target: MeasuredJoint) -> float:
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * target.measurement_error_db())
 
 
+def compliance_flag(
+    fit: DriveFit,
+    target: MeasuredJoint,
+    compared: ComparedResponses,
+    robot: RobotSpec,
+    nominal: Mapping[str, float],
+) -> str:
+    """Name a compliance between motor and link where the match does not explain the log.
+
+    Args:
+        fit: Fit of the joint.
+        target: Its measured response.
+        compared: Measured and simulated response.
+        robot: The robot, which has the inertias.
+        nominal: Parameters of its drive with the stated gains.
+
+    Returns:
+        The flag of `find_compliance`; empty where the match explains the log.
+    """
+    explained = not fit.rmse > MISFIT * target.measured.amplitude
+    if explained and compared.error_db <= no_match_db(target):
+        return ""
+    inertia, pull = bench_inertia(robot, robot.joint(fit.joint).original[0])
+    armature = robot.joint(fit.joint).drive.armature
+    if nominal["damping"] <= 0.0 or not 0.0 < armature < inertia:
+        return ""
+    joint = JointDynamics(
+        motor_inertia=armature,
+        link_inertia=inertia - armature,
+        pull=pull,
+        stiffness=nominal["stiffness"],
+        damping=nominal["damping"],
+    )
+    return find_compliance(target.measured, target.fit_mask, joint)
+
+
 def joint_flags(
     fit: DriveFit,
     target: MeasuredJoint,
     compared: ComparedResponses,
     excitation_flags: Sequence[str],
+    compliance: str = "",
 ) -> tuple[str, ...]:
     """Return what warns of a joint beside its fit: the torque limit first, then its response.
 
@@ -473,6 +512,7 @@ def joint_flags(
         target: Measured response.
         compared: Measured and simulated response.
         excitation_flags: Flags of its excitations.
+        compliance: Flag that names a compliance; empty where none can be told.
     """
     limit_is_named = any(flag.startswith(EFFORT_LIMIT) for flag in fit.flags)
     limit_flags = []
@@ -482,14 +522,17 @@ def joint_flags(
             other_flags.append(flag)
         elif not limit_is_named:
             limit_flags.append(flag)
+    causes = list(limit_flags)
+    if compliance and not limit_is_named and not limit_flags:
+        causes.append(compliance)
     flags = [
-        *limit_flags,
+        *causes,
         *check_response(
             target.measured,
             compared.matched,
             target.fit_mask,
             no_match_db(target),
-            cause_is_named=limit_is_named or bool(limit_flags),
+            cause_is_named=limit_is_named or bool(causes),
         ),
         *other_flags,
     ]
