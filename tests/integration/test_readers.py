@@ -328,6 +328,28 @@ def test_degrees_read_as_radians_are_refused(tmp_path: Path, degrees: np.ndarray
     assert np.ptp(read_log(tmp_path / "a.csv", options=ReadOptions(unit="deg")).position) < 0.6
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_joints_that_the_model_holds_are_left_out(tmp_path: Path, moves: bool) -> None:
+    """A gripper's slide in the log of an arm."""
+    robot = replace(load_robot("mini_cheetah"), held_joints=("finger",))
+    values = np.column_stack([SWING, 0.01 * np.ones(4000)])
+    if moves:
+        values[:, 1] += 0.1 * SWING
+    time = np.arange(4000) / 200.0
+    names = np.array(["FR_knee", "finger"])
+    arrays = {"time": time, "command": values, "position": values, "velocity": values}
+    np.savez(tmp_path / "a.npz", joints=names, **arrays)
+    if moves:
+        with pytest.raises(LogError, match="finger"):
+            read_log(tmp_path / "a.npz", robot=robot, options=ReadOptions(unit="rad"))
+        return
+    log = read_log(tmp_path / "a.npz", robot=robot, options=ReadOptions(unit="rad"))
+    assert log.joints == ("FR_knee",)
+    assert log.velocity is not None
+    np.testing.assert_array_equal(log.velocity[:, 0], SWING)
+    assert any("finger" in note for note in log.notes)
+
+
 def test_a_log_of_another_robot_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", replace(example(), robot="so101"))
     with pytest.raises(LogError, match=r"so101.*mini_cheetah"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -75,8 +74,7 @@ def log(
     robot_words = f" --robot {shlex.quote(robot)}" if robot else ""
     command = f"pronk response {shlex.quote(str(path))}{robot_words}"
     if not yes:
-        words = " ".join(shlex.quote(word) for word in sys.argv[1:])
-        repeated = f"pronk {words} --yes" if words.startswith("log ") else "the same with --yes"
+        repeated = f"pronk log inspect {shlex.quote(str(path))}{robot_words}{reading.words()} --yes"
         console.say(f"nothing was written; --yes writes {description_path(path)}")
         return console.Outcome(figures=figures, following=[repeated])
     written = write_description(path, guess.options)

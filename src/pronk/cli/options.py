@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,6 +72,35 @@ class Reading:
             command_field=self.command_field,
             reader_options=named_values("--reader-option", self.reader_options, str),
         )
+
+    def words(self) -> str:
+        """Return the options as they are typed, with a space in front; empty for none."""
+        words = []
+        single = {
+            "--unit": self.unit,
+            "--time-unit": self.time_unit,
+            "--joint-order": self.joint_order,
+            "--rate-hz": None if self.rate_hz is None else f"{self.rate_hz:g}",
+            "--format": self.log_format,
+            "--measured-topic": self.measured_topic,
+            "--command-topic": self.command_topic,
+            "--command-field": self.command_field,
+        }
+        for option, value in single.items():
+            if value is not None:
+                words += [option, value]
+        repeated = {
+            "--columns": self.columns,
+            "--joint-names": self.joint_names,
+            "--scale": self.scale,
+            "--reader-option": self.reader_options,
+        }
+        for option, values in repeated.items():
+            for value in values:
+                words += [option, value]
+        if self.drop_duplicates:
+            words.append("--drop-duplicates")
+        return "".join(f" {shlex.quote(word)}" for word in words)
 
     def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
         """Read every log that some paths stand for, on all cores."""

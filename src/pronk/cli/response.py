@@ -82,12 +82,16 @@ def response(
     console.show(response_table(rows))
     for note in notes:
         console.say(f"note: {note}")
-    robot_name = robot or logs[0].robot or "ROBOT"
+    robot_name = robot or logs[0].robot
+    if robot_name in ("", "unknown"):
+        robot_name = "ROBOT"
     logs_stated = " ".join(str(path) for path in paths)
     return console.Outcome(
         figures={"responses": rows, "written": written},
         wrote=written,
-        following=[f"pronk match {logs_stated} --robot {robot_name} --out gains.yaml"],
+        following=[
+            f"pronk match {logs_stated} --robot {robot_name}{reading.words()} --out gains.yaml"
+        ],
     )
 
 

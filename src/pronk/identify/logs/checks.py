@@ -47,6 +47,10 @@ _LAGS_S = (0.0, 0.02, 0.04, 0.08, 0.15, 0.3)
 """Delays of a position behind its command that are tried where a command is guessed [s]."""
 _LEAST_CORRELATION = 0.5
 """Least correlation of a guessed command, delayed, with the position."""
+_CLOSE_CORRELATION = 0.8
+"""Correlation of a position that follows closely."""
+_CLOSE_SLOPE = 0.3
+"""Difference from one of the slope of a position that follows closely over its command."""
 _TRAVEL_RATIOS = (0.2, 5.0)
 """Travel of a position over that of its guessed command."""
 
@@ -178,16 +182,19 @@ def check_motion(excitation: Excitation) -> None:
         )
 
 
-def position_follows(time: Array, command: Array, position: Array) -> bool:
+def position_follows(
+    time: Array, command: Array, position: Array, *, closely: bool = False
+) -> bool:
     """Return True if a position moves as if some numbers were the commands to it.
 
     Numbers that do not move are accepted. Torques and speeds differ from the position in size, in
-    their middle, or in phase.
+    their middle, or in phase; a torque against gravity may not.
 
     Args:
         time: Timestamps [s], shape (n,).
         command: The numbers, shape (n,).
         position: Position in the same unit, shape (n,).
+        closely: True to ask for a motion of nearly the same size, as of a stiff joint.
     """
     travel = float(np.ptp(command))
     moved = float(np.ptp(position))
@@ -199,7 +206,13 @@ def position_follows(time: Array, command: Array, position: Array) -> bool:
         return False
     for lag in _LAGS_S:
         delayed = np.interp(time - lag, time, command)
-        if np.ptp(delayed) > 0.0 and np.corrcoef(delayed, position)[0, 1] > _LEAST_CORRELATION:
+        if np.ptp(delayed) == 0.0:
+            continue
+        correlation = float(np.corrcoef(delayed, position)[0, 1])
+        slope = correlation * float(np.std(position) / np.std(delayed))
+        if not closely and correlation > _LEAST_CORRELATION:
+            return True
+        if correlation > _CLOSE_CORRELATION and abs(slope - 1.0) < _CLOSE_SLOPE:
             return True
     return False
 

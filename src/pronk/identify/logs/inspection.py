@@ -68,13 +68,15 @@ _POSITION_WORDS = frozenset(
     ("pos", "position", "q", "angle", "theta", "enc", "encoder", "y", "winkel")
 )
 _MEASURED_WORDS = frozenset(
-    ("act", "actual", "meas", "measured", "ist", "fb", "feedback", "state", "real")
+    ("act", "actual", "meas", "measured", "ist", "fb", "feedback", "state", "real", "present")
 )
 _VELOCITY_WORDS = frozenset(("vel", "velocity", "dq", "qd", "qdot", "speed", "omega", "rate"))
 _TORQUE_WORDS = frozenset(("tau", "torque", "effort", "trq", "moment"))
 _OTHER_WORDS = frozenset(
     ("current", "amp", "amps", "voltage", "volt", "temp", "temperature", "kp", "kd", "acc", "error")
 )
+_VAGUE_COMMANDS = frozenset(("u", "set", "input"))
+"""Names of commands that may be torques as well."""
 _KINDS = {
     "other": _OTHER_WORDS,
     "velocity": _VELOCITY_WORDS,
@@ -246,9 +248,12 @@ def _inspect_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> L
         for joint in log.excited_joints:
             column = log.column(joint)
             command = log.command[:, column]
-            if not position_follows(log.time, command, log.position[:, column]):
+            name = chosen.get(f"command.{joint}", "")
+            # In control engineering u is the input of a plant, often a torque.
+            closely = name.casefold() in _VAGUE_COMMANDS
+            if not position_follows(log.time, command, log.position[:, column], closely=closely):
                 questions.append(
-                    f"{chosen.get(f'command.{joint}', 'the command')} may be no commanded position "
+                    f"{name or 'the command'} may be no commanded position "
                     f"of {joint}, as the position does not follow it; say what the columns are "
                     f"with --columns command.{joint}=NAME,position.{joint}=NAME (or torque.{joint})"
                 )
@@ -296,6 +301,8 @@ def _parts_of(table: CsvTable, index: int) -> _Parts:
         if is_unit and not parts.unit and len(words) > 1:
             parts.unit = word
             kind = "unit"
+        elif word in _TIME_UNIT_WORDS and parts.unit in _ANGLE_WORDS:
+            kind = "unit"  # Of rad/s or deg/s.
         else:
             for name_of_kind, kind_words in _KINDS.items():
                 if word in kind_words:
@@ -306,6 +313,8 @@ def _parts_of(table: CsvTable, index: int) -> _Parts:
             for character in range(*match.span()):
                 rest[character] = "_"
     kinds.discard("unit")
+    if "current" in words and "position" in kinds:
+        kinds.discard("other")  # The current position is no electric current.
     first = words[0] if words else ""
     is_unit_of_time = len(words) == 1 and first in _TIME_UNIT_WORDS
     if is_unit_of_time or (0 < len(words) <= 2 and first in _TIME_WORDS):
