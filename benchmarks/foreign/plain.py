@@ -208,7 +208,7 @@ def peaks(
         mujoco.mjtDisableBit.mjDSBL_LIMIT,
     ):
         spec.option.disableflags |= flag
-    for elements in (spec.actuators, spec.tendons, spec.keys, spec.sensors):
+    for elements in (spec.actuators, spec.equalities, spec.tendons, spec.keys, spec.sensors):
         for element in list(elements):
             spec.delete(element)
     for name, held in chain.items():

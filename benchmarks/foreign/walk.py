@@ -29,6 +29,7 @@ LIMIT_S = 900.0
 FITTING = re.compile(r"amplitude of ([0-9.e+-]+) rad fits")
 """Where a refusal of a sweep says which amplitude fits."""
 NOT_BETTER_STATUS = 3
+NO_MATCH_STATUS = 4
 PEAK_DIFFERENCE = 0.1
 """Largest difference of a planned peak, as a share of MuJoCo's."""
 Row = dict[str, Any]
@@ -61,6 +62,12 @@ def pronk(folder: Path, *words: str) -> Row:
     }
 
 
+def sentence_of(said: str) -> str:
+    """Return the sentence with which a command ended, among what it printed beside it."""
+    lines = [line for line in said.split("\n") if line.startswith("pronk: ")]
+    return lines[-1] if lines else " ".join(said.split())[-300:]
+
+
 def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row:
     """Take one robot from its model to its exports; return how far it went, and its numbers.
 
@@ -91,7 +98,7 @@ def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row
         if done["status"] in accepted:
             row["reached"] = name
             return True
-        row["refusal"] = done["said"].strip().split("\n")[-1]
+        row["refusal"] = sentence_of(done["said"])
         row["refused_at"] = name
         row["status"] = done["status"]
         return False
@@ -116,6 +123,9 @@ def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row
     compare_peaks(robot_file, model, joint, folder / "sweep.json", row)
     match = ["match", "logs", "--robot", "robot.yaml", "--out", "gains.yaml"]
     if not step("match", *match, "--json", "match.json", accepted=(0, NOT_BETTER_STATUS)):
+        if row["status"] == NO_MATCH_STATUS:
+            figures = json.loads((folder / "match.json").read_text(encoding="utf-8"))
+            row["refusal"] = "; ".join(figures["flags"][joint])
         return row
     for target, name in (("mjlab", "actuators.py"), ("mjcf", "matched.xml")):
         export = ["export", "gains.yaml", "--to", target, "--out", name, "--robot", "robot.yaml"]
