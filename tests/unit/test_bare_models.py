@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import mujoco
@@ -528,6 +529,12 @@ def test_the_effort_limit_is_compared_with_stiffness_and_gravity(tmp_path: Path)
         "<mujoco><worldbody><flexcomp name='f' type='grid' count='5000 5000 50' "
         "spacing='1 1 1'/></worldbody></mujoco>",
         "<mujoco><include file='robot.xml'/></mujoco>",
+        "<mujoco><asset><model name='m' file='robot.xml'/></asset><worldbody>"
+        "<attach model='m' prefix='a'/></worldbody></mujoco>",
+        "<mujoco><size nuser_body='1000000000'/><worldbody><body><joint/><geom size='.1'/></body>"
+        "</worldbody></mujoco>",
+        "<mujoco><asset><mesh name='m' builtin='supersphere' params='100000 1 1'/></asset>"
+        "<worldbody><body><joint/><geom type='mesh' mesh='m'/></body></worldbody></mujoco>",
         "<mujoco><option timestep='nan'/><worldbody><body><joint/><geom size='nan'/></body>"
         "</worldbody></mujoco>",
         "<mujoco",
@@ -563,3 +570,13 @@ def test_limits_that_are_not_stated_leave_room_for_the_gains_and_the_smallest_ra
     file.write_text(file.read_text() + "limits: {stiffness: 950.0, margin: 0.01}\n")
     stated = load_robot(file).limits
     assert (stated.stiffness, stated.margin) == (950.0, 0.01)
+
+
+def test_a_pipe_in_place_of_a_mesh_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.stl")
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        "<mujoco><asset><mesh name='m' file='pipe.stl'/></asset><worldbody><body><joint/>"
+        "<geom type='mesh' mesh='m'/></body></worldbody></mujoco>"
+    )
+    refused("robot", "new", path)

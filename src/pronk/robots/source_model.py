@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Mapping
@@ -17,8 +18,11 @@ from pronk.robots.urdf import PlainUrdf, plain_urdf
 
 MAX_BYTES = 64_000_000
 """Largest file of a model; humanoids with all their parts have some 1 MB."""
-MAX_ELEMENTS = 500_000
-"""Largest number of elements of a model with its replicates."""
+MAX_ELEMENTS = 20_000
+"""Largest number of elements of a model with its replicates; a fruit fly with all its parts has
+2,000."""
+MAX_USER_NUMBERS = 100_000
+"""Largest number of user data, keyframes and constraints that a model reserves."""
 MAX_DEPTH = 400
 """Deepest nesting of elements; MuJoCo's reader calls itself for each level."""
 MAX_SAMPLES = 100_000_000
@@ -27,7 +31,9 @@ SMALLEST_MASS = 1e-4
 """Mass of a link of a URDF that moves and has none [kg]."""
 SMALLEST_INERTIA = 1e-8
 """Moment of inertia of such a link, as of a ball of 0.1 g and 16 mm [kg m^2]."""
-SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample")
+SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample", "num", "dim")
+FOLDERS = ("meshdir", "texturedir", "assetdir")
+"""Attributes that name the folder of files."""
 """Attributes whose product is the number of samples of an element."""
 COMMENT = re.compile("<!--.*?-->", re.DOTALL)
 """A comment of XML."""
@@ -76,14 +82,15 @@ class SourceModel:
 
     def has_mass(self, joint: int) -> bool:
         """Return whether a joint carries more than links without mass."""
+        if not self.is_urdf:
+            return True
         body = self.model.jnt_bodyid[joint]
         subtree = [body]
         for other in range(body + 1, self.model.nbody):
             if self.model.body_parentid[other] in subtree:
                 subtree.append(other)
         mass = float(self.model.body_subtreemass[body])
-        has_mass: bool = mass > 1.01 * SMALLEST_MASS * len(subtree)
-        return not self.is_urdf or has_mass
+        return mass > 1.01 * SMALLEST_MASS * len(subtree)
 
     @property
     def base_joint(self) -> int:
@@ -283,15 +290,16 @@ def _check_size(path: Path) -> None:
     Tags are found as they stand, so that XML that only MuJoCo's reader accepts is checked too.
     """
     pending = [path]
-    seen = set()
+    files_of: dict[Path, list[Path]] = {}
     total = 0
     while pending:
         file = pending.pop()
-        if file in seen or not file.is_file():
+        if file in files_of or not file.is_file():
             continue
-        seen.add(file)
+        files_of[file] = []
         text = COMMENT.sub("", file.read_text(encoding="utf-8", errors="replace"))
         copies = [1]  # of the elements inside each open element
+        folders = [file.parent, path.parent]
         for match in TAG.finditer(text):
             closing, name, attribute_text, empty = match.groups()
             if closing:
@@ -301,26 +309,53 @@ def _check_size(path: Path) -> None:
             attributes = dict(ATTRIBUTE.findall(attribute_text))
             total += copies[-1]
             inside = copies[-1]
-            samples = 1.0
             if name == "replicate":
                 inside = min(inside * int(_product(attributes.get("count", "1"))), MAX_SAMPLES)
-            else:
-                for attribute in SIZES:
-                    samples *= _product(attributes.get(attribute, "1"))
-            if name == "include" and "file" in attributes:
-                pending.append(file.parent / attributes["file"])
-                pending.append(path.parent / attributes["file"])
             if not empty:
                 copies.append(inside)
             if len(copies) > MAX_DEPTH:
                 raise RobotError(
                     f"{file}: elements are nested over {MAX_DEPTH} deep; expected a robot."
                 )
-            if samples > MAX_SAMPLES or total > MAX_ELEMENTS:
+            if total > MAX_ELEMENTS or _samples(name, attributes) > MAX_SAMPLES:
                 raise RobotError(
                     f"{file}: element {name} makes the model too large; expected at most "
                     f"{MAX_ELEMENTS:,} elements and {MAX_SAMPLES:,} samples of an element."
                 )
+            for attribute in FOLDERS:
+                if attribute in attributes:
+                    folders.append(path.parent / attributes[attribute])
+            for folder in folders:
+                target = folder / attributes.get("file", "")
+                if "file" in attributes and target.exists():
+                    if not target.is_file():
+                        raise RobotError(f"{file}: {attributes['file']} is no file.")
+                    if name in ("include", "model"):
+                        files_of[file].append(target.resolve())
+        files_of[file.resolve()] = files_of[file]
+        pending.extend(files_of[file])
+    _check_cycles(path.resolve(), files_of, (path.resolve(),))
+
+
+def _samples(name: str, attributes: Mapping[str, str]) -> float:
+    """Return how many samples an element asks for: pixels, points, parts or user numbers."""
+    samples = 1.0
+    if name == "size":
+        for attribute, value in attributes.items():
+            if attribute != "memory" and _product(value) > MAX_USER_NUMBERS:
+                samples = math.inf
+    elif name != "replicate":
+        for attribute in SIZES:
+            samples *= _product(attributes.get(attribute, "1"))
+    return samples
+
+
+def _check_cycles(file: Path, files_of: Mapping[Path, list[Path]], above: tuple[Path, ...]) -> None:
+    """Refuse a file that includes or attaches itself, also through others."""
+    for target in files_of.get(file, ()):
+        if target in above or len(above) > MAX_DEPTH:
+            raise RobotError(f"{file}: includes or attaches {target.name}, which leads back to it.")
+        _check_cycles(target, files_of, (*above, target))
 
 
 def _product(text: str) -> float:
