@@ -8,7 +8,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -191,6 +191,43 @@ def written_whole(path: Path) -> Iterator[Path]:
         if isinstance(error, OSError):
             raise PronkError(f"{path}: cannot be written ({error.strerror or error}).") from error
         raise
+
+
+@contextmanager
+def locked_folder(path: Path) -> Iterator[None]:
+    """Keep a folder to this process inside the block; missing folders are made.
+
+    No file is left behind. A folder that was made for the block is removed if the block raises and
+    leaves it empty.
+
+    Raises:
+        PronkError: Another process has the folder, or it cannot be made.
+    """
+    import fcntl  # Not on every system; only recordings need it.
+
+    made = not path.exists()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise PronkError(f"{path}: no folder to write to ({error.strerror or error}).") from None
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise PronkError(
+                f"{path}: another command is writing to this folder; wait until it has ended, or "
+                "give another folder."
+            ) from None
+        try:
+            yield
+        except BaseException:
+            if made:
+                with suppress(OSError):
+                    path.rmdir()
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def write_text(path: Path, text: str) -> None:

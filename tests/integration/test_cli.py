@@ -65,7 +65,9 @@ def test_every_command_has_help(command):
     [
         (PronkError("got this,\nexpected that."), 2),
         (KeyboardInterrupt(), 130),
-        (MemoryError(), 1),
+        (MemoryError(), 2),
+        (OSError(28, "No space left on device"), 2),
+        (BrokenPipeError(32, "Broken pipe"), 2),
         (ZeroDivisionError("division by zero"), 1),
     ],
 )

@@ -6,6 +6,7 @@ piped into a file.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import select
@@ -35,14 +36,22 @@ _POLL_S = 0.2
 """Time between two looks at standard input while a person works at the rig [s]."""
 
 
+class PipeConsole(Console):
+    """A console that lets the caller know that the reader of a pipe has closed it."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise the error again: rich would end the program with a status of its own."""
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+
 def err() -> Console:
     """Return standard error, made anew each time, so that a redirected stream is found."""
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return PipeConsole(stderr=True, highlight=False, soft_wrap=True)
 
 
 def say(text: str) -> None:
     """Print one line to standard output."""
-    Console(highlight=False, soft_wrap=True).print(text, markup=False)
+    PipeConsole(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
 def note(text: str, style: str | None = None) -> None:
@@ -115,9 +124,9 @@ def show(table: Table) -> None:
         rich_table.add_column(Text(column.title), justify=justify, no_wrap=is_name)  # type: ignore[arg-type]
     for text_row in text_rows:
         rich_table.add_row(*map(Text, text_row))
-    console = Console(highlight=False)
+    console = PipeConsole(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=_PIPED_WIDTH)
+        console = PipeConsole(highlight=False, width=_PIPED_WIDTH)
     console.print(rich_table)
     for sentence in table.notes:
         say(f"  {sentence}")

@@ -1,25 +1,30 @@
 """The command line: each command is a function whose parameters tyro makes into options.
 
 A command that returns an `Outcome` also has the option `--json`. Bad input ends with one sentence
-on standard error and exit status 2. Any other exception is a defect of pronk, is named so, and
-ends with 1 (`PRONK_DEBUG=1` prints the traceback).
+on standard error and exit status 2, and so does what the machine cannot do. Any other exception is
+a defect of pronk, is named so, and ends with 1 (`PRONK_DEBUG=1` prints the traceback). All exit
+statuses are in `pronk.exit_status`.
 """
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import dataclasses
+import errno
 import inspect
 import io
 import os
 import pkgutil
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
 from pronk.opengl import keep_opengl_out
 from pronk.version import VERSION
 
@@ -57,6 +62,22 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 }
 """Name of a command: where its function is, and what it does."""
 
+PLAIN_CHARACTERS = {"±": "+-", "²": "^2", "°": " deg", "µ": "u", "…": "...", "–": "-", "·": "*"}
+"""Characters for terminals whose encoding has no others; "?" stands for all that are not here."""
+MACHINE_ERRORS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+    errno.EIO,
+)
+"""Errors of the operating system that say what the machine or its user cannot do, whatever pronk
+does: a full disk or quota, a folder without permission, too many open files, a bad disk."""
 _JSON_PARAMETER = "json_file"
 """Parameter of the option `--json`, which commands with an `Outcome` get."""
 
@@ -74,31 +95,44 @@ def run(
         program: The program's name, for messages.
     """
     try:
-        return _dispatch(commands, list(arguments), program)
+        status = _dispatch(commands, list(arguments), program)
+        if sys.stdout is not None:
+            sys.stdout.flush()  # A full disk or a closed pipe shows here at the latest.
+        return status
     except SystemExit as stop:  # The help of a command was printed.
         return int(stop.code or 0)
-    except BrokenPipeError:
-        sys.stderr.close()  # The reader of a pipe has closed it.
-        return 0
-    except PronkError as error:
-        status = 2
-        message = str(error)
     except KeyboardInterrupt:
-        status = 130
+        status = ExitStatus.INTERRUPTED
         message = "interrupted."
-    except MemoryError:
-        status = 1
-        message = "out of memory; give fewer logs or joints at a time."
     except Exception as error:
-        if os.environ.get("PRONK_DEBUG"):
+        status, message = _failure(error)
+        if status == ExitStatus.DEFECT and os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
-        status = 1
-        message = (
-            f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
-            "PRONK_DEBUG=1 shows where it happened."
-        )
-    print(f"pronk: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    with contextlib.suppress(OSError):  # Standard error may be closed or full as well.
+        print(f"pronk: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
     return status
+
+
+def _failure(error: Exception) -> tuple[ExitStatus, str]:
+    """Return the exit status and the sentence of a command that ended with an error."""
+    if isinstance(error, PronkError):
+        return ExitStatus.REFUSED, str(error)
+    if isinstance(error, BrokenPipeError):
+        return ExitStatus.REFUSED, (
+            "standard output was closed before everything was printed; files that were not named "
+            "as written may be missing."
+        )
+    if isinstance(error, MemoryError):
+        return ExitStatus.REFUSED, "out of memory; give fewer logs or joints at a time."
+    if isinstance(error, OSError) and error.errno in MACHINE_ERRORS:
+        place = f"{error.filename}: " if error.filename else "the output cannot be written: "
+        return ExitStatus.REFUSED, (
+            f"{place}{error.strerror}; make room or give another place, then run the command again."
+        )
+    return ExitStatus.DEFECT, (
+        f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
+        "PRONK_DEBUG=1 shows where it happened."
+    )
 
 
 def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], program: str) -> int:
@@ -225,7 +259,53 @@ def main() -> None:
     # Matrices are small here, and threads of the linear algebra would take the cores from those of
     # the simulations: a match of twelve joints takes 6.8 s in place of 9.2 s on two cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.exit(run(sys.argv[1:]))
+    _print_plain_characters()
+    with contextlib.suppress(ValueError):  # Signals are for the main thread alone.
+        signal.signal(signal.SIGTERM, _interrupt)
+    if sys.stdout is None:
+        if sys.stderr is not None:
+            sys.stderr.write("pronk: standard output is closed; give it a place, as in >out.txt.\n")
+        sys.exit(ExitStatus.REFUSED)
+    status = run(sys.argv[1:])
+    _abandon_broken_output()
+    sys.exit(status)
+
+
+def _print_plain_characters() -> None:
+    """Print characters that the terminal's encoding does not have as others that look alike."""
+    codecs.register_error("pronk-plain", _plain_characters)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="pronk-plain")
+
+
+def _plain_characters(error: UnicodeError) -> tuple[str, int]:
+    """Return plain characters for those that cannot be encoded, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start : error.end]
+    return "".join(PLAIN_CHARACTERS.get(character, "?") for character in text), error.end
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    """End as Ctrl-C does, so that temporary files are removed."""
+    raise KeyboardInterrupt
+
+
+def _abandon_broken_output() -> None:
+    """Send what a full or closed standard output did not take to nowhere.
+
+    Python would otherwise try to write it once more as it ends, and fail with a message of its own.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if stream is None:
+            continue
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(nowhere, stream.fileno())
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,7 +12,8 @@ import tyro
 
 from pronk.cli import console
 from pronk.cli.link_options import LinkOptions
-from pronk.errors import HardwareError
+from pronk.errors import HardwareError, PronkError
+from pronk.files import locked_folder
 from pronk.tables import Column, Table
 
 if TYPE_CHECKING:
@@ -101,25 +103,27 @@ def sweep(
             params_file = None if stated_file is None else str(stated_file)
             params = load_sim_params(params_file, spec)
             params.check_joints(spec.joint_names, params_file or "sim_params")
-            figures["logs"] = sweep_virtual(
-                plan,
-                params,
-                out,
-                seed=int(address.options.get("seed", 0)),
-                processes=os.cpu_count() or 1,
-                overwrite=overwrite,
-                progress=progress,
-            )
+            with locked_folder(out), new_logs_removed_on_failure(out):
+                figures["logs"] = sweep_virtual(
+                    plan,
+                    params,
+                    out,
+                    seed=int(address.options.get("seed", 0)),
+                    processes=os.cpu_count() or 1,
+                    overwrite=overwrite,
+                    progress=progress,
+                )
         else:
             link = Link(robot=spec.source or spec.name, address=address, release=machine.release)
-            figures |= record_wire(
-                plan,
-                out,
-                link,
-                real_time=machine.real_time,
-                overwrite=overwrite,
-                progress=progress,
-            )
+            with locked_folder(out):
+                figures |= record_wire(
+                    plan,
+                    out,
+                    link,
+                    real_time=machine.real_time,
+                    overwrite=overwrite,
+                    progress=progress,
+                )
     recorded = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
     console.say(f"wrote {len(figures['logs'])} logs of {recorded} to {out}")
     lateness = figures.get("servo")
@@ -136,6 +140,28 @@ def sweep(
             f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
         ],
     )
+
+
+@contextmanager
+def new_logs_removed_on_failure(out: Path) -> Iterator[None]:
+    """Remove the logs that a sweep of the virtual robot has begun if it fails.
+
+    A sweep of the virtual robot can be repeated at will; one of a robot keeps what it recorded.
+
+    Raises:
+        PronkError: The logs cannot be written, as on a full disk.
+    """
+    before = set(out.glob("*.mcap"))
+    try:
+        yield
+    except BaseException as error:
+        for path in set(out.glob("*.mcap")) - before:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise PronkError(
+                f"{out}: the logs cannot be written ({error.strerror or error})."
+            ) from error
+        raise
 
 
 def _signal(name: SignalName) -> Signal:
