@@ -17,7 +17,12 @@ from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.segment import Segment
 from pronk.identify.match.gains import load_gains, save_gains
 from pronk.identify.match.match import match
-from pronk.identify.match.torque_fit import fit_torque, fit_torque_drives, with_torque
+from pronk.identify.match.torque_fit import (
+    fit_torque,
+    fit_torque_drives,
+    left_out_by_torque,
+    with_torque,
+)
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -203,6 +208,28 @@ def column_options() -> list[str]:
         words += ["--columns", f"position.{joint}=pos_meas{number}"]
         words += ["--columns", f"torque.{joint}=tau_meas{number}"]
     return words
+
+
+def test_an_angle_that_counts_from_the_base_is_not_dropped_without_a_word(
+    logs: list[JointLog],
+) -> None:
+    for torque_too in (False, True):
+        absolute = []
+        for log in logs:
+            assert log.torque is not None
+            position = log.position.copy()
+            torque = log.torque.copy()
+            position[:, 1] += position[:, 0]
+            if torque_too:
+                torque[:, 0] -= torque[:, 1]
+            absolute.append(
+                replace(log, command=0.0 * log.command, position=position, torque=torque)
+            )
+        with pytest.raises(IdentifiabilityError, match=r"elbow.*count from the base"):
+            match(absolute, rig(), mode="drive")
+        # Beside a commanded motion the joints are left out with their reason.
+        reasons = left_out_by_torque(fit_torque_drives(absolute, rig()), ())
+        assert set(reasons) == set(JOINTS)
 
 
 @recorded

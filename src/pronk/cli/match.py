@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -130,8 +131,6 @@ def match_command(
     positions = tables.positions_table(result)
     if positions.rows:
         console.show(positions)
-        for name, reason in result.excluded.items():
-            console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
         figures["mode"] = mode
         figures["held"] = {}
         figures["rmse"] = {}
@@ -139,6 +138,8 @@ def match_command(
             if joint.fit.held:
                 figures["held"][name] = joint.fit.held
             figures["rmse"][name] = {"nominal": joint.fit.nominal_rmse, "matched": joint.fit.rmse}
+    for name, reason in result.excluded.items():
+        console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
     if frameworks:
         comparison = tables.simulators_table(results, members)
         console.show(comparison)
@@ -169,10 +170,21 @@ def next_commands(result: MatchResult, out: Path) -> list[str]:
     if result.gains.unmatched:
         joints = ", ".join(result.gains.unmatched)
         return [f"record {joints} again; --allow-unmatched exports these gains all the same"]
+    if by_torque_alone(result):
+        robot = result.robot_path or result.robot
+        return [f"pronk sweep {robot} --out LOGS, for torque tells no gains: match that sweep"]
     return [
         f"pronk predict FRESH_LOG --gains {out}",
         f"pronk export {out} --to mjlab --out actuators.py",
     ]
+
+
+def by_torque_alone(result: MatchResult) -> bool:
+    """Return whether no joint of a match was compared with a commanded motion."""
+    for joint in result.joints.values():
+        if joint.responses is not None or not math.isnan(joint.fit.rmse):
+            return False
+    return True
 
 
 def joints_of_groups(robot: RobotSpec, result: MatchResult) -> dict[str, list[str]]:

@@ -60,7 +60,7 @@ from pronk.identify.match.result import (
 )
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
-from pronk.identify.match.torque_fit import fit_torque_drives, with_torque
+from pronk.identify.match.torque_fit import fit_torque_drives, left_out_by_torque, with_torque
 from pronk.identify.match.torque_limit import MISFIT, fit_torque_limit
 from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.response.estimate import resolution_note
@@ -244,7 +244,8 @@ def match(
                 zero_armature=zero_armature,
             )
             progress("responses", len(joints) / len(fits))
-        result = match_result(simulation, simulation.info(rigs), joints, logs, method=method)
+        excluded = left_out_by_torque(torque_fits, joints)
+        result = match_result(simulation, simulation.info(rigs), joints, logs, excluded, method)
         return replace(result, gain_uncertainty=settings.gain_uncertainty)
 
 
@@ -429,6 +430,7 @@ def match_chains(
         gains = joint_gains(fit, robot, responses.get(name), flags)
         gains = replace(gains, physical=physical.get(name, {}))
         joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
+    excluded = left_out_by_torque(torque_fits, joints) | excluded
     result = match_result(simulation, simulation.info(), joints, logs, excluded)
     return replace(result, gain_uncertainty=settings.gain_uncertainty)
 
@@ -562,11 +564,15 @@ def match_by_torque(
         reasons: dict[str, None] = {}
         for fit in torque_fits.values():
             reasons.update(dict.fromkeys(fit.flags))
+        if not reasons:
+            for name, reason in left_out_by_torque(torque_fits, joints).items():
+                reasons[f"{name}: {reason}"] = None
         raise IdentifiabilityError(
             f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
             f"by torque: {'; '.join(reasons) or 'record larger or faster motions'}."
         )
-    return match_result(simulation, simulation.info(), joints, logs)
+    excluded = left_out_by_torque(torque_fits, joints)
+    return match_result(simulation, simulation.info(), joints, logs, excluded)
 
 
 def match_result(

@@ -27,7 +27,8 @@ as right: recordings that begin at rest show it, and in the fit it passes for gr
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -80,6 +81,11 @@ LINKS_HOLD = 1.05
 """Residual with the model's links over that with fitted links up to which the model's hold. On
 simulated logs it is 1.002 or less with the right links, and 1.14 or more with a link 2 % too heavy,
 which makes the armature of the joint before it 12 % too large."""
+UNEXPLAINED_MAX = 0.5
+"""Residual over the torque, from which on the equation of motion does not hold: a quarter of the
+torque's power. On simulated rigs it is 0.02, on the AK80-6 recordings 0.1 to 0.2."""
+EXPLAINED_BY_OTHERS = 0.25
+"""Residual over the torque below which another meaning of the angles is named."""
 MOVES_RAD_S = 2.0 * SIGN_RAD_S
 """Root mean square speed below `FIT_HZ` from which on a joint moves [rad/s]. In sweeps of one joint
 the excited one moves at 0.5 rad/s, its neighbours at 0.01."""
@@ -281,6 +287,8 @@ class TorqueFit:
     """Number of independent combinations of parameters that the recordings show."""
     rms: Array
     """Residual of each joint's torque below `FIT_HZ` [N m], shape (joints,)."""
+    unexplained: Array
+    """That residual over the torque's own root mean square about its mean, shape (joints,)."""
     blocks: int
     """Number of blocks that the intervals rest on."""
     model: TorqueModel
@@ -413,8 +421,18 @@ def _solve(
         joints[joint] = {}
         for term in ("scale", *DRIVE_TERMS):
             joints[joint][term] = solution.parameter(joint, term, links_torque)
+    moved = np.where(design.any(axis=2), torque, np.nan)
+    deviation = np.full(joint_count, np.inf)
+    for column in np.flatnonzero(counts):
+        deviation[column] = np.nanstd(moved[:, column])
     return TorqueFit(
-        joints=joints, coefficients=x, rank=rank, rms=rms, blocks=len(moves), model=model
+        joints=joints,
+        coefficients=x,
+        rank=rank,
+        rms=rms,
+        unexplained=rms / np.maximum(deviation, 1e-12),
+        blocks=len(moves),
+        model=model,
     )
 
 
@@ -576,6 +594,19 @@ def _fit_chain_torque(
     with_fitted_links = fit_torque(
         logs, robot, root, links_known=False, shared=equal_drives, most_s=most_s
     )
+    least = np.minimum(with_known_links.unexplained, with_fitted_links.unexplained)
+    if least.max() > UNEXPLAINED_MAX:
+        reason = (
+            f"the equation of motion leaves {100.0 * least.max():.0f} % of the torque of "
+            f"{chain[int(np.argmax(least))]} unexplained{_other_angles(logs, robot, root, chain)}"
+        )
+        unexplained = {}
+        for name in chain:
+            torque = {}
+            for term, parameter in with_known_links.joints[name].items():
+                torque[term] = replace(parameter, value=np.nan, reason=reason)
+            unexplained[name] = _torque_drive(robot.joint(name), torque, ())
+        return unexplained
     links_hold = bool((with_known_links.rms <= LINKS_HOLD * with_fitted_links.rms).all())
     fits = {}
     for index, (name, drive) in enumerate(with_known_links.joints.items()):
@@ -595,6 +626,40 @@ def _fit_chain_torque(
             drive = with_fitted_links.joints[name]
         fits[name] = _torque_drive(robot.joint(name), {**drive, "scale": scale}, flags)
     return fits
+
+
+def _other_angles(
+    logs: Sequence[JointLog], robot: RobotSpec, root: str, chain: Sequence[str]
+) -> str:
+    """Say whether the torque is explained by angles that count from the base; empty if not.
+
+    The links of some arms are driven by belts from the base: the encoder of the second joint then
+    shows the angle of its link, and its motor pushes against the base.
+    """
+    for torque_too in (False, True):
+        relative = []
+        for log in logs:
+            assert log.torque is not None
+            position = log.position.copy()
+            torque = log.torque.copy()
+            for before, name in itertools.pairwise(chain):
+                position[:, log.column(name)] -= log.position[:, log.column(before)]
+            if torque_too:
+                for before, name in reversed(list(itertools.pairwise(chain))):
+                    torque[:, log.column(before)] += torque[:, log.column(name)]
+            relative.append(replace(log, position=position, torque=torque))
+        most_s = MOST_S / len(logs)
+        fit = fit_torque(relative, robot, root, links_known=True, most_s=most_s)
+        if fit.unexplained.max() < EXPLAINED_BY_OTHERS:
+            torque_words = ""
+            if torque_too:
+                torque_words = ", and add the torques of later joints to those before"
+            return (
+                f"; it leaves {100.0 * fit.unexplained.max():.0f} % if the angles of the file "
+                "count from the base and not from the link before: take the differences of the "
+                f"columns{torque_words}"
+            )
+    return ""
 
 
 def _torque_drive(
@@ -655,6 +720,40 @@ def with_torque(
             flag = f"{', '.join(names)}: not fitted but those of the robot's file"
             joined[joint] = replace(by_torque, flags=(*by_torque.flags, flag))
     return joined
+
+
+def left_out_by_torque(
+    torque_fits: Mapping[str, DriveFit], joints: Collection[str]
+) -> dict[str, str]:
+    """Say of joints with torque why they are in no result.
+
+    Args:
+        torque_fits: Drives by `fit_torque_drives`.
+        joints: Names of the joints that have a result.
+
+    Returns:
+        A sentence for each joint that is left out.
+    """
+    reasons = {}
+    for name, fit in torque_fits.items():
+        if name in joints:
+            continue
+        causes: dict[str, list[str]] = {}
+        for term, parameter in fit.torque.items():
+            if parameter.reason:
+                causes.setdefault(parameter.reason, []).append(term)
+        words = [f"{', '.join(terms)}: {cause}" for cause, terms in causes.items()]
+        if len(causes) == 1:
+            words = list(causes)
+        words.extend(fit.flags)
+        reason = f"torque identifies none of its parameters ({'; '.join(words) or 'no motion'})"
+        if any(cause.startswith("negative") for cause in causes):
+            reason += (
+                "; check that its angle counts from the link before it, which that of a link "
+                "driven by a belt from the base does not, and the sign of its torque"
+            )
+        reasons[name] = reason
+    return reasons
 
 
 def _identifies(fit: DriveFit) -> bool:
