@@ -447,6 +447,28 @@ def test_chunks_that_unpack_to_much_are_refused(
         read(whole)
 
 
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_images_in_a_bag_take_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    def build(builder: Builder) -> list[Message]:
+        messages = list(commanded()(builder))
+        image = "sensor_msgs/msg/CompressedImage"
+        noise = np.random.default_rng(0).integers(0, 255, 2**20, dtype=np.uint8)
+        for k in range(8):
+            picture = builder.store.types[image](
+                header=builder.header(nano(k)), format="jpeg", data=noise
+            )
+            messages.append(("/camera", image, nano(k), picture))
+        return messages
+
+    path = write_bag(tmp_path / "bag", build, kind)
+    monkeypatch.setenv(SIZE_LIMIT, "4")
+    assert_elbow(read(path))
+    with pytest.raises(LogError, match=r"/camera \(sensor_msgs/msg/CompressedImage\)"):
+        read(path, command_topic="/elsewhere")
+
+
 def test_metadata_that_names_a_file_elsewhere_is_not_followed(tmp_path: Path) -> None:
     folder = write_bag(tmp_path / "bag", commanded())
     (file,) = folder.glob("*.mcap")

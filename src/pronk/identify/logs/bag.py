@@ -20,7 +20,7 @@ from mcap.records import Schema
 
 from pronk.errors import LogError, printable
 from pronk.files import check_regular, check_size, max_bytes, read_yaml
-from pronk.identify.logs.mcap import Record, read_records
+from pronk.identify.logs.mcap import MessageFilter, Record, Wanted, read_records
 from pronk.identify.logs.unitree import DEFINITIONS
 
 METADATA = "metadata.yaml"
@@ -31,8 +31,13 @@ _MAX_DEFINITION = 2**18
 """Longest definition of a message [bytes]; LowState has 3 KiB."""
 
 
-def read_bag(path: Path) -> tuple[list[Record], str]:
+def read_bag(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
     """Read the messages of a bag: an MCAP, SQLite or ROS 1 file, or the folder of a rosbag2.
+
+    Args:
+        path: The bag.
+        wanted: Says which messages are kept, as bags hold images too; of every other topic the
+            first message is kept, empty.
 
     Returns:
         The messages in the order of the file, and why reading ended early ("" if it did not).
@@ -45,11 +50,11 @@ def read_bag(path: Path) -> tuple[list[Record], str]:
     damages = []
     for file in files:
         if file.suffix.lower() == ".mcap":
-            messages, damage = read_records(file)
+            messages, damage = read_records(file, wanted)
         elif file.suffix.lower() == ".bag":
-            messages, damage = _read_ros1(file)
+            messages, damage = _read_ros1(file, wanted)
         else:
-            messages, damage = _read_sqlite(file, _compression(path))
+            messages, damage = _read_sqlite(file, _compression(path), wanted)
         records += messages
         if damage:
             damages.append(damage)
@@ -79,7 +84,6 @@ def bag_files(path: Path) -> list[Path]:
         check_regular(file, LogError)
         if not file.is_file():
             raise LogError(f"{file}: no such file, which {METADATA} names.")
-        check_size(file, file.stat().st_size, LogError)
     if not files:
         raise LogError(f"{path}: no .mcap or .db3 file in it.")
     return files
@@ -98,7 +102,7 @@ def _compression(path: Path) -> str:
     return "" if mode == "none" else mode
 
 
-def _read_sqlite(path: Path, compression: str) -> tuple[list[Record], str]:
+def _read_sqlite(path: Path, compression: str, wanted: Wanted) -> tuple[list[Record], str]:
     """Read a `.db3` file; also returns why its end may be missing."""
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -114,7 +118,7 @@ def _read_sqlite(path: Path, compression: str) -> tuple[list[Record], str]:
     try:
         messages = reader.messages(reader.connections)
         unpack = _zstd if compression == "message" else None
-        return _records(path, messages, "cdr", unpack), damage
+        return _records(path, messages, "cdr", unpack, wanted), damage
     finally:
         reader.close()
 
@@ -135,7 +139,7 @@ def _check_sqlite(path: Path) -> None:
             raise LogError(f"{path}: a database with computed tables, which no recorder writes.")
 
 
-def _read_ros1(path: Path) -> tuple[list[Record], str]:
+def _read_ros1(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
     """Read a bag of ROS 1; one that was cut has to be indexed again by `rosbag reindex`."""
     from rosbags.rosbag1 import Reader
     from rosbags.rosbag1.reader import ReaderError
@@ -154,7 +158,7 @@ def _read_ros1(path: Path) -> tuple[list[Record], str]:
                 reader.chunks[position] = chunk._replace(decompressor=_bz2)
             elif chunk.decompressor is lz4.frame.decompress:
                 reader.chunks[position] = chunk._replace(decompressor=_lz4)
-        return _records(path, reader.messages(), "ros1", None), ""
+        return _records(path, reader.messages(), "ros1", None, wanted), ""
     finally:
         reader.close()
 
@@ -164,15 +168,15 @@ def _records(
     messages: Iterable[tuple[Any, int, bytes]],
     encoding: str,
     unpack: Callable[[bytes], bytes] | None,
+    wanted: Wanted,
 ) -> list[Record]:
     """Records of the messages that a reader of rosbags gives."""
     schemas: dict[tuple[int, str], Schema] = {}
+    keep = MessageFilter(wanted)
     records = []
     size = 0
     for connection, log_time, data in messages:
         content = bytes(data) if unpack is None else unpack(bytes(data))
-        size += len(content) + _MESSAGE_BYTES
-        check_size(path, size, LogError)
         key = (connection.id, connection.topic)
         if key not in schemas:
             definition = connection.msgdef
@@ -183,7 +187,11 @@ def _records(
                 encoding=notation.replace("cdr", "ros2"),
                 data=definition.data.encode(),
             )
-        records.append(Record(connection.topic, encoding, schemas[key], log_time, content))
+        record = Record(connection.topic, encoding, schemas[key], log_time, content)
+        for kept_record in keep.kept([record]):
+            records.append(kept_record)
+            size += len(kept_record.data) + _MESSAGE_BYTES
+        check_size(path, size, LogError)
     return records
 
 

@@ -31,7 +31,7 @@ from pronk.identify.logs.columns import (
     robot_names,
 )
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
-from pronk.identify.logs.mcap import Record
+from pronk.identify.logs.mcap import Record, Wanted
 from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
 from pronk.identify.logs.segmentation import MOVED_RAD
 from pronk.identify.logs.unitree import COMMAND_TYPES, STATE_TYPES, motor_joints
@@ -127,8 +127,21 @@ def read_rosbag(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Jo
     Raises:
         LogError: The bag cannot be read, or its states and commands cannot be joined.
     """
-    records, damage = read_bag(path)
+    records, damage = read_bag(path, wanted_messages(options))
     return join_topics(path, records, damage, robot, options)
+
+
+def wanted_messages(options: ReadOptions) -> Wanted:
+    """Return what says which messages of a bag are read: by their types, and of stated topics."""
+    types = frozenset((*MEASURED_TYPES, *COMMAND_TYPES, *NUMBERS, TRAJECTORY))
+    topics = (options.measured_topic, options.command_topic)
+
+    def is_wanted(record: Record) -> bool:
+        kind = "" if record.schema is None else message_type(record.schema)
+        is_own = record.topic.startswith("/sweep/")
+        return is_own or kind in types or record.topic in topics
+
+    return is_wanted
 
 
 def join_topics(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -112,13 +112,20 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     """The encoded message."""
 
 
-def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[list[Record]]:
+Wanted = Callable[[Record], bool]
+"""Says whether a message is kept; of a topic whose messages are not, the first is kept, empty."""
+
+
+def records(
+    stream: IO[bytes], size: int, most: int | None = None, wanted: Wanted | None = None
+) -> Iterator[list[Record]]:
     """Read the messages of a file, chunk by chunk, in the order written.
 
     Args:
         stream: The file, at its beginning.
         size: Size of the file, which no record can exceed [bytes].
         most: Most memory that all messages may take [bytes]; `max_bytes()` if None.
+        wanted: Says which messages are kept and counted; all of them if None.
 
     Yields:
         Messages of one chunk, or one message that stands outside of chunks.
@@ -131,16 +138,21 @@ def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[l
     limit = max_bytes() if most is None else most
     memory = 0
     messages = _MessageReader()
+    keep = None if wanted is None else MessageFilter(wanted)
     try:
         for opcode, content in _file_records(stream, size):
             if opcode == Opcode.CHUNK:
                 chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-                memory += chunk.uncompressed_size
+                if keep is None:
+                    memory += chunk.uncompressed_size
                 if memory > limit:
                     raise TooLargeError(f"its chunks unpack to more than {limit >> 20} MiB")
                 batch = messages.read(_unpacked_records(chunk))
             else:
                 batch = messages.read([(opcode, content)])
+            if keep is not None:
+                batch = keep.kept(batch)
+                memory += sum(len(record.data) for record in batch)
             memory += _RECORD_BYTES * len(batch)
             if memory > limit:
                 raise TooLargeError(f"its messages take more than {limit >> 20} MiB")
@@ -233,8 +245,32 @@ class _MessageReader:
         return messages
 
 
-def read_records(path: Path) -> tuple[list[Record], str]:
-    """Read every message of a file as far as it is sound.
+class MessageFilter:
+    """Keeps the messages that are wanted, and one empty message of every other topic."""
+
+    def __init__(self, wanted: Wanted) -> None:
+        """Begin without a topic."""
+        self._wanted = wanted
+        self._topics: set[str] = set()
+
+    def kept(self, messages: Iterable[Record]) -> list[Record]:
+        """Return the messages that are kept."""
+        kept_messages = []
+        for message in messages:
+            if self._wanted(message):
+                kept_messages.append(message)
+            elif message.topic not in self._topics:
+                kept_messages.append(msgspec.structs.replace(message, data=b""))
+            self._topics.add(message.topic)
+        return kept_messages
+
+
+def read_records(path: Path, wanted: Wanted | None = None) -> tuple[list[Record], str]:
+    """Read the messages of a file as far as it is sound.
+
+    Args:
+        path: The file.
+        wanted: Says which messages are kept; all of them if None.
 
     Returns:
         The messages in the order written, and why reading ended early ("" if it did not).
@@ -246,7 +282,7 @@ def read_records(path: Path) -> tuple[list[Record], str]:
     damage = ""
     try:
         with path.open("rb") as stream:
-            for batch in records(stream, path.stat().st_size):
+            for batch in records(stream, path.stat().st_size, wanted=wanted):
                 messages += batch
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None

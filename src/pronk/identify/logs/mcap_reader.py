@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pronk.errors import LogError
 from pronk.identify.logs.bag import read_bag
-from pronk.identify.logs.bag_reader import join_topics
+from pronk.identify.logs.bag_reader import join_topics, wanted_messages
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.sweep_reader import read_sweep
@@ -22,7 +22,7 @@ def read_mcap(path: Path, robot: RobotSpec | None, options: ReadOptions) -> Join
     Raises:
         LogError: The file is no MCAP file, or holds neither kind of log.
     """
-    messages, damage = read_bag(path)
+    messages, damage = read_bag(path, wanted_messages(options))
     if any(message.topic.startswith("/sweep/") for message in messages):
         needless = [name for name in options.stated() if name != "joint_order"]
         if needless or options.joint_order not in (None, "default"):
