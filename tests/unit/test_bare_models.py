@@ -117,6 +117,7 @@ ELEMENTS = {
         "inside": '<replicate count="3" offset=".01 0 0"><geom size=".001"/></replicate>',
     },
     "frame": {"world": '<frame euler="0 0 1"><body name="post"><geom size=".1"/></body></frame>'},
+    "sizes": {"assets": '<size njmax="4500" nconmax="900" nstack="3000000" nuserdata="5"/>'},
     "unnamed": {"world": "<body><geom size='.1'/></body>"},
     "flexible": {
         "world": '<flexcomp name="f" type="grid" count="3 3 1" spacing=".1 .1 .1" pos="2 0 0" '

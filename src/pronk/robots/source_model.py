@@ -22,7 +22,9 @@ MAX_ELEMENTS = 20_000
 """Largest number of elements of a model with its replicates; a fruit fly with all its parts has
 2,000."""
 MAX_USER_NUMBERS = 100_000
-"""Largest number of user data, keyframes and constraints that a model reserves."""
+"""Largest number of user data and keyframes that a model reserves."""
+USER_NUMBERS = ("nuser", "nkey")
+"""Beginnings of the attributes that reserve them."""
 MAX_DEPTH = 400
 """Deepest nesting of elements; MuJoCo's reader calls itself for each level."""
 MAX_SAMPLES = 100_000_000
@@ -342,7 +344,7 @@ def _samples(name: str, attributes: Mapping[str, str]) -> float:
     samples = 1.0
     if name == "size":
         for attribute, value in attributes.items():
-            if attribute != "memory" and _product(value) > MAX_USER_NUMBERS:
+            if attribute.startswith(USER_NUMBERS) and _product(value) > MAX_USER_NUMBERS:
                 samples = math.inf
     elif name != "replicate":
         for attribute in SIZES:
