@@ -6,6 +6,7 @@ The logs are those of `joint_mechanisms`, whose integrator shares nothing with t
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,10 @@ from joint_mechanisms import (
     simulate_mechanisms,
     with_fault,
 )
+from pronk.identify.match.checks import unwrapped
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
+from pronk.identify.match.tables import dead_band_notes
 
 
 def drawn(seed: int, faults: tuple[str, ...]) -> list[Mechanism]:
@@ -113,3 +116,53 @@ def test_no_other_mechanism_is_taken_for_a_compliance(tmp_path: Path) -> None:
     mechanisms = drawn(11, FAULTS[4:])
     for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
         assert not any("compliance:" in flag for flag in gains.flags), mechanism
+
+
+def test_what_a_fit_leaves_unexplained_is_said_without_a_cause(tmp_path: Path) -> None:
+    (joint,) = drawn(17, ("",))
+    mechanisms = [
+        with_fault(joint, "velocity feed-forward", 0.9),
+        with_fault(joint, "backlash", 0.9),
+        with_fault(joint, "stribeck", 0.9),
+    ]
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        warnings = [flag for flag in gains.flags if "So would look" in flag]
+        assert len(warnings) == 1, mechanism
+        assert "friction" in warnings[0]
+        assert "backlash" in warnings[0]
+
+
+def test_a_late_command_column_is_named_where_the_rest_is_explained(tmp_path: Path) -> None:
+    (joint,) = drawn(21, ("",))
+    late = with_fault(joint, "delayed command column", 0.3)
+    early = replace(late, delay_s=0.0)
+    for gains in matched([late, early], tmp_path):
+        (flag,) = (flag for flag in gains.flags if flag.startswith("lead:"))
+        assert "command column" in flag
+        assert gains.delay_s.value == 0.0
+
+
+def test_a_reading_that_wraps_is_unwrapped(tmp_path: Path) -> None:
+    (joint,) = drawn(23, ("",))
+    command = chirp_commands([joint])
+    reading = simulate_mechanisms([joint], command)
+    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
+    turned = np.angle(np.exp(1j * (log.position + np.pi)))
+    wrapped = replace(log, command=log.command + np.pi, position=turned)
+    assert np.ptp(turned) > 6.0
+    level = unwrapped(wrapped)
+    np.testing.assert_allclose(level.position, log.position + np.pi, atol=1e-9)
+    assert "wraps" in level.notes[-1]
+    assert unwrapped(log) is log
+
+
+def test_the_dead_band_of_dry_friction_is_beside_the_gains(tmp_path: Path) -> None:
+    (joint,) = drawn(4, ("",))
+    joint = replace(joint, frictionloss=0.05 * joint.stiffness * joint.amplitude)
+    command = chirp_commands([joint])
+    reading = simulate_mechanisms([joint], command)
+    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
+    result = match([log.segmented()], mechanism_robot(joint, tmp_path))
+    (note,) = dead_band_notes(result)
+    band = float(note.split("[deg]: j ")[1].split(".  ")[0].split(". ")[0])
+    assert band == pytest.approx(np.rad2deg(2.0 * 0.05 * joint.amplitude), rel=0.1)

@@ -89,6 +89,9 @@ and 0.1 to 0.3 where one of them is known."""
 NEGLIGIBLE_FRICTION = 0.05
 """Dry friction, over stiffness times amplitude, below which it need not be known any better: a
 relay of that share changes the response outside of the resonance by less than 0.3 dB."""
+EXPLAINED_LEAD = 0.02
+"""Error in time, as a share of the amplitude, up to which a match explains the motion so well that
+a negative delay is one of the log. Honest joints leave 0.001 to 0.008 unexplained."""
 NOT_WORSE = 0.01
 """Error on the held-out samples that a match may have beside that of less fitting, as a share of
 the amplitude of the command: 0.1 dB, a tenth of what counts as no match."""
@@ -511,14 +514,40 @@ def _parameter_flags(
                 f"{name} is not identified (deviation {joint_estimate.sd[name]:.2g}); "
                 f"{PARAMETERS[name].remedy}"
             )
-    if "delay" in joint_estimate.ci95 and joint_estimate.ci95["delay"][1] < 0.0:
-        flags.append(
-            f"delay {1e3 * values['delay']:.1f} ms: the log has the command later than the drive "
-            "had it; 0 in the gains, which hold for earlier commands"
-        )
+    if "delay" in joint_estimate.ci95:
+        flags.extend(_early_position(joint, best, joint_estimate.ci95["delay"]))
     if not best.settled:
         flags.append("the fit in time did not settle")
     return flags
+
+
+def _early_position(joint: str, best: Optimum, ci95: tuple[float, float]) -> tuple[str, ...]:
+    """Say that the position leads its command, and why where that can be told.
+
+    The timestamps of a log are right to a sample, so the delay counts as negative where it is so
+    by a sample more than its interval. A fit that leaves some of the motion unexplained shifts in
+    time to make up for it; then nothing is said of the cause.
+
+    Args:
+        joint: The joint.
+        best: The fit.
+        ci95: Interval of the delay [s].
+    """
+    residuals = best.residuals
+    samples = [recording for recording in residuals.replay.recordings if recording.joint == joint]
+    period_s = max(float(np.median(np.diff(recording.time))) for recording in samples)
+    if ci95[1] + period_s >= 0.0:
+        return ()
+    delay_s = best.drives()[joint]["delay"]
+    lead = (
+        f"lead: the position leads the command of the log by {-1e3 * delay_s:.1f} ms; the delay of "
+        "the gains is 0, and they hold for commands that are logged as late"
+    )
+    amplitude = float(np.max(residuals.amplitude))
+    explained = residuals.rmse(best.residual, joint) < EXPLAINED_LEAD * amplitude
+    if explained and "effort_limit" not in best.vector.fitted[joint]:
+        return (f"{lead}: the command column was delayed or filtered before it was logged",)
+    return (lead,)
 
 
 def negligible_friction(best: Optimum, joint: str, joint_estimate: Estimate) -> bool:

@@ -16,6 +16,8 @@ from pronk.identify.match.checks import (
     check_excitations,
     check_explained_motion,
     check_response,
+    unexplained_motion,
+    unwrapped,
 )
 from pronk.identify.match.compared import (
     COHERENCE_MIN,
@@ -52,6 +54,7 @@ from pronk.identify.match.physical import physical_drives
 from pronk.identify.match.ranges import group_gains
 from pronk.identify.match.replay import ChainReplay, JointReplay
 from pronk.identify.match.result import (
+    NO_MATCH,
     DriveFit,
     GridSearch,
     JointResult,
@@ -144,7 +147,7 @@ def match(
     simulation = find_simulation(simulator, robot)
     check_choices(method, mode, settings, simulation)
     parameters = fitted_parameters(mode, settings, simulation)
-    logs = with_drive_gains(logs, robot, drive_gains)
+    logs = with_drive_gains([unwrapped(log) for log in logs], robot, drive_gains)
     torque_fits = fit_torque_drives(logs, robot) if mode == "drive" else {}
     excited_logs = [log for log in logs if log.excited_joints]
     if torque_fits and not excited_logs:
@@ -234,6 +237,13 @@ def match(
                 )
             compliance = compliance_flag(fit, target, compared, rigs.robot, nominal[name])
             flags = joint_flags(fit, target, compared, excitation_flags[name], compliance)
+            named = any(flag.startswith((NO_MATCH, EFFORT_LIMIT)) for flag in (*fit.flags, *flags))
+            if not named:
+                excitations = excitations_of(sources[name], name)
+                flags = (
+                    *unexplained_motion(excitations, fit.rmse, target.measured.amplitude),
+                    *flags,
+                )
             gains = joint_gains(fit, robot, compared, flags)
             joints[name] = JointResult(
                 joint=name,

@@ -91,6 +91,7 @@ def gains_table(result: MatchResult) -> Table:
             "repeat: spread of the repeats. total: also the change between amplitudes and between "
             "parts of the excitation."
         )
+    notes.extend(dead_band_notes(result))
     return Table(
         title="Matched gains", columns=tuple(columns), rows=tuple(rows), notes=tuple(notes)
     )
@@ -130,7 +131,29 @@ def gains_summary_table(result: MatchResult) -> Table:
         Column(heading="delay", unit="ms"),
         Column(heading="error", unit="dB", digits=2),
     )
-    return Table(title="Matched gains", columns=columns, rows=tuple(rows))
+    return Table(
+        title="Matched gains", columns=columns, rows=tuple(rows), notes=dead_band_notes(result)
+    )
+
+
+def dead_band_notes(result: MatchResult) -> tuple[str, ...]:
+    """Say how far each joint stays from its command by its dry friction alone, one sentence.
+
+    A joint stops anywhere within `friction / stiffness` of its command, on either side. Backlash
+    gives the same band; another stiffness changes the band of friction and leaves that of backlash.
+    """
+    joints = []
+    for name, joint in result.joints.items():
+        gains = joint.gains
+        if gains.frictionloss.value > 0.0 and gains.stiffness.value > 0.0:
+            band = np.rad2deg(2.0 * gains.frictionloss.value / gains.stiffness.value)
+            joints.append(f"{name} {band:.2g}")
+    if not joints:
+        return ()
+    return (
+        f"Dead band by dry friction, 2 x friction / stiffness [deg]: {', '.join(joints)}. Logs "
+        "with two stiffnesses tell it from backlash, whose band does not change.",
+    )
 
 
 def value_and_interval(fitted: FittedValue, digits: int | None = None) -> str:
