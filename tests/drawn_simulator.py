@@ -261,6 +261,8 @@ def score(truth: Truth, probe: Probe) -> dict[str, float | bool | str]:
     """How far a probe is from the truth."""
     # A joint that is not stable with its gains is no fault that was drawn.
     named = set(probe.faults) - {"unstable"}
+    delay_named = "delay" in named
+    named.discard("delay")
     drive = truth.robot.joint(truth.joint).drive
     acting_armature = truth.armature
     if truth.kind == "PyBullet":
@@ -272,6 +274,12 @@ def score(truth: Truth, probe: Probe) -> dict[str, float | bool | str]:
     delay_error = abs(probe.delay_s - truth.delay_s)
     beside_explicit = truth.fault == "beside"
     expected_faults = {truth.fault} if truth.fault else set()
+    late = truth.delay_s > 0.1 * truth.robot.timestep_s
+    # A delay near the limit may be named or not.
+    if truth.delay_s == 0.0 or late:
+        delay_right_named = delay_named == late
+    else:
+        delay_right_named = True
     return {
         "kind": truth.kind,
         "joint": truth.joint,
@@ -281,7 +289,7 @@ def score(truth: Truth, probe: Probe) -> dict[str, float | bool | str]:
         "armature_error": armature_error,
         "armature_right": armature_error < 0.02,
         "delay_error_s": delay_error,
-        "delay_right": delay_error < 5e-4,
+        "delay_right": delay_error < 5e-4 and delay_right_named,
         "friction_error": abs(probe.frictionloss - truth.frictionloss),
         "hold_right": probe.hold == truth.hold,
         "fault": truth.fault,

@@ -57,7 +57,7 @@ def test_law_and_parameters(engine: str, law: DriveLaw) -> None:
     assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
     assert probe.frictionloss == pytest.approx(0.1, rel=1e-2)
     assert probe.delay_s == pytest.approx(0.0032, abs=1e-5)
-    assert not probe.faults
+    assert set(probe.faults) == {"delay"}
 
 
 def assert_named_as_drawn(truth: Truth) -> None:

@@ -35,9 +35,11 @@ def probe(
     info = engine.info
     probed_joint = robot_spec.joint(result.joint)
     drive = probed_joint.drive
-    acting_law = result.law.drive.label
-    if result.law.beside_explicit:
-        acting_law = f"E, beside it {acting_law}"
+    acting_law = result.law.label
+    for other in result.alike:
+        acting_law += f" or {other.label}"
+    if "residual" in result.faults:
+        acting_law = "none of the laws"
     acting_stiffness = probed_joint.stiffness * result.stiffness_factor
     acting_damping = probed_joint.damping * result.damping_factor
     # Adding 0 makes -0 a 0.

@@ -1,21 +1,26 @@
 """Name how a simulator drives a joint, from the response of the joint alone.
 
-Two experiments on one joint, all others held at their default positions:
+Three experiments on one joint, all others held at their default positions:
 
 - Steps of the command at successive instants. The step in which each begins to act gives the number
   of steps that the simulator holds a command for, and the whole steps of delay.
+- Steps of many heights, up to the effort limit. How far the joint comes in the first step in which
+  it moves is in proportion to the height, until the torque (or the command) is clipped.
 - Chirps at three pairs of gains, and one with another armature where it can be set. One pair is not
   enough: explicit drives of inertia `J + h kd` respond as drives of inertia `J` with implicit
   damping do. How the response changes with the gains separates the laws of
-  `pronk.robots.drive_law`, and an implicit drive that acts beside the explicit torque.
+  `pronk.robots.drive_law`, an implicit drive that acts beside the explicit torque, and a torque
+  of a position that is some steps old.
 
-A joint with friction is fitted to each law; the law with the smallest residual is the answer.
+A joint with friction is fitted to each law; the law with the smallest residual is the answer, with
+those that explain the motion as well. The time of the fits is limited.
 Gravity and the inertia of the links are the robot's, which is what makes the gains absolute.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -58,8 +63,27 @@ _CLEAR = 0.7
 """The best law is clear if its residual is less than this share of the next one's."""
 _LARGE_RESIDUAL = 0.01
 """Share of the motion that a right answer leaves unexplained at most."""
+_DELAY_SHOWS = 0.05
+"""Share of a step from which on a delay is named."""
 _GRAVITY_SHOWS = 0.002
 """Torque of gravity over stiffness from which on gravity can be fitted [rad]."""
+_SAME_RESIDUAL = 1e-7
+"""Residual below which laws are told apart by nothing but rounding."""
+_EXACT_RESIDUAL = 1e-6
+"""Residual of a law that is certainly right: no other is tried."""
+_STALE_STEPS = (1, 2, 3, 4)
+"""Ages of the position in the torque that are tried [steps]."""
+_MOST_SECONDS = 18.0
+"""Time of the processor after which no further law is tried [s]."""
+_HIGHEST_STEP = 3.0
+"""Highest step of the command with which a limit of the torque is looked for [rad]."""
+_CLIPPED_SLOPE = 0.3
+"""Share of its greatest growth with the height of a step below which the motion is clipped."""
+_CLEAR_OF_CLIP = 0.35
+"""Amplitude of the chirps over the height of a step that is clipped."""
+_SHORT_FIRST_STEP = 5.0
+"""Motion after two steps over that after one from which on a command acts for less than a third of
+the first one; it is 3 where it acts for all of it."""
 _PARAMETERS = ("damping", "inertia", "viscous", "friction", "delay", "applied", "gravity")
 """Fitted parameters. As gains, inertia, friction and gravity of any common factor move alike, they
 belong to a stiffness that acts as it is set: the factor on damping, inertia [kg m^2], passive
@@ -77,6 +101,34 @@ class ActingLaw:
     """True if the drive acts beside an explicit torque of the same gains."""
     soft_friction: bool = False
     """True if dry friction is MuJoCo's soft constraint, in which a joint that is held creeps."""
+    stale_position: int = 0
+    """Age of the position from which the torque is computed [steps]."""
+    stale_speed: int = 0
+    """Age of the speed from which the torque is computed [steps]."""
+
+    @property
+    def label(self) -> str:
+        """Short name."""
+        name = self.drive.label
+        if self.beside_explicit:
+            name = f"E, beside it {name}"
+        if self.stale_position:
+            name += f" of an old position (steps: {self.stale_position})"
+        return name
+
+    def moves_as(self, other: ActingLaw) -> bool:
+        """Tell whether two laws are the same but for the kind of dry friction."""
+        return replace(self, soft_friction=other.soft_friction) == other
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """A limit that was found in the response to steps of many heights."""
+
+    height: float
+    """Height of a step from which on the joint goes no further in its first step [rad]."""
+    of_torque: bool
+    """True if the torque is clipped, False if the command is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +161,11 @@ class Probe:
     """Share of the gains at which the simulator is stable: 1, or less."""
     residual: float
     """RMS of the motion that the answer does not explain, as a share of the motion."""
+    alike: tuple[ActingLaw, ...] = ()
+    """Other laws that explain the motion as well."""
+    clip: float | None = None
+    """Torque [N m] or command about the pose [rad] at which it is clipped below the effort limit;
+    None where no limit was met."""
     faults: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word for each, and a sentence."""
 
@@ -133,6 +190,13 @@ class _Runs:
     """Inertia of the links about the joint [kg m^2]."""
     gravity: tuple[float, float]
     """Torque of gravity, `gravity[0] cos q + gravity[1] sin q` [N m]."""
+    deadline: float
+    """Time of the processor after which no further law is tried, and fits end [s]."""
+
+    @property
+    def late(self) -> bool:
+        """True after the deadline."""
+        return time.process_time() > self.deadline
 
     @property
     def torque(self) -> float:
@@ -141,8 +205,9 @@ class _Runs:
 
     @property
     def motion(self) -> float:
-        """Standard deviation of the motion [rad]."""
-        return float(np.std(self.position - self.position[0]))
+        """Standard deviation of the motion [rad]; 0 where it is no number."""
+        motion = float(np.std(self.position - self.position[0]))
+        return motion if math.isfinite(motion) else 0.0
 
     @property
     def gravity_shows(self) -> bool:
@@ -168,6 +233,8 @@ class _Answer:
     doubt: float
     """Residual over that of the next law, and more where the answer is poor; the least counts."""
     fit: _Fit
+    alike: tuple[ActingLaw, ...]
+    """Other laws that explain the motion as well."""
     scale: float
     """Gains that act over those that are set."""
     hold: int
@@ -195,6 +262,10 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
         )
     bench = _Bench(simulator, robot, joint)
     stable_share = bench.stable_share()
+    clip = bench.clip(stable_share)
+    if clip is not None:
+        bench.lower_amplitude(_CLEAR_OF_CLIP * clip.height)
+    deadline = time.process_time() + _MOST_SECONDS
     answers: list[_Answer] = []
     shares = [stable_share]
     while shares:
@@ -206,10 +277,19 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
                 # Friction holds the joint against smaller gains.
                 break
             raise
-        runs = bench.chirps(share, hold, phase)
-        best, next_residual = _best_law(runs, delay, bench.armature_settable)
+        runs = bench.chirps(share, hold, phase, deadline)
+        if runs.motion < 1e-3 * bench.amplitude:
+            # Friction, or a defect, holds the joint.
+            break
+        ranking = _best_laws(runs, delay, simulator.info.drive_law, bench.armature_settable)
+        best = ranking[0]
+        alike = _alike(ranking)
+        next_residual = np.inf
+        for fit in ranking[1:]:
+            if fit.law not in alike:
+                next_residual = min(next_residual, fit.residual)
         scale = _scale(runs, best, bench.armature_settable)
-        doubt = best.residual / next_residual
+        doubt = best.residual / max(next_residual, 1e-15)
         more_shares: list[float] = []
         if best.residual > _LARGE_RESIDUAL:
             doubt += best.residual
@@ -219,7 +299,7 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
                 # Gravity moves a joint far whose gains act per degree; of a limit of the torque
                 # smaller gains stay clear.
                 larger_share = share * 180.0 / math.pi
-                if bench.stable(larger_share):
+                if clip is None and bench.stable(larger_share):
                     more_shares.append(larger_share)
                 more_shares += [share / 8.0, share / 64.0]
         elif share * scale < 0.2:
@@ -229,8 +309,15 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
         elif doubt > _CLEAR and share <= stable_share and bench.stable(4.0 * share):
             # Rounding hides by how many iterations laws differ; of larger gains less.
             more_shares = [4.0 * share]
-        shares = more_shares
-        answers.append(_Answer(doubt=doubt, fit=best, scale=scale, hold=hold, runs=runs))
+        shares = more_shares if time.process_time() < deadline else []
+        answers.append(
+            _Answer(doubt=doubt, fit=best, alike=alike, scale=scale, hold=hold, runs=runs)
+        )
+    if not answers:
+        raise PronkError(
+            f"{joint} moves by less than {1e-3 * bench.amplitude:.1g} rad when it is commanded by "
+            f"chirps of {bench.amplitude:.2g} rad; check friction and limits of the simulator."
+        )
     answer = min(answers, key=lambda candidate: candidate.doubt)
     damping, inertia, viscous, friction, delay_steps, applied, gravity = answer.fit.theta.tolist()
     scale = answer.scale
@@ -248,8 +335,20 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
         hold=answer.hold,
         stable_share=stable_share,
         residual=answer.fit.residual,
+        alike=answer.alike,
     )
-    return replace(probe, faults=_faults(probe, simulator, robot, answer.runs))
+    if clip is not None:
+        limit = clip.height
+        if clip.of_torque:
+            # In its first step a command acts for the share of the step that the delay leaves.
+            acting = 1.0 - (delay_steps - math.floor(delay_steps + 1e-3))
+            if acting < 1.0 / (_SHORT_FIRST_STEP - 2.0):
+                acting = 1.0
+            limit = min(acting, 1.0) * robot.joint(joint).stiffness * stable_share * clip.height
+            if answer.fit.residual < _LARGE_RESIDUAL:
+                limit *= scale
+        probe = replace(probe, clip=limit)
+    return replace(probe, faults=_faults(probe, clip, simulator, robot, answer.runs))
 
 
 class _Bench:
@@ -263,7 +362,62 @@ class _Bench:
         self._step = simulator.info.timestep_s
         drive = self._joint.drive
         effort_limit = min(drive.effort_limit, drive.stall_torque)
-        self._amplitude = min(AMPLITUDE, 0.3 * effort_limit / self._joint.stiffness)
+        self.amplitude = min(AMPLITUDE, 0.3 * effort_limit / self._joint.stiffness)
+        """Amplitude of the commands [rad]."""
+        self._highest = min(_HIGHEST_STEP, 0.95 * effort_limit / self._joint.stiffness)
+
+    def lower_amplitude(self, amplitude: float) -> None:
+        """Take a smaller amplitude of the commands [rad], if it is smaller."""
+        self.amplitude = min(self.amplitude, amplitude)
+
+    def clip(self, share: float) -> Clip | None:
+        """Look for a limit of the torque or of the command below the effort limit.
+
+        Args:
+            share: Share of the gains.
+
+        Returns:
+            The limit; None where there is none up to the effort limit.
+        """
+        height = self._clipped_height(share)
+        if height is None:
+            return None
+        # A torque is clipped at twice the height with half the stiffness, a command at the same.
+        other_height = self._clipped_height(0.5 * share)
+        of_torque = other_height is None or other_height > 1.4 * height
+        return Clip(height=height, of_torque=of_torque)
+
+    def _clipped_height(self, share: float) -> float | None:
+        """Find the height of a step from which on the joint goes no further [rad].
+
+        How far it comes in the first step is in proportion to the command that acts in it.
+        """
+        heights = self._highest * np.geomspace(1e-3, 1.0, 24)
+        length = _REST + 2 * _LONGEST_HOLD
+        command = np.zeros((2 * len(heights) + 1, length))
+        command[1:, _REST:] = np.concatenate([heights, -heights])[:, None]
+        position = self._run(command, self._gains(np.full(len(command), share)))
+        motion = position[1:] - position[:1]
+        if not np.isfinite(motion).all():
+            return None
+        moved = (np.abs(motion) > 1e-6 * self._highest).any(axis=0)
+        if not moved[:-1].any():
+            return None
+        first = int(moved.argmax())
+        # Gravity adds to the torque to one side and takes from it to the other.
+        both_sides = 0.5 * (motion[: len(heights)] - motion[len(heights) :])
+        reach = both_sides[:, first]
+        first_part = both_sides[len(heights) // 2, first : first + 2]
+        if first_part[1] > _SHORT_FIRST_STEP * first_part[0]:
+            # The delay leaves little of the first step; what the second one adds to the speed.
+            reach = both_sides[:, first + 1] - 2.0 * reach
+        slope = np.diff(reach) / np.diff(heights)
+        steepest = int(slope.argmax())
+        if slope[steepest] <= 0.0 or slope[-1] > _CLIPPED_SLOPE * slope[steepest]:
+            return None
+        # Where the line of the steepest part reaches the height of the end.
+        height = heights[steepest] + (reach[-1] - reach[steepest]) / slope[steepest]
+        return float(height)
 
     def stable(self, share: float) -> bool:
         """Tell whether the joint stays near with a share of the gains.
@@ -273,11 +427,11 @@ class _Bench:
         """
         position = self._run(self._chirp()[None], self._gains(np.array([share])))[0]
         motion = position - position[0]
-        if not np.isfinite(motion).all() or np.abs(motion).max() >= 12.0 * self._amplitude:
+        if not np.isfinite(motion).all() or np.abs(motion).max() >= 12.0 * self.amplitude:
             return False
-        if np.ptp(motion) < 1e-3 * self._amplitude:
+        if np.ptp(motion) < 1e-3 * self.amplitude:
             raise PronkError(
-                f"{self._joint.name} does not move when it is commanded by {self._amplitude:.2g} "
+                f"{self._joint.name} does not move when it is commanded by {self.amplitude:.2g} "
                 "rad; check the order of the simulator's joints."
             )
         return True
@@ -304,10 +458,10 @@ class _Bench:
         length = _REST + 4 * _LONGEST_HOLD
         command = np.zeros((len(first_steps) + 1, length))
         # Of smaller gains a larger step, which friction does not hold.
-        height = self._amplitude * min(max(1.0 / share, 1.0), 5.0)
+        height = self.amplitude * min(max(1.0 / share, 1.0), 5.0)
         command[1:] = height * (np.arange(length)[None] >= first_steps[:, None])
         position = self._run(command, self._gains(np.full(len(command), share)))
-        apart = np.abs(position[1:] - position[:1]) > 1e-5 * self._amplitude
+        apart = np.abs(position[1:] - position[:1]) > 1e-5 * self.amplitude
         if not apart.any(axis=1).all():
             raise PronkError(
                 f"{self._joint.name} does not respond to a step of {height:.2g} rad within "
@@ -322,13 +476,14 @@ class _Bench:
             hold = int(np.diff(instants).max())
         return int(lateness.min()), hold, int(first_steps[lateness.argmin()])
 
-    def chirps(self, share: float, hold: int, phase: int) -> _Runs:
+    def chirps(self, share: float, hold: int, phase: int, deadline: float) -> _Runs:
         """Run chirps with three pairs of gains, and with another armature where it can be set.
 
         Args:
             share: Share of the gains.
             hold: Steps that the simulator holds a command for.
             phase: Instant of a hold's first step.
+            deadline: `_Runs.deadline` [s].
         """
         links = links_of(self._robot, self._joint.name)
         index = links.joints.index(self._joint.name)
@@ -365,6 +520,7 @@ class _Bench:
             timestep=self._step,
             inertia=inertia,
             gravity=(gravity_at_zero, gravity_at_quarter),
+            deadline=deadline,
         )
 
     def _run(self, command: Array, values: Values) -> Array:
@@ -374,9 +530,19 @@ class _Bench:
         full_command = np.tile(pose, (*command.shape, 1))
         full_command[..., names.index(self._joint.name)] += command
         with np.errstate(all="ignore"):
-            return rollout_joint(
-                self._simulator, self._robot, self._joint.name, full_command, values
-            )
+            try:
+                return rollout_joint(
+                    self._simulator, self._robot, self._joint.name, full_command, values
+                )
+            except (PronkError, KeyboardInterrupt):
+                raise
+            except Exception as error:
+                # What is wrong is in the simulator, which is the user's.
+                raise PronkError(
+                    f"the simulator's rollout raised {type(error).__name__}: {error}; its command "
+                    f"had the shape {full_command.shape} (runs, steps, joints) and the values were "
+                    f"{', '.join(values)}."
+                ) from error
 
     def _gains(self, share: Array) -> dict[str, Array]:
         """Return both gains at shares of the robot's, shape (B,)."""
@@ -389,7 +555,7 @@ class _Bench:
         low_hz = 1.0 / time[-1]
         high_hz = min(25.0, 0.1 / self._step)
         phase = 2.0 * np.pi * (low_hz + (high_hz - low_hz) * time / (2.0 * time[-1])) * time
-        return np.concatenate([np.zeros(_REST), self._amplitude * (np.sin(phase) + 0.3)])
+        return np.concatenate([np.zeros(_REST), self.amplitude * (np.sin(phase) + 0.3)])
 
 
 def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
@@ -416,6 +582,8 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
     explicit = law.beside_explicit or law.drive.kind == "explicit"
     # The part of the drive that acts implicitly, of law `implicit` with what stiffness adds.
     spring = kp
+    if law.stale_position:
+        spring = np.zeros(kp.shape)
     implicit_damping = law.drive.damping(kp, kd, h)
     if law.drive.kind == "explicit":
         spring = np.zeros(kp.shape)
@@ -427,11 +595,17 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
     q = np.broadcast_to(runs.position[0], kp.shape).copy()
     v = np.zeros(kp.shape)
     positions = np.empty((len(command), *kp.shape))
+    speeds = np.empty((len(command), *kp.shape))
     for step, target in enumerate(command):
         positions[step] = q
+        speeds[step] = v
         explicit_torque = np.zeros(kp.shape)
+        read_position = positions[max(step - law.stale_position, 0)]
         if explicit:
-            explicit_torque = kp * (target - q) - kd * v
+            read_speed = speeds[max(step - law.stale_speed, 0)]
+            explicit_torque = kp * (target - read_position) - kd * read_speed
+        elif law.stale_position:
+            explicit_torque = kp * (target - read_position)
         for _ in range(iterations):
             torque = explicit_torque + spring * (target - q) - total_damping * v
             torque += cosine * np.cos(q) + sine * np.sin(q)
@@ -443,6 +617,10 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
                 v = v - np.clip(v, -friction_speed, friction_speed)
             q = q + h * v
     return positions.transpose(1, 0, 2)
+
+
+class _OutOfTimeError(Exception):
+    """The time for the fits is over."""
 
 
 def _fit_law(
@@ -464,49 +642,89 @@ def _fit_law(
     start = np.clip(start, low, high)
     step = 1e-6 * size[free]
 
+    latest: dict[bytes, Array] = {}
+    best_values = start[free]
+    least_square = np.inf
+
+    def positions_at(values: Array) -> Array:
+        # All differences in one simulation, which takes about as long as that of one set.
+        nonlocal best_values, least_square
+        key = values.tobytes()
+        if key not in latest:
+            theta = np.tile(start, (len(free) + 1, 1))
+            theta[:, free] = values
+            theta[np.arange(1, len(free) + 1), free] += step
+            latest.clear()
+            latest[key] = _simulated(runs, law, theta).reshape(len(theta), -1)
+            square = float(np.sum((latest[key][0] - runs.position.ravel()) ** 2))
+            if square < least_square:
+                least_square = square
+                best_values = values.copy()
+            if runs.late:
+                raise _OutOfTimeError
+        return latest[key]
+
     def residuals(values: Array) -> Array:
-        theta = start.copy()
-        theta[free] = values
-        return np.asarray(_simulated(runs, law, theta[None])[0] - runs.position).ravel()
+        return np.asarray(positions_at(values)[0] - runs.position.ravel())
 
     def jacobian(values: Array) -> Array:
-        # All differences in one simulation, which takes as long as that of one set.
-        theta = np.tile(start, (len(free) + 1, 1))
-        theta[:, free] = values
-        theta[np.arange(1, len(free) + 1), free] += step
-        positions = _simulated(runs, law, theta).reshape(len(theta), -1)
+        positions = positions_at(values)
         return np.asarray((positions[1:] - positions[0]).T / step)
 
     with np.errstate(all="ignore"):
-        if not np.isfinite(residuals(start[free])).all():
-            return _Fit(law=law, theta=start, residual=np.inf)
-        solution = least_squares(
-            residuals,
-            start[free],
-            jacobian,
-            bounds=(low[free], high[free]),
-            x_scale=size[free],
-            ftol=1e-4,
-            xtol=1e-12,
-            gtol=None,
-            max_nfev=evaluations,
-        )
+        try:
+            if not np.isfinite(positions_at(start[free])).all():
+                return _Fit(law=law, theta=start, residual=np.inf)
+            least_squares(
+                residuals,
+                start[free],
+                jacobian,
+                bounds=(low[free], high[free]),
+                x_scale=size[free],
+                ftol=1e-4,
+                xtol=1e-12,
+                gtol=None,
+                max_nfev=evaluations,
+            )
+        except _OutOfTimeError:
+            # The best values until then.
+            pass
     theta = start.copy()
-    theta[free] = solution.x
-    rms = float(np.sqrt(np.mean(solution.fun**2)))
+    theta[free] = best_values
+    rms = math.sqrt(least_square / runs.position.size)
     return _Fit(law=law, theta=theta, residual=rms / runs.motion)
 
 
-def _best_law(runs: _Runs, delay: int, armature_settable: bool) -> tuple[_Fit, float]:
-    """Return the law with the smallest residual, and the residual of the next one."""
+def _best_laws(runs: _Runs, delay: int, stated: DriveLaw, armature_settable: bool) -> list[_Fit]:
+    """Fit the laws that may be right, and return the fits, the best one first.
+
+    Args:
+        runs: The runs.
+        delay: Whole steps of delay.
+        stated: Law that the simulator states.
+        armature_settable: True if the armature was changed in one run.
+    """
     fixed = [] if armature_settable else ["applied"]
     candidates = _screened(runs, delay, fixed)
     candidates.sort(key=lambda fit: fit.residual)
+    # The stated law too, which is the answer where others explain the motion no better.
+    tried = candidates[:3]
+    for candidate in candidates[3:]:
+        if candidate.law.moves_as(ActingLaw(drive=stated)):
+            tried.append(candidate)
     finals: list[_Fit] = []
-    for candidate in candidates[:3]:
-        if finals and candidate.residual > _FAR * finals[0].residual:
+    for candidate in tried:
+        is_stated = candidate.law.moves_as(ActingLaw(drive=stated))
+        is_far = finals and candidate.residual > _FAR * max(finals[0].residual, _SAME_RESIDUAL)
+        if is_far and not is_stated:
+            continue
+        if finals and runs.late:
             break
         fit = _fit_law(runs, candidate.law, candidate.theta, fixed, _FINAL_EVALUATIONS)
+        if is_far:
+            # Whether the stated law explains the motion with the values of the best one.
+            other_fit = _fit_law(runs, fit.law, finals[0].theta, fixed, _FINAL_EVALUATIONS)
+            fit = min(fit, other_fit, key=lambda each: each.residual)
         # A factor on one of the gains must explain more than none.
         plain_start = fit.theta.copy()
         plain_start[0] = 1.0
@@ -517,17 +735,33 @@ def _best_law(runs: _Runs, delay: int, armature_settable: bool) -> tuple[_Fit, f
             finals.append(plain_fit)
         else:
             finals.append(fit)
-        if fit.residual < 1e-6:
+        finals.sort(key=lambda final: final.residual)
+    for index, fit in enumerate(finals):
+        is_stated = fit.law.moves_as(ActingLaw(drive=stated))
+        if is_stated and fit.law in _alike(finals):
+            finals.insert(0, finals.pop(index))
             break
-    finals.sort(key=lambda fit: fit.residual)
-    next_residual = np.inf
-    if len(finals) > 1:
-        next_residual = finals[1].residual
-    return finals[0], next_residual
+    return finals
+
+
+def _alike(ranking: Sequence[_Fit]) -> tuple[ActingLaw, ...]:
+    """Return the laws but the first that explain the motion as well as the best one."""
+    least_residual = min(fit.residual for fit in ranking)
+    laws: list[ActingLaw] = []
+    for fit in ranking[1:]:
+        as_well = fit.residual < max(least_residual / _CLEAR, _SAME_RESIDUAL)
+        if as_well and not fit.law.moves_as(ranking[0].law):
+            laws.append(fit.law)
+    return tuple(laws)
 
 
 def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
-    """Fit every law to the runs with few simulations."""
+    """Fit the laws to the runs with few simulations, the quick ones first.
+
+    The fits end with a law that leaves nothing, or at the deadline.
+    """
+    explicit = DriveLaw()
+    implicit_damping = DriveLaw(kind="implicit_damping")
     fits: list[_Fit] = []
     friction_start: Array | None = None
     for soft in (False, True):
@@ -537,30 +771,85 @@ def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
             if best.theta[3] <= 0.002 * runs.torque or best.residual < 1e-5:
                 break
             friction_start = best.theta
-        law = ActingLaw(drive=DriveLaw(), soft_friction=soft)
-        fits.append(_screened_law(runs, law, friction_start, delay, fixed))
-        for beside in (False, True):
-            law = ActingLaw(
-                drive=DriveLaw(kind="implicit_damping"), beside_explicit=beside, soft_friction=soft
+        quick = [ActingLaw(drive=explicit), ActingLaw(drive=implicit_damping)]
+        quick.append(ActingLaw(drive=implicit_damping, beside_explicit=True))
+        ages = _STALE_STEPS[:1] if soft else _STALE_STEPS
+        for age in ages:
+            quick.append(ActingLaw(drive=explicit, stale_position=age))
+            quick.append(ActingLaw(drive=explicit, stale_position=age, stale_speed=age))
+        quick.append(ActingLaw(drive=implicit_damping, stale_position=1))
+        for law in quick:
+            if runs.late:
+                return fits
+            fits.append(
+                _screened_law(runs, replace(law, soft_friction=soft), friction_start, delay, fixed)
             )
-            fits.append(_screened_law(runs, law, friction_start, delay, fixed))
-            previous: _Fit | None = None
-            rises = 0
-            for iterations in _ITERATIONS:
-                law = replace(law, drive=DriveLaw(kind="implicit", iterations=iterations))
-                start = friction_start if previous is None else previous.theta
-                fit = _screened_law(runs, law, start, delay, fixed)
-                fits.append(fit)
-                # The residual has one minimum over the iterations.
-                if previous is not None and fit.residual > previous.residual:
-                    rises += 1
-                else:
-                    rises = 0
-                least_residual = min(other.residual for other in fits)
-                if rises == 2 or (iterations >= 4 and fit.residual > _FAR * least_residual):
-                    break
-                previous = fit
+        if min(fit.residual for fit in fits) < _EXACT_RESIDUAL:
+            return fits
+        for beside in (False, True):
+            _screen_iterations(runs, fits, (beside, soft), friction_start, delay, fixed)
+            if min(fit.residual for fit in fits) < _EXACT_RESIDUAL:
+                return fits
     return fits
+
+
+def _screen_iterations(
+    runs: _Runs,
+    fits: list[_Fit],
+    kind: tuple[bool, bool],
+    start: Array | None,
+    delay: int,
+    fixed: Sequence[str],
+) -> None:
+    """Fit law implicit with few, then more iterations, and add the fits to `fits`.
+
+    Args:
+        runs: The runs.
+        fits: Fits of other laws.
+        kind: True if an explicit torque acts beside it, and if friction is soft.
+        start: Values of `_PARAMETERS` to begin with; None to search a grid.
+        delay: Whole steps of delay.
+        fixed: Names of parameters that are not fitted.
+    """
+    beside, soft = kind
+    by_iterations: dict[int, _Fit] = {}
+
+    def fit_iterations(iterations: int, begin: Array | None) -> _Fit:
+        law = ActingLaw(
+            drive=DriveLaw(kind="implicit", iterations=iterations),
+            beside_explicit=beside,
+            soft_friction=soft,
+        )
+        fit = _screened_law(runs, law, begin, delay, fixed)
+        fits.append(fit)
+        by_iterations[iterations] = fit
+        return fit
+
+    previous: _Fit | None = None
+    rises = 0
+    for iterations in _ITERATIONS:
+        if runs.late:
+            return
+        fit = fit_iterations(iterations, start if previous is None else previous.theta)
+        # The residual has one minimum over the iterations.
+        if previous is not None and fit.residual > previous.residual:
+            rises += 1
+        else:
+            rises = 0
+        least_residual = min(other.residual for other in fits)
+        if rises == 2 or (iterations >= 4 and fit.residual > _FAR * least_residual):
+            break
+        if least_residual < _EXACT_RESIDUAL:
+            return
+        previous = fit
+    # Numbers between those of the list: 5 beside 4 and 6.
+    best = min(by_iterations, key=lambda iterations: by_iterations[iterations].residual)
+    least_residual = min(other.residual for other in fits)
+    if by_iterations[best].residual > least_residual:
+        return
+    for iterations in range(max(best - 2, 1), best + 3):
+        if iterations not in by_iterations and not runs.late:
+            fit_iterations(iterations, by_iterations[best].theta)
 
 
 def _screened_law(
@@ -609,19 +898,52 @@ def _scale(runs: _Runs, fit: _Fit, armature_settable: bool) -> float:
     return best
 
 
-def _faults(probe: Probe, simulator: Simulator, robot: RobotSpec, runs: _Runs) -> dict[str, str]:
+def _faults(
+    probe: Probe, clip: Clip | None, simulator: Simulator, robot: RobotSpec, runs: _Runs
+) -> dict[str, str]:
     """Name what acts otherwise than it is set; see `Probe.faults`."""
     faults = {}
-    drive = robot.joint(probe.joint).drive
+    joint = robot.joint(probe.joint)
+    drive = joint.drive
     stated_law = simulator.info.drive_law
     law = probe.law.drive
-    if probe.law.beside_explicit:
+    if clip is not None and clip.of_torque:
+        faults["clipped"] = (
+            f"torque is clipped at {probe.clip:.2g} N m, the effort limit is "
+            f"{drive.effort_limit:g} N m; the joint was probed below it"
+        )
+    elif clip is not None:
+        faults["clipped"] = f"the command is clipped at {probe.clip:.3g} rad about the pose"
+    if probe.residual > _LARGE_RESIDUAL:
+        faults["residual"] = (
+            f"{100.0 * probe.residual:.1f} % of the motion is not explained: the joint follows "
+            "none of the laws, or others move with it"
+        )
+        # What a law says that does not explain the motion is no finding.
+        return faults
+    labels = [law.label]
+    for other in probe.alike:
+        labels.append(other.label)
+    if probe.law.stale_position:
+        taken = probe.law.stale_position * runs.timestep * joint.stiffness
+        what = "position and speed are" if probe.law.stale_speed else "the position is"
+        steps = probe.law.stale_position
+        age = "one step old" if steps == 1 else f"{steps} steps old"
+        faults["stale"] = (
+            f"{what} {age} where the torque is computed, which takes about {taken:.3g} N m s/rad "
+            f"from the damping of {joint.damping:g}"
+        )
+        if law != stated_law:
+            faults["law"] = f"law {stated_law.label} is stated, the joint responds by {law.label}"
+    elif probe.law.beside_explicit:
         faults["beside"] = (
             f"a drive of law {law.label} acts beside the explicit torque; set the gains of the "
             "engine's own drive to 0"
         )
     elif law != stated_law:
-        faults["law"] = f"law {stated_law.label} is stated, the joint responds by {law.label}"
+        faults["law"] = (
+            f"law {stated_law.label} is stated, the joint responds by {' or '.join(labels)}"
+        )
 
     if _both_near(probe, 2.0):
         faults["twice"] = (
@@ -644,7 +966,10 @@ def _faults(probe: Probe, simulator: Simulator, robot: RobotSpec, runs: _Runs) -
                 faults[name] = f"the {name} that acts is {factor:.3g} times the one that is set"
 
     if probe.armature_applied is not None and probe.armature_applied < 0.5:
-        faults["ignored"] = "a change of the armature changes nothing: the engine ignores it"
+        faults["ignored"] = (
+            "a change of the armature changes nothing: the engine ignores it, and "
+            f"{probe.armature:.4g} kg m^2 acts"
+        )
     elif abs(probe.armature - drive.armature) > 0.03 * (runs.inertia + drive.armature):
         faults["armature"] = (
             f"an armature of {probe.armature:.4g} kg m^2 acts, {drive.armature:.4g} is set"
@@ -663,14 +988,20 @@ def _faults(probe: Probe, simulator: Simulator, robot: RobotSpec, runs: _Runs) -
         faults["hold"] = f"the simulator holds each command for {probe.hold} steps"
     if probe.delay_s < -0.5 * runs.timestep:
         faults["early"] = "positions are those at the end of each step, one step early"
+    elif probe.delay_s > _DELAY_SHOWS * runs.timestep:
+        faults["delay"] = (
+            f"commands act {1e3 * probe.delay_s:.3g} ms late ({probe.delay_s / runs.timestep:.3g} "
+            "steps), or positions are read so late"
+        )
+    passive_tolerance = max(0.1 * drive.viscous_damping, 0.03 * joint.damping)
+    if abs(probe.viscous_damping - drive.viscous_damping) > passive_tolerance:
+        faults["passive"] = (
+            f"passive damping of {probe.viscous_damping:.3g} N m s/rad acts, "
+            f"{drive.viscous_damping:.3g} is set"
+        )
     if probe.stable_share < 1.0:
         faults["unstable"] = (
             f"the joint diverges with its gains; it was probed with {probe.stable_share:g} of them"
-        )
-    if probe.residual > _LARGE_RESIDUAL:
-        faults["residual"] = (
-            f"{100.0 * probe.residual:.1f} % of the motion is not explained: the joint follows "
-            "none of the laws, or others move with it"
         )
     return faults
 
