@@ -274,12 +274,10 @@ def score(truth: Truth, probe: Probe) -> dict[str, float | bool | str]:
     delay_error = abs(probe.delay_s - truth.delay_s)
     beside_explicit = truth.fault == "beside"
     expected_faults = {truth.fault} if truth.fault else set()
-    late = truth.delay_s > 0.1 * truth.robot.timestep_s
     # A delay near the limit may be named or not.
-    if truth.delay_s == 0.0 or late:
-        delay_right_named = delay_named == late
-    else:
-        delay_right_named = True
+    is_late = truth.delay_s > 0.1 * truth.robot.timestep_s
+    may_be_named = truth.delay_s > 0.0
+    delay_right_named = delay_named >= is_late and delay_named <= may_be_named
     return {
         "kind": truth.kind,
         "joint": truth.joint,
