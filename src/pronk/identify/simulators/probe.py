@@ -347,6 +347,11 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
             limit = min(acting, 1.0) * robot.joint(joint).stiffness * stable_share * clip.height
             if answer.fit.residual < _LARGE_RESIDUAL:
                 limit *= scale
+            drive = robot.joint(joint).drive
+            if limit > 0.97 * min(drive.effort_limit, drive.stall_torque):
+                # Of larger gains than are set the effort limit is met earlier; it is no fault.
+                clip = None
+    if clip is not None:
         probe = replace(probe, clip=limit)
     return replace(probe, faults=_faults(probe, clip, simulator, robot, answer.runs))
 
@@ -400,7 +405,7 @@ class _Bench:
         motion = position[1:] - position[:1]
         if not np.isfinite(motion).all():
             return None
-        moved = (np.abs(motion) > 1e-6 * self._highest).any(axis=0)
+        moved = np.abs(motion).max(axis=0) > 1e-6 * self._highest
         if not moved[:-1].any():
             return None
         first = int(moved.argmax())
