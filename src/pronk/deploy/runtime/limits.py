@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from pronk.arrays import Array
+from pronk.deploy.runtime.posture import LegKinematics, leg_kinematics
 from pronk.errors import RobotError
 from pronk.robots.limits import OperatingLimits
 from pronk.robots.motor import winding_loss
@@ -150,6 +151,36 @@ class BlockedLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ResponseLimits:
+    """How little joints may respond to their targets; `pronk.deploy.runtime.response`."""
+
+    push_share: float = 0.45
+    """Commanded torque that a joint must follow, as a share of its effort limit."""
+    pushed_s: float = 0.25
+    """Longest time for which a joint is pushed so without following [s]; landings of the virtual
+    Mini Cheetah take 0.14 s."""
+    far: float = 0.8
+    """Motion of a target in 0.25 s that a joint must follow [rad]."""
+    still: float = 0.03
+    """Least motion of the joint then [rad]; the least measured is 0.076."""
+    low_s: float = 0.06
+    """Longest time for which the trunk may be collapsed [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing."""
+        _require_positive(
+            "ResponseLimits",
+            {
+                "push_share": self.push_share,
+                "pushed_s": self.pushed_s,
+                "far": self.far,
+                "still": self.still,
+                "low_s": self.low_s,
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorLimits:
     """How far the sensors may contradict each other; `pronk.deploy.runtime.supervision`."""
 
@@ -173,6 +204,9 @@ class SensorLimits:
     moved: float = 0.005
     """Largest range of the integral of velocity at a constant position, or the reverse [rad]: three
     steps of an encoder of 12 bits."""
+    drift: float = 0.04
+    """Largest difference of position and integral of velocity over half a second, of states that
+    arrived on time [rad]; 2.5 times the largest of 5 min of walking and jumping, 0.016."""
     others_moved: float = 0.05
     """Largest sum of the displacements of other joints while one is constant for `repeat_s` [rad];
     the largest measured is 0.003, with encoders of 12 bits without noise."""
@@ -193,6 +227,7 @@ class SensorLimits:
                 "upright": self.upright,
                 "encoder": self.encoder,
                 "moved": self.moved,
+                "drift": self.drift,
                 "others_moved": self.others_moved,
                 "clock_s": self.clock_s,
                 "restarts": self.restarts,
@@ -214,6 +249,10 @@ class Limits:
     """Times for which targets may be limited by torque."""
     sensors: SensorLimits = field(default_factory=SensorLimits)
     """Contradictions of the sensors."""
+    response: ResponseLimits = field(default_factory=ResponseLimits)
+    """How joints respond to their targets."""
+    legs: LegKinematics | None = None
+    """Geometry of the legs; None for a robot whose height is not judged."""
 
     def __post_init__(self) -> None:
         """Refuse a margin that leaves no target."""
@@ -228,6 +267,22 @@ class Limits:
     def trunk_is_free(self) -> bool:
         """Whether the trunk can move; a hung robot has no limit of its tilt."""
         return math.isfinite(self.operating.tilt)
+
+    @property
+    def collapsed(self) -> float:
+        """Height of the trunk over its lowest foot below which it has collapsed [m]."""
+        return 0.0 if self.legs is None else self.legs.collapsed
+
+    @cached_property
+    def push(self) -> Array:
+        """Commanded torque that each joint must follow [N m], (joints,).
+
+        A leg that carries half of the weight needs its length of a shank times that without moving.
+        """
+        least = 0.0
+        if self.legs is not None:
+            least = 0.5 * self.legs.weight * self.legs.shank
+        return np.maximum(self.response.push_share * self.joints.torque, least)
 
     @cached_property
     def measured(self) -> tuple[Array, Array]:
@@ -303,4 +358,4 @@ class Limits:
         if operating.bus_voltage == 0.0:
             nominal = max(joint.drive.bus_voltage for joint in robot.joints)
             operating = replace(operating, bus_voltage=VOLTAGE_SHARE * nominal)
-        return cls(joints=joints, operating=operating)
+        return cls(joints=joints, operating=operating, legs=leg_kinematics(robot))

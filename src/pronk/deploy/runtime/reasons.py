@@ -61,6 +61,9 @@ class Reason(IntEnum):
     INTERRUPTED = 31
     BUS_VOLTAGE = 32
     FAR_TARGET = 33
+    COLLAPSED = 34
+    TRACKING = 35
+    ORIENTATION = 36
 
     @property
     def text(self) -> str:
@@ -196,6 +199,17 @@ REASONS: tuple[ReasonEntry, ...] = (
     ),
     ReasonEntry(Reason.BUS_VOLTAGE, _LATCH, "the bus voltage is too low for the drives"),
     ReasonEntry(Reason.FAR_TARGET, _LATCH, "a target is far beyond the range of its joint"),
+    ReasonEntry(Reason.COLLAPSED, _LATCH, "the trunk is down although the policy runs"),
+    ReasonEntry(
+        Reason.TRACKING,
+        _LATCH,
+        "a joint does not follow its target; it may be seized, or its motor without torque",
+    ),
+    ReasonEntry(
+        Reason.ORIENTATION,
+        _LATCH,
+        "small motions in the standing pose were not measured as they were commanded",
+    ),
 )
 """Every reason in the order of its number: entry `n` is that of `Reason(n)`."""
 

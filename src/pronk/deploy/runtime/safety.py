@@ -6,6 +6,7 @@ The rules are applied in one order; the first that is met gives the reason:
    it moves or holds the target where a limit asks for it.
 2. `supervision.find_contradiction`: whether the states so far can all be true.
 3. `persistence.find_persistent`: whether targets have been held or limited for too long.
+4. `response.find_no_response`: whether joints follow their targets, and the trunk is up.
 
 A fault damps for at least one second; a latched fault needs the operator's reset.
 `reasons.REASONS` is the table of all reasons, with the text and the action of each.
@@ -22,6 +23,7 @@ from pronk.arrays import Array
 from pronk.deploy.runtime.limits import LAG_RATE_HZ, Limits
 from pronk.deploy.runtime.persistence import TargetHistory, find_persistent
 from pronk.deploy.runtime.reasons import Decision, FilterAction, Reason
+from pronk.deploy.runtime.response import ResponseHistory, find_no_response
 from pronk.deploy.runtime.rules import SafetyInput, apply_rules, tilt
 from pronk.deploy.runtime.supervision import SensorHistory, find_contradiction
 from pronk.robots.machine import Command, State
@@ -58,6 +60,10 @@ class SafetyFilter:
         """States since the last damping."""
         self.targets = TargetHistory(joints)
         """Targets since the last damping."""
+        self.response = ResponseHistory(joints)
+        """Response of the joints since the last damping."""
+        self.on_feet = False
+        """Whether the trunk should be up, as while a policy runs; the state machine sets it."""
 
     @property
     def level(self) -> FilterAction:
@@ -88,6 +94,7 @@ class SafetyFilter:
         self.sent_target = None
         self.sensors.begin()
         self.targets.begin()
+        self.response.begin()
         return Decision(self.reason)
 
     def judge(
@@ -149,7 +156,11 @@ class SafetyFilter:
                 return contradiction
         self.targets.observe(decision.reason, t, command, states[-1], limits)
         persistent = find_persistent(self.targets, limits)
-        return decision if persistent is None else persistent
+        if persistent is not None:
+            return persistent
+        self.response.observe(t, command, states[-1], limits, on_feet=self.on_feet)
+        missing = find_no_response(self.response, limits)
+        return decision if missing is None else missing
 
     def _input(
         self, states: Sequence[State], command: Command, t: float, dead_man: bool

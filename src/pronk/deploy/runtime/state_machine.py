@@ -248,6 +248,7 @@ class StateMachine:
         """Return the desired command of the mode, but of a sweep; arguments as of `step`."""
         if self.mode is Mode.HALT and t - self.since >= self.timing.halt_s:
             self._sit(t, position)
+        safety.on_feet = self.mode in POLICY_MODES
         path = self._path
         if path is None:
             return DesiredCommand()

@@ -33,6 +33,10 @@ from pronk.robots.machine import State
 
 WINDOW_S = 0.06
 """Time over which attitude and position are compared with their rates [s]."""
+DRIFT_S = 0.5
+"""Time over which a slow drift of a position against its velocity is summed [s]."""
+ON_TIME_SHARE = 0.25
+"""Largest deviation of the time between two states that arrived on time, in periods."""
 SPEED_STEP = 0.016
 """Largest constant velocity of a joint at rest: the Mini Cheetah's drives send 12 bits over 130
 rad/s, of which none is zero [rad/s]."""
@@ -69,6 +73,7 @@ class SensorHistory:
         self.restarts = 0
         """Restarts of the comparison since states were last compared for `WINDOW_S` without one."""
         self._undisturbed_s = 0.0
+        self._drift_window = max(2, round(DRIFT_S * state_rate_hz))
         self._voltages: deque[float] = deque(maxlen=max(1, round(VOLTAGE_S * state_rate_hz)))
         self._newest: State | None = None
         self._command_torque = np.zeros(joints)
@@ -91,6 +96,8 @@ class SensorHistory:
         # Of each joint.
         self.encoder = np.zeros(n)
         """Position less integral of velocity, beyond its uncertainty [rad], (n,)."""
+        self.slow_drift = np.zeros(n)
+        """The same over `DRIFT_S`, of states that arrived on time alone [rad], (n,)."""
         self.constant_s = np.zeros(2 * n)
         """Time for which each position, then each velocity has not changed in one bit [s], (2n,):
         entry i is the position of joint i, entry n + i its velocity."""
@@ -115,6 +122,10 @@ class SensorHistory:
         self._joint_drifts = np.zeros((window, n))
         self._joint_speeds = np.zeros((window, n))
         self._row = 0
+        # The same over the longer window, and the largest speeds within it and the one before.
+        self._slow_drifts = np.zeros((self._drift_window, n))
+        self._slow_speeds = np.zeros((2, n))
+        self._slow_row = 0
         # Integral of the velocity, and the range of it and of the position while constant.
         self._travel = np.zeros(n)
         self._lowest = np.concatenate((self._travel, position))
@@ -234,7 +245,9 @@ class SensorHistory:
             encoder = |sum over the window of (change of position - path)| - uncertainty
 
         where each term is reduced in size, by at most half the change of speed times the time, if
-        states in between were lost. In arrays of 2n entries, entry i belongs to the position of
+        states in between were lost. `slow_drift` is the same over a longer window, of the steps
+        between states that arrived on time, whose uncertainty is that of one such time. In arrays
+        of 2n entries, entry i belongs to the position of
         joint i and entry n + i to its velocity. `compared` is (`_travel`, position): what should
         not move while the position, or the velocity, is constant. `_lowest` and `_highest` are its
         range since that quantity changed last. Then
@@ -263,6 +276,22 @@ class SensorHistory:
         self._joint_speeds[self._row] = np.abs(velocity)
         uncertainty = self._joint_speeds.max(axis=0) * self._late_spread
         self.encoder = np.abs(drift - oldest_drift) - uncertainty
+
+        newest_slow = self._slow_drifts[self._slow_row]
+        self._slow_row = (self._slow_row + 1) % self._drift_window
+        oldest_slow = self._slow_drifts[self._slow_row].copy()
+        late = abs(seconds - self._period)
+        if state.sequence - before.sequence == 1 and late < ON_TIME_SHARE * self._period:
+            newest_slow = newest_slow + position - before.position - path
+        self._slow_drifts[self._slow_row] = newest_slow
+        # Largest speed of the present and of the last window.
+        speed = self._joint_speeds[self._row]
+        self._slow_speeds[0] = np.maximum(self._slow_speeds[0], speed)
+        if self._slow_row == 0:
+            self._slow_speeds[1] = self._slow_speeds[0]
+            self._slow_speeds[0] = speed
+        slow_uncertainty = (ON_TIME_SHARE * self._period) * self._slow_speeds.max(axis=0)
+        self.slow_drift = np.abs(newest_slow - oldest_slow) - slow_uncertainty
 
         # A position is compared with the integral of the velocity, a velocity with the position.
         compared = np.concatenate((self._travel, position))
@@ -418,6 +447,19 @@ def position_off_velocity(history: SensorHistory, limits: Limits) -> str:
     return ""
 
 
+def position_drifts(history: SensorHistory, limits: Limits) -> str:
+    """Find a joint whose position drifts slowly against its velocity.
+
+    Rule: `|sum(change of position - velocity dt)|` over half a second, of the states that arrived
+    on time and less the uncertainty of their times, is more than `drift`, 0.04 rad. A drift of both
+    together does not show.
+    """
+    if (history.slow_drift > limits.sensors.drift).any():
+        i = int(np.argmax(history.slow_drift))
+        return f"{limits.joints.names[i]}, drifts by {history.slow_drift[i]:.2f} rad"
+    return ""
+
+
 def constant_while_others_moved(history: SensorHistory, limits: Limits) -> str:
     """Find a joint that is constant to the last bit while the other joints move.
 
@@ -495,7 +537,10 @@ TRUNK_RULES: tuple[tuple[Reason, SensorRule], ...] = (
     (Reason.ATTITUDE, force_off_vertical),
 )
 """Rules of a trunk that is free, in their order; a fixed one may have no inertial unit."""
-JOINT_RULES: tuple[tuple[Reason, SensorRule], ...] = ((Reason.ENCODER, position_off_velocity),)
+JOINT_RULES: tuple[tuple[Reason, SensorRule], ...] = (
+    (Reason.ENCODER, position_off_velocity),
+    (Reason.ENCODER, position_drifts),
+)
 """Rules of the joints, after those of the trunk."""
 CONSTANT_RULES: tuple[tuple[Reason, SensorRule], ...] = (
     (Reason.ENCODER, constant_while_others_moved),
