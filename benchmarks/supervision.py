@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ import tyro
 
 from benchmarks.runner import Row, finish, rows_in, rows_of
 from pronk.cli import console
-from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from pronk.deploy.bench.faults import CLOCKS, SENSOR_FAULTS, SWAPPED, spoiled
 from pronk.deploy.runtime.limits import Limits
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.poses import RunTiming
@@ -59,6 +59,8 @@ _SEEDS = 1_000_000
 SUPERVISED = (
     *(Reason.REPEATED, Reason.ATTITUDE, Reason.ENCODER),
     *(Reason.HELD, Reason.CLIPPED, Reason.SWAPPED),
+    *(Reason.ROBOT_CLOCK, Reason.INTERRUPTED, Reason.BUS_VOLTAGE, Reason.FAR_TARGET),
+    *(Reason.COLLAPSED, Reason.TRACKING, Reason.ORIENTATION),
 )
 LIMITS = Limits.of(load_robot("mini_cheetah"))
 
@@ -105,6 +107,38 @@ def _clipped(safety: SafetyFilter) -> float:
     return safety.targets.clipped_s
 
 
+def _slow_drift(safety: SafetyFilter) -> float:
+    return float(safety.sensors.slow_drift.max())
+
+
+def _clock(safety: SafetyFilter) -> float:
+    return safety.sensors.clock.disagreement
+
+
+def _voltage(safety: SafetyFilter) -> float:
+    voltage = safety.sensors.voltage
+    return math.inf if math.isnan(voltage) else voltage
+
+
+def _height(safety: SafetyFilter) -> float:
+    return float(safety.response.trunk_height)
+
+
+def _low(safety: SafetyFilter) -> float:
+    return safety.response.low_s
+
+
+def _pushed(safety: SafetyFilter) -> float:
+    return float(safety.response.pushed_s.max())
+
+
+def _seized(safety: SafetyFilter) -> float:
+    response = safety.response
+    far = response.target_range > LIMITS.response.far
+    far &= response.torque_range > LIMITS.response.push_share * LIMITS.joints.torque
+    return float(np.where(far, response.motion, math.inf).min())
+
+
 QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
     "attitude less gyro [rad]": (SENSORS.attitude, _attitude),
     "force off the vertical [rad]": (SENSORS.upright, _lean),
@@ -115,6 +149,13 @@ QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
     "others moved while constant [rad]": (SENSORS.others_moved, _others),
     "limited by torque without moving [s]": (LIMITS.blocked.blocked_s, _blocked),
     "limited by torque [s]": (LIMITS.blocked.clipped_s, _clipped),
+    "slow drift of a position [rad]": (SENSORS.drift, _slow_drift),
+    "robot's clock off in a second [s]": (SENSORS.clock_s, _clock),
+    "least bus voltage [V]": (LIMITS.operating.bus_voltage, _voltage),
+    "least height of the trunk [m]": (LIMITS.collapsed, _height),
+    "trunk collapsed [s]": (LIMITS.response.low_s, _low),
+    "pushed without following [s]": (LIMITS.response.pushed_s, _pushed),
+    "least motion of a joint whose target moves far [rad]": (LIMITS.response.still, _seized),
 }
 """Limit, and the quantity, of the filter."""
 
@@ -174,6 +215,45 @@ def in_steps(state: State) -> State:
     )
 
 
+_FREE_KNEE = 2
+_FREE_PITCH = 1
+_FREE_ROLL = 0
+BODY_FAULTS = {
+    "motor-free-knee": _FREE_KNEE,
+    "motor-free-hip-pitch": _FREE_PITCH,
+    "motor-free-hip-roll": _FREE_ROLL,
+    "seized-knee": _FREE_KNEE,
+    "seized-hip-pitch": _FREE_PITCH,
+    "seized-hip-roll": _FREE_ROLL,
+    "battery-6-V": -1,
+}
+"""Faults of the robot itself, and the joint of each; the bus voltage is that of the battery."""
+_SEIZED_STIFFNESS = 1000.0
+_SEIZED_DAMPING = 5.0
+"""Of a seized rotor against its housing [N m/rad, N m s/rad]."""
+
+
+def strike_body(machine: VirtualRobot, fault: str) -> None:
+    """Make a fault of the robot itself in a virtual one, at each tick that it lasts."""
+    physics = machine._physics
+    assert physics is not None
+    plant = physics.plant
+    data = physics.data
+    k = BODY_FAULTS[fault]
+    if fault == "battery-6-V":
+        physics._machine = replace(physics._machine, bus_voltage=6.0)
+        return
+    rotor = plant.rotor[k]
+    if fault.startswith("motor-free"):
+        data.qfrc_applied[rotor] = -float(plant.motor_torque(data.act[None])[0][k])
+        return
+    joint = plant.model.dof_jntid[rotor]
+    if plant.model.jnt_stiffness[joint] != _SEIZED_STIFFNESS:
+        plant.model.jnt_stiffness[joint] = _SEIZED_STIFFNESS
+        plant.model.dof_damping[rotor] += _SEIZED_DAMPING
+        plant.model.qpos_spring[plant.rotor_qpos[k]] = data.qpos[plant.rotor_qpos[k]]
+
+
 @dataclass(kw_only=True)
 class Flight:
     """One run of the virtual robot, from damping."""
@@ -187,7 +267,9 @@ class Flight:
     coarse: bool = False
     """Whether positions and velocities come in the steps of the Mini Cheetah's drives."""
     fault: str = ""
-    """Of `SENSOR_FAULTS`."""
+    """Of `SENSOR_FAULTS` or `BODY_FAULTS`."""
+    clock: str = "right"
+    """The robot's own clock from `fault_at` on, of `CLOCKS`."""
     fault_at: float = math.inf
     """[s]"""
     delay_ticks: int = 0
@@ -200,6 +282,12 @@ class Flight:
     damped: Decision | None = None
     damped_at: float = math.nan
     """[s]"""
+
+    def _stamped(self, state: State) -> State:
+        """A state with the robot's own time."""
+        if state.time < self.fault_at:
+            return replace(state, robot_time=state.time)
+        return replace(state, robot_time=CLOCKS[self.clock](self.fault_at, state.time))
 
     def run(self, seconds: float) -> None:
         """Fly until a time, or until the filter damps."""
@@ -227,13 +315,16 @@ class Flight:
         sound = machine.latest()
         for tick in range(1, round(seconds * SERVO_HZ) + 1):
             t = tick / SERVO_HZ
+            if t >= self.fault_at and self.fault in BODY_FAULTS:
+                strike_body(machine, self.fault)
             measured = [state for state in machine.wait(t) if rng.random() >= self.loss]
             if self.coarse:
                 measured = [in_steps(state) for state in measured]
             if t < self.fault_at:
                 sound = measured[-1] if measured else sound
-            elif self.fault:
+            elif self.fault in SENSOR_FAULTS:
                 measured = [spoiled(self.fault, sound, state) for state in measured]
+            measured = [self._stamped(state) for state in measured]
             waiting += measured
             keep = self.delay_ticks if t >= self.fault_at else 0
             states = waiting[: max(0, len(waiting) - keep)]
@@ -296,7 +387,9 @@ class Flight:
 LATE = "states-30-ms-old"
 WALK = (1.0, 0.0, 0.0)
 """Forward, left [m/s], yaw rate [rad/s] at the begin of a fault."""
-FAULTS = (*SENSOR_FAULTS, LATE)
+CLOCK_ALONE = "clock-alone"
+"""No fault but that of the robot's own clock."""
+FAULTS = (*SENSOR_FAULTS, *BODY_FAULTS, LATE, CLOCK_ALONE)
 
 
 def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
@@ -323,9 +416,12 @@ def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
     return [{"flight": number, "end": end, "alarm": alarm, **row}]
 
 
-def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
-    """Time from a fault to damping [s] and the reason; NaN where it is not found in 4 s."""
-    fault, k = job
+def struck(policy: Path, seed: int, job: tuple[str, str, int]) -> list[Row]:
+    """Time from a fault to damping [s] and the reason; NaN where it is not found in 4 s.
+
+    The job is a fault, the robot's own clock from its begin on, and the number of the run.
+    """
+    fault, clock, k = job
     begins = 0.0 if fault in SWAPPED else 7.0 + 0.137 * k
     number = k
     while True:
@@ -335,7 +431,8 @@ def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
             params=draw_params(number),
             seed=_SEEDS * seed + 1000 + number,
             steady=WALK,
-            fault="" if fault == LATE else fault,
+            fault="" if fault in (LATE, CLOCK_ALONE) else fault,
+            clock=clock,
             fault_at=begins,
             delay_ticks=15 if fault == LATE else 0,
             coarse=k % 2 == 1,
@@ -344,11 +441,19 @@ def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
         if not flight.damped_at < begins:  # else it fell before
             break
     reason = "none" if flight.damped is None else flight.damped.reason.name
-    return [{"fault": fault, "run": k, "time_s": flight.damped_at - begins, "reason": reason}]
+    time_s = flight.damped_at - begins
+    return [{"fault": fault, "clock": clock, "run": k, "time_s": time_s, "reason": reason}]
 
 
 def fly(
-    policy: Path, hours: float, sets: int, runs: int, seed: int, jobs: int, out: Path | None
+    policy: Path,
+    hours: float,
+    sets: int,
+    runs: int,
+    clocks: tuple[str, ...],
+    seed: int,
+    jobs: int,
+    out: Path | None,
 ) -> Iterator[Row]:
     """Rows in `out`, then of `quiet` until so many hours are flown, then of `struck`."""
     rows = rows_in(out)
@@ -361,9 +466,12 @@ def fly(
         flown += row["seconds"]
         if flown >= 3600.0 * hours:
             break
-    done = {(row["fault"], row["run"]) for row in rows if "fault" in row}
-    faults = ((name, k) for k in range(runs) for name in FAULTS if (name, k) not in done)
-    yield from rows_of((partial(struck, policy, seed, job) for job in faults), jobs, out)
+    done = {(row["fault"], row["clock"], row["run"]) for row in rows if "fault" in row}
+    waiting = []
+    for job in product(FAULTS, clocks, range(runs)):
+        if job not in done and job[:2] != (CLOCK_ALONE, "right"):
+            waiting.append(partial(struck, policy, seed, job))
+    yield from rows_of(waiting, jobs, out)
 
 
 def supervision(
@@ -371,6 +479,7 @@ def supervision(
     hours: float = 0.1,
     sets: int = 10,
     runs: int = 10,
+    clocks: str = "right,stuck,fast,jumps",
     seed: int = 0,
     jobs: int = 1,
     out: Path | None = None,
@@ -382,6 +491,7 @@ def supervision(
         hours: Of walking and jumping without a fault.
         sets: Parameter sets of the virtual robot.
         runs: With each fault, each at another moment of the gait and another parameter set.
+        clocks: The robot's own clock from the begin of a fault on, separated by commas.
         seed: Of noise, commands and losses.
         jobs: Processes.
         out: File of rows in JSON, written as they come; a run goes on from those that are there.
@@ -389,10 +499,12 @@ def supervision(
     load_policy(policy)
     rows: list[Row] = []
     with console.progress() as report:
-        for row in fly(policy, hours, sets, runs, seed, jobs, out):
+        for row in fly(policy, hours, sets, runs, tuple(clocks.split(",")), seed, jobs, out):
             rows.append(row)
             if "run" in row:
-                report("faults", min(len(rows) / (len(FAULTS) * runs), 1.0))
+                report(
+                    "faults", min(len(rows) / (len(FAULTS) * len(clocks.split(",")) * runs), 1.0)
+                )
             else:
                 flown_s = sum(flight.get("seconds", 0.0) for flight in rows)
                 report("walking and jumping", min(flown_s / (3600.0 * hours), 1.0))
@@ -423,8 +535,10 @@ def supervision(
         notes=(f"Ends of the flights: {end_counts}.",),
     )
     fault_rows: list[tuple[Cell, ...]] = []
-    for name in FAULTS:
-        of_fault = [row for row in rows if row.get("fault") == name]
+    for name, clock in product(FAULTS, clocks.split(",")):
+        of_fault = [row for row in rows if (row.get("fault"), row.get("clock")) == (name, clock)]
+        if not of_fault:
+            continue
         times = 1e3 * np.array([row["time_s"] for row in of_fault])
         missed = int(np.isnan(times).sum())
         if missed == len(of_fault):
@@ -436,8 +550,8 @@ def supervision(
         reasons = Counter(row["reason"] for row in of_fault)
         texts = ", ".join(f"{reason} {number}" for reason, number in reasons.items())
         found = f"{len(of_fault) - missed}/{len(of_fault)}"
-        fault_rows.append((name, median, worst, found, texts))
-    headings = ("fault", "median", "worst", "found", "reasons")
+        fault_rows.append((name, clock, median, worst, found, texts))
+    headings = ("fault", "robot's clock", "median", "worst", "found", "reasons")
     fault_table = Table(
         title="From a fault to damping [ms]",
         columns=tuple(Column(heading=heading) for heading in headings),

@@ -74,18 +74,19 @@ _ROBOT_PRIORITY = 30
 """Real-time priority of the virtual robot, below that of the commanding processes."""
 
 
-def _wire(robot: RobotSpec, link: str, options: dict[str, int]) -> ServerTransport:
+def _wire(robot: RobotSpec, link: str, options: dict[str, Any]) -> ServerTransport:
     """The wire behind which a virtual robot is."""
-    if link == "lcm":
+    if link.startswith("lcm"):
         from pronk.deploy.bench.lcm_server import LcmServerTransport
 
-        return LcmServerTransport(robot, mode="", port=options["port"])
+        layout = "wtw" if link == "lcm-wtw" else "cheetah"
+        return LcmServerTransport(robot, mode="", port=options["port"], layout=layout)
     from pronk.deploy.bench.dds_server import DdsServerTransport
 
     return DdsServerTransport(robot, mode="", domain=options["domain"])
 
 
-def _serve(name: str, link: str, options: dict[str, int], end: Connection) -> None:
+def _serve(name: str, link: str, options: dict[str, Any], end: Connection) -> None:
     """Body of the robot's process; receives faults, and sends the time to damping."""
     die_with_parent()
     # A robot does not depend on how busy this computer is.
@@ -121,13 +122,15 @@ def free_port() -> int:
 def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]:
     """A virtual robot on the ground in a process of its own: its address, and its other end.
 
+    `lcm-wtw` is LCM in the layout `wtw`, which carries the robot's own time.
+
     Of the link `sim`, whose robot is in the servo's process, the address alone.
     """
     if link == "sim":
         yield Address.parse("sim://ground"), None
         return
-    options = {"domain": 100 + os.getpid() % 50}
-    if link == "lcm":
+    options: dict[str, Any] = {"domain": 100 + os.getpid() % 50}
+    if link.startswith("lcm"):
         options = {"port": free_port()}
     context = get_context("spawn")
     end, other_end = context.Pipe()
@@ -138,7 +141,9 @@ def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]
     other_end.close()
     try:
         end.recv()
-        yield Address(scheme=link, options=options), end
+        if link == "lcm-wtw":
+            options["layout"] = "wtw"
+        yield Address(scheme=link.partition("-")[0], options=options), end
     finally:
         process.kill()
         process.join()
@@ -265,7 +270,7 @@ def _strike_standing(deployment: Deployment, robot: Connection, fault: str) -> S
 def _strike_walking(deployment: Deployment, robot: Connection, fault: str) -> Strike | None:
     """Strike a robot that walks; None if the computer was too busy."""
     deployment.events_seen()
-    robot.send(fault if fault in SENSOR_FAULTS else "")
+    robot.send(fault if fault.partition("@")[0] in SENSOR_FAULTS else "")
     stopped: int | None = None
     if fault in PROCESSES:
         process_name, number = PROCESSES[fault]
@@ -305,7 +310,8 @@ def _result(
         reasons = ["STANDBY"]
     if seconds is None or not reasons:
         return Strike(fault, math.nan, "not found")
-    if reasons[0] in BUSY and not fault.startswith(("policy", "servo")):
+    # A clock that stands still stops the numbers of the states over DDS, and so the states.
+    if reasons[0] in BUSY and "@" not in fault and not fault.startswith(("policy", "servo")):
         return None
     return Strike(fault, seconds, reasons[0])
 

@@ -19,14 +19,20 @@ pytest.importorskip("cyclonedds")
 pytest.importorskip("onnx")
 
 from deploy_runs import PATIENT
-from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
+from pronk.deploy.bench.faults import NO_VOLTAGE, SENSOR_FAULTS, SWAPPED
 from tests.deploy_strikes import PROCESSES, REFUSED, measure
 
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 IMU = ("imu", "attitude", "gyro", "accelerometer")
 SERVO = ("servo-stopped", "servo-killed")
 """`test_deploy_rival.py` has those of the Mini Cheetah: by the other link here."""
-OTHERS = (*SENSOR_FAULTS, "policy-stopped", "policy-killed")
+UNSEEN = (*NO_VOLTAGE, "encoder-drifts-with-velocity")
+"""Not carried by LCM, and found by the fall alone."""
+OTHERS = (
+    *(fault for fault in SENSOR_FAULTS if fault not in UNSEEN),
+    "policy-stopped",
+    "policy-killed",
+)
 LONGEST_S = {"encoder-zero": 2.0, **dict.fromkeys(SWAPPED, 6.0), **dict.fromkeys(PROCESSES, 2.5)}
 """Of a joint that hardly moves, of a robot that stands up, and of `patient` processes; 0.5 s else.
 Several times what an idle computer takes, so that a busy one passes."""
@@ -63,3 +69,22 @@ def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> Non
             expected = {"REPEATED", "ATTITUDE"} if of_trunk else {"ENCODER"}
         assert strike.reason in expected, strike
         assert strike.time_s <= LONGEST_S.get(fault, 0.5), strike
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["lcm-wtw", "dds"])
+def test_a_frozen_unit_is_found_whatever_the_robots_clock_says(link: str) -> None:
+    patient = {"ages": replace(PATIENT, hold_s=1.0), "action_valid_s": 0.3}
+    patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
+    faults = ("imu-repeats@fast", "imu-repeats@jumps")
+    for strike in measure("mini_cheetah", POLICY, link, faults, **patient):
+        assert strike.reason in ("REPEATED", "ROBOT_CLOCK", "NO_STATE"), strike
+        assert strike.time_s <= 2.0, strike
+
+
+@pytest.mark.slow
+def test_a_voltage_of_zero_is_found_over_dds() -> None:
+    patient = {"ages": replace(PATIENT, hold_s=1.0), "action_valid_s": 0.3}
+    patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
+    for strike in measure("go2", POLICY, "dds", ("voltage-zero",), **patient):
+        assert strike.reason == "BUS_VOLTAGE", strike

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from pronk.deploy.bench.faults import NO_VOLTAGE, SENSOR_FAULTS, SWAPPED, spoiled
 from pronk.deploy.runtime.limits import Limits
 from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.deploy.runtime.safety import SafetyFilter
@@ -96,7 +96,10 @@ def test_a_moving_robot_is_believed_with_lost_states_bursts_and_slow_ones() -> N
         assert judged(states)[0] is Reason.NONE
 
 
-@pytest.mark.parametrize("fault", sorted(set(SENSOR_FAULTS) - set(SWAPPED)))
+SLOW = "encoder-drifts-with-velocity"
+
+
+@pytest.mark.parametrize("fault", sorted(set(SENSOR_FAULTS) - {*SWAPPED, *NO_VOLTAGE, SLOW}))
 def test_a_faulty_sensor_is_found(fault: str) -> None:
     reason, when = judged(spoil(lambda sound, state: spoiled(fault, sound, state)))
     imu = fault.split("-")[0] in ("imu", "attitude", "gyro", "accelerometer")
@@ -127,9 +130,16 @@ def lying(_: State, state: State) -> State:
     return replace(state, accelerometer=np.array([x, z, y]))
 
 
+def creeping(_: State, state: State) -> State:
+    """An encoder drifts by 0.5 rad/s; its velocity does not."""
+    drift = np.where(np.arange(12) == 2, 0.5 * (state.time - BEGINS), 0.0)
+    return replace(state, position=state.position + drift)
+
+
 @pytest.mark.parametrize(
     ("change", "reason", "within"),
     [
+        (creeping, Reason.ENCODER, 0.1),
         (stopped, Reason.ENCODER, 0.1),  # by the others' motion
         (drifting, Reason.ATTITUDE, 0.1),
         (lying, Reason.ATTITUDE, 1.0),

@@ -52,6 +52,10 @@ class ChannelFaults(Bounded):
 
 _FAULTY_JOINT = 3
 """Joint of a faulty encoder: the second leg's first, whose load changes least."""
+_DRIFTING_JOINT = 2
+"""Joint of an encoder that drifts: the first leg's knee."""
+_DRIFT = 0.5
+"""Its drift [rad/s]."""
 _DITHER = 1e-4
 """Share of the live attitude in one that is stuck, so that it does not repeat."""
 
@@ -125,6 +129,26 @@ def _encoder_constant(sound: State, state: State) -> State:
     return replace(state, position=position, velocity=velocity)
 
 
+def _encoder_drifts(sound: State, state: State) -> State:
+    position = state.position.copy()
+    position[_DRIFTING_JOINT] += _DRIFT * (state.time - sound.time)
+    return replace(state, position=position)
+
+
+def _encoder_drifts_with_velocity(sound: State, state: State) -> State:
+    velocity = state.velocity.copy()
+    velocity[_DRIFTING_JOINT] += _DRIFT
+    return replace(_encoder_drifts(sound, state), velocity=velocity)
+
+
+def _voltage_low(_sound: State, state: State) -> State:
+    return replace(state, bus_voltage=6.0)
+
+
+def _voltage_zero(_sound: State, state: State) -> State:
+    return replace(state, bus_voltage=0.0)
+
+
 def _legs_swapped(_sound: State, state: State) -> State:
     return _reordered(state, [3, 4, 5, 0, 1, 2])
 
@@ -158,12 +182,44 @@ SENSOR_FAULTS: dict[str, Callable[[State, State], State]] = {
     "encoder-jumps": _encoder_jumps,
     "encoder-zero": _encoder_zero,
     "encoder-constant": _encoder_constant,
+    "encoder-drifts": _encoder_drifts,
+    "encoder-drifts-with-velocity": _encoder_drifts_with_velocity,
+    "voltage-low": _voltage_low,
+    "voltage-zero": _voltage_zero,
     "legs-swapped": _legs_swapped,
     "joints-swapped": _joints_swapped,
 }
 """What a faulty sensor makes of a state, from the last state before the fault and this one."""
+NO_VOLTAGE = ("voltage-low", "voltage-zero")
+"""Faults of the bus voltage, which LCM does not carry."""
 SWAPPED = ("legs-swapped", "joints-swapped")
 """The first two legs, and the last two joints of the first: found as the robot stands up."""
+
+
+def _right(_begun: float, time: float) -> float:
+    return time
+
+
+def _stuck(begun: float, _time: float) -> float:
+    return begun
+
+
+def _thousand_times(begun: float, time: float) -> float:
+    return begun + 1000.0 * (time - begun)
+
+
+def _jumps(begun: float, time: float) -> float:
+    return time + 10.0 * (1.0 - math.floor((time - begun) / 0.1) % 2)
+
+
+CLOCKS: dict[str, Callable[[float, float], float]] = {
+    "right": _right,
+    "stuck": _stuck,
+    "fast": _thousand_times,
+    "jumps": _jumps,
+}
+"""The robot's own time [s] by the time at which the fault began and the true time: right, stuck,
+1,000 times too fast, and forward and back by 10 s every 0.1 s."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from pronk.deploy.bench.faults import FaultChannel, Faults, flip_bit, spoiled
+from pronk.deploy.bench.faults import CLOCKS, FaultChannel, Faults, flip_bit, spoiled
 from pronk.deploy.links.realtime import Histogram, sleep_until
 from pronk.errors import HardwareError
 from pronk.jump.virtual.bounds import Bounded
@@ -136,6 +136,7 @@ class RobotServer:
         self._frozen: State | None = None
         self._sound: State | None = None  # the last state before a sensor's fault
         self._sensor = self._faults.sensor
+        self._clock_fault = "right"
         self.damped_s: float | None = None
         """Time from the beginning of a sensor's fault to the first damping, None before it [s]."""
         self._slipped_s = 0.0
@@ -179,8 +180,13 @@ class RobotServer:
             self._wire.publish(state)
 
     def spoil(self, fault: str | None) -> None:
-        """Begin a fault of `SENSOR_FAULTS` now, or end it; "" notes the time of another fault."""
-        self._sensor = None if fault is None else (fault, self._now)
+        """Begin a fault of `SENSOR_FAULTS` now, or end it; "" notes the time of another fault.
+
+        `FAULT@CLOCK` begins one of `CLOCKS` with it.
+        """
+        name, _, clock = (fault or "").partition("@")
+        self._sensor = None if fault is None else (name, self._now)
+        self._clock_fault = clock or "right"
         self.damped_s = None
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -257,6 +263,8 @@ class RobotServer:
             values = getattr(state, name).copy()
             values[self._states.pick(len(values))] = math.nan
             state = replace(state, **{name: values})
+        if self._sensor is not None and now >= self._sensor[1]:
+            robot_time = CLOCKS[self._clock_fault](self._sensor[1], robot_time)
         return replace(state, robot_time=robot_time)
 
     def _flip(self, channel: FaultChannel[Command] | FaultChannel[State], data: bytes) -> bytes:

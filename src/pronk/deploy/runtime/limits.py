@@ -204,9 +204,9 @@ class SensorLimits:
     moved: float = 0.005
     """Largest range of the integral of velocity at a constant position, or the reverse [rad]: three
     steps of an encoder of 12 bits."""
-    drift: float = 0.04
+    drift: float = 0.035
     """Largest difference of position and integral of velocity over half a second, of states that
-    arrived on time [rad]; 2.5 times the largest of 5 min of walking and jumping, 0.016."""
+    arrived on time [rad]; twice the largest of 5 min of walking and jumping, 0.018."""
     others_moved: float = 0.05
     """Largest sum of the displacements of other joints while one is constant for `repeat_s` [rad];
     the largest measured is 0.003, with encoders of 12 bits without noise."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +27,8 @@ class RunTiming:
     fold_s: float = 1.0
     """Time from the measured pose to the folded pose [s]."""
     check_s: float = 0.15
-    """Time of each half swing of a leg in the folded pose, before the first rise; 0 for no check
-    [s]."""
+    """Time of each half swing of a leg in the folded pose before the first rise, and of each small
+    motion in the default pose after it; 0 for no check [s]."""
     rise_s: float = 1.5
     """Time from the folded pose to the default pose [s]."""
     ramp_s: float = 0.5
@@ -121,7 +122,13 @@ def folded_pose(robot: RobotSpec) -> Array:
 
 
 def stand_up(
-    robot: RobotSpec, measured: Array, began: float, timing: RunTiming, *, swing: bool = False
+    robot: RobotSpec,
+    measured: Array,
+    began: float,
+    timing: RunTiming,
+    *,
+    swing: bool = False,
+    nods: Sequence[Array] = (),
 ) -> PosePath:
     """Plan the way from the measured pose through the folded to the default pose.
 
@@ -132,6 +139,8 @@ def stand_up(
         timing: Times of the way.
         swing: Whether each leg's last joint swings by `SWING` in the folded pose, one leg after
             another.
+        nods: Poses of small motions after the default pose, the last of them the default pose
+            again, `RunTiming.check_s` apart [rad], each (joints,).
     """
     default = np.array([joint.default_position for joint in robot.joints])
     folded = folded_pose(robot)
@@ -145,4 +154,7 @@ def stand_up(
             seconds += [timing.check_s, timing.check_s]
     poses.append(default)
     seconds.append(timing.rise_s)
+    for pose in nods:
+        poses.append(pose)
+        seconds.append(timing.check_s)
     return PosePath(began=began, poses=tuple(poses), seconds=tuple(seconds), ramp_s=timing.ramp_s)

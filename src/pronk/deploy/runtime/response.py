@@ -20,7 +20,7 @@ from pronk.robots.machine import Command, State
 
 _STEP_S = 0.01
 """Time between two samples of targets and positions [s]."""
-_LAG_S = 0.04
+_LAG_S = 0.06
 """Time from a target to a motion that follows it, on the way there and back and in the drive, at
 most [s]."""
 SEIZED_S = 0.25
@@ -40,7 +40,7 @@ class ResponseHistory:
         """Time for which the commanded torque of each joint has been beyond `ResponseLimits.push`
         in one direction without the joint's moving that way [s], (joints,)."""
         self.target_range = np.zeros(joints)
-        """Range of the target of each joint over `SEIZED_S`, until 40 ms ago [rad], (joints,)."""
+        """Range of the target of each joint over `SEIZED_S`, until 60 ms ago [rad], (joints,)."""
         self.torque_range = np.zeros(joints)
         """Range of stiffness times target over the same time [N m], (joints,)."""
         self.motion = np.full(joints, np.inf)
@@ -173,7 +173,7 @@ def pushed_in_vain(history: ResponseHistory, limits: Limits) -> str:
 def seized_joint(history: ResponseHistory, limits: Limits) -> str:
     """Find a joint that stands still while its target moves far.
 
-    Rule: over 0.25 s the position stayed within `still`, 0.03 rad, while the target, 40 ms earlier,
+    Rule: over 0.25 s the position stayed within `still`, 0.03 rad, while the target, 60 ms earlier,
     moved over more than `far`, 0.8 rad, and stiffness times target over more than 0.45 of the
     effort limit. Least motion of walks and jumps while targets moved as far: 0.076 rad.
     """

@@ -29,6 +29,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.deploy.runtime.modes import POLICY_MODES, SILENT, Mode, OperatorRequest
+from pronk.deploy.runtime.nod_check import NodCheck, nod_poses
 from pronk.deploy.runtime.poses import (
     PosePath,
     RunTiming,
@@ -37,6 +38,7 @@ from pronk.deploy.runtime.poses import (
     minimum_jerk,
     stand_up,
 )
+from pronk.deploy.runtime.posture import leg_kinematics
 from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.deploy.runtime.records import Record
 from pronk.deploy.runtime.safety import SafetyFilter
@@ -138,6 +140,14 @@ class StateMachine:
         self._damping = np.array([joint.damping for joint in robot.joints])
         self._path: PosePath | None = None
         self._swing_check = SwingCheck(robot, timing)
+        self._nods: list[Array] = []
+        """Poses of the small motions after the first rise; none once they are passed."""
+        self._nod_check: NodCheck | None = None
+        legs = leg_kinematics(robot) if self._swing_check.needed else None
+        if legs is not None:
+            default = np.array([joint.default_position for joint in robot.joints])
+            self._nods = nod_poses(legs, default, folded_pose(robot))
+            self._nod_check = NodCheck(legs, robot.joint_names)
         self._blending_since: float | None = None
         """Time of the policy's first action in this run of it [s]; None before it."""
         self._policy_mode_count = 0
@@ -226,9 +236,16 @@ class StateMachine:
         elif request is OperatorRequest.STAND and mode is Mode.DAMP:
             if t - self.since >= self.timing.damp_s:
                 self._path = stand_up(
-                    self.robot, position, t, self.timing, swing=self._swing_check.needed
+                    self.robot,
+                    position,
+                    t,
+                    self.timing,
+                    swing=self._swing_check.needed,
+                    nods=self._nods,
                 )
                 self._swing_check.begin()
+                if self._nod_check is not None:
+                    self._nod_check.begin()
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
         elif request is OperatorRequest.WALK and mode is Mode.STAND and self._rise_is_over(t):
@@ -260,12 +277,32 @@ class StateMachine:
             ):
                 safety.fault(Reason.SWAPPED, t)
                 return DesiredCommand()
+            if self._nods and self._finds_contradiction(t, path, position, safety):
+                safety.fault(Reason.ORIENTATION, t)
+                return DesiredCommand()
             return self._pose(t, path.target(t), path.stiffness(t))
         if self.mode is Mode.SIT:
             if not path.done(t):
                 return self._pose(t, path.target(t), path.stiffness(t))
             self.enter(Mode.DAMP, t)
         return DesiredCommand()
+
+    def _finds_contradiction(
+        self, t: float, path: PosePath, position: Array, safety: SafetyFilter
+    ) -> bool:
+        """Note a tick of the small motions; after them, whether sensors contradict them."""
+        assert self._nod_check is not None
+        nods_s = len(self._nods) * self.timing.check_s
+        if t < path.began + sum(path.seconds) - nods_s:
+            return False
+        if not path.done(t):
+            state = safety.sensors.newest if safety.limits.trunk_is_free else None
+            self._nod_check.observe(t, path.target(t), position, state)
+            return False
+        self.notice = self._nod_check.contradiction()
+        if not self.notice:
+            self._nods = []
+        return bool(self.notice)
 
     def follow_sweep(self, t: float, command: Command | None) -> DesiredCommand:
         """Return the desired command of a sweep; None as its command ends the run."""
@@ -276,8 +313,11 @@ class StateMachine:
         return DesiredCommand()
 
     def _rise_is_over(self, t: float) -> bool:
-        """Whether the time of the path to the default pose has passed, wherever the robot is."""
-        return self._path is not None and self._path.done(t)
+        """Whether the path to the default pose is over, and the small motions after it are judged.
+
+        The measured pose is not compared with the path.
+        """
+        return self._path is not None and self._path.done(t) and not self._nods
 
     def _sit(self, t: float, position: Array) -> None:
         """Begin to sit down from the measured pose."""

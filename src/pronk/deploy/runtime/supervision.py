@@ -142,6 +142,11 @@ class SensorHistory:
         return math.atan2(math.hypot(x, y), z)
 
     @property
+    def newest(self) -> State | None:
+        """The newest state since the last damping; None without one."""
+        return self._newest
+
+    @property
     def voltage(self) -> float:
         """Largest bus voltage of the last `VOLTAGE_S` [V]; NaN before, and where there is none."""
         voltages = self._voltages
@@ -451,8 +456,8 @@ def position_drifts(history: SensorHistory, limits: Limits) -> str:
     """Find a joint whose position drifts slowly against its velocity.
 
     Rule: `|sum(change of position - velocity dt)|` over half a second, of the states that arrived
-    on time and less the uncertainty of their times, is more than `drift`, 0.04 rad. A drift of both
-    together does not show.
+    on time and less the uncertainty of their times, is more than `drift`, 0.035 rad. A drift of
+    both together does not show.
     """
     if (history.slow_drift > limits.sensors.drift).any():
         i = int(np.argmax(history.slow_drift))
