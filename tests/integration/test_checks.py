@@ -104,3 +104,13 @@ def test_excitations_of_an_arm_pass() -> None:
     for log in read_logs(folders, robot=robot):
         for joint in log.excited_joints:
             assert check_excitations(log.excitations(joint), robot) == (), (log.source, joint)
+
+
+def test_an_encoder_that_is_reset_is_not_taken_for_a_torque_limit(bare_case: Case) -> None:
+    position = bare_case.log.position.copy()
+    middle = bare_case.log.segments[0].start + 8.0
+    position[bare_case.log.time > middle, bare_case.log.column(JOINT)] += 0.8
+    excitations = replace(bare_case.log, position=position).excitations(JOINT)
+    flags = check_excitations(excitations, ROBOT)
+    assert any(flag.startswith("position column") for flag in flags)
+    assert not any(flag.startswith("effort limit") for flag in flags[:1])

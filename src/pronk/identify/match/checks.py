@@ -118,11 +118,13 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
             if problem:
                 source = excitation.source or "log"
                 raise LogError(f"{source}: {excitation.joint}: {problem}.")
+        jump = position_jump(excitation, joint)
         for flag in (
+            jump,
             standstill(excitation, joint),
             too_few_samples(excitation, joint),
             wrong_clock(excitation, robot.policy_rate_hz),
-            effort_limit_reached(excitation, joint),
+            "" if jump else effort_limit_reached(excitation, joint),
         ):
             if flag and not _is_repeated(flag, flags):
                 flags.append(flag)
@@ -328,6 +330,36 @@ def standstill(excitation: Excitation, joint: Joint) -> str:
                 "above the torque of the drive: look there and record again"
             )
     return ""
+
+
+JUMP_SPEED = 3.0
+"""Speed between two samples, over the no-load speed of the drive, from which on a position jumps:
+no drive turns so fast, and three times leave room for a wrong no-load speed in the robot's file."""
+JUMP_RAD = 0.1
+"""Least jump of a position that counts [rad]: far above the noise of an encoder at any rate."""
+
+
+def position_jump(excitation: Excitation, joint: Joint) -> str:
+    """Say when the position jumps between two samples, as after a reset of the encoder.
+
+    Args:
+        excitation: Excitation of a joint.
+        joint: Its model, which has the no-load speed.
+
+    Returns:
+        What was seen and the way out; empty if nothing jumps.
+    """
+    changes = np.abs(np.diff(excitation.position))
+    speeds = changes / np.diff(excitation.time)
+    jumps = (changes > JUMP_RAD) & (speeds > JUMP_SPEED * joint.drive.no_load_speed)
+    if not jumps.any():
+        return ""
+    largest = int(np.argmax(np.where(jumps, changes, 0.0)))
+    return (
+        f"position column: it jumps by {changes[largest]:.2g} rad between two samples at "
+        f"{excitation.time[largest]:.2f} s, {int(jumps.sum())} times in all, faster than the drive "
+        "turns without a load; use the part of the log before or after, or record again"
+    )
 
 
 def too_few_samples(excitation: Excitation, joint: Joint) -> str:
