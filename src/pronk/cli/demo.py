@@ -6,7 +6,6 @@ import importlib.util
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,7 +71,7 @@ def demo(
         tried = tried[:1]
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
     with console.progress() as report, pool(1) as process:
-        jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed)
+        jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed, quick)
         result, replays = sweep_and_match(robot, joints, out, repeats, seed, report)
         report("jumps and film", 0.0)
         trial, films = jumping.result()
@@ -81,9 +80,10 @@ def demo(
         page, _ = write_report(out, report)
     seconds = time.perf_counter() - begin
     cells = show_match(result, replays)
-    if trial is not None:
+    if trial is not None and not quick:
         console.show(tables.paper_table(trial, "height"))
         console.show(tables.paper_table(trial, "distance"))
+    if trial is not None:
         console.show(tables.landings(trial))
     console.say(
         "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
@@ -140,22 +140,27 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
 
 
 def jump_and_film(
-    policies: Sequence[Path], out: Path, jumps: int, seed: int
+    policies: Sequence[Path], out: Path, jumps: int, seed: int, quick: bool = False
 ) -> tuple[TrialResults | None, tuple[Path, ...]]:
-    """Run a short trial on the shipped virtual robot and film one jump of the first policy.
+    """Run a short trial on the shipped virtual robot and film one jump of each policy.
 
-    An existing trial is replaced. Without policies the results are None and no film.
+    An existing trial is replaced. Without policies the results are None and no film. A quick trial
+    has the filmed command alone.
     """
     from pronk.jump.trial.films.record import record_trial
+    from pronk.jump.trial.protocol import PAPER_COMMANDS
     from pronk.jump.trial.trial import VIDEOS, TrialPlan, run_trial, setup_of
 
     if not policies:
         return None, ()
     setup = setup_of(policies[0], out)
-    trial = run_trial(policies, TrialPlan(jumps=jumps, seed=seed), setup, overwrite=True)
-    first = replace(trial, subjects=trial.subjects[:1])
+    cases = PAPER_COMMANDS
+    if quick:
+        cases = tuple(case for case in cases if case.name == FILMED)
+    plan = TrialPlan(cases=cases, jumps=jumps, seed=seed)
+    trial = run_trial(policies, plan, setup, overwrite=True)
     films = record_trial(
-        first, out, out / VIDEOS, robot=setup.robot, cases=(FILMED,), slow=2.0, warn=console.warn
+        trial, out, out / VIDEOS, robot=setup.robot, cases=(FILMED,), slow=2.0, warn=console.warn
     )
     return trial, films
 
@@ -200,7 +205,9 @@ def sweep_and_match(
 
     repeats_by_amplitude = (repeats, *[1] * len(AMPLITUDES[1:]))
     sweep = make_plan(robot, joints, Chirp(), amplitudes=AMPLITUDES, repeats=repeats_by_amplitude)
-    fresh_sweep = make_plan(robot, joints, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
+    # One joint of a leg shows whether the gains hold on another signal.
+    fresh_joints = joints if len(joints) == len(robot.joint_names) else joints[-1:]
+    fresh_sweep = make_plan(robot, fresh_joints, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     log_paths = record("logs", sweep, seed)
     fresh_paths = record("fresh", fresh_sweep, seed + 1)
     logs = read_logs(log_paths, processes=processes, robot=robot)
@@ -244,7 +251,7 @@ def show_match(
         stiffness_distance = abs(gains.stiffness.value - stiffness) / stiffness_cell
         damping_distance = abs(gains.damping.value - damping) / damping_cell
         cells[name] = (stiffness_distance, damping_distance)
-        replay = replay_by_joint[name]
+        replay = replay_by_joint.get(name)
         rows.append(
             (
                 name,
@@ -253,8 +260,8 @@ def show_match(
                 f"{stiffness_distance:.1f} / {damping_distance:.1f}",
                 gains.quality.nominal_error_db,
                 gains.quality.error_db,
-                replay.rmse_nominal,
-                replay.rmse_matched,
+                replay.rmse_nominal if replay else None,
+                replay.rmse_matched if replay else None,
             )
         )
     columns = (
