@@ -205,7 +205,7 @@ def locked_folder(path: Path) -> Iterator[None]:
     """
     import fcntl  # Not on every system; only recordings need it.
 
-    made = not path.exists()
+    is_new = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDONLY)
@@ -222,7 +222,7 @@ def locked_folder(path: Path) -> Iterator[None]:
         try:
             yield
         except BaseException:
-            if made:
+            if is_new:
                 with suppress(OSError):
                     path.rmdir()
             raise

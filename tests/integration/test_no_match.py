@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from pronk.cli.export import TargetName
 from pronk.errors import PronkError, UnmatchedError
 from pronk.exit_status import ExitStatus
 from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.match.checks import check_explained_motion
 from pronk.identify.match.export.targets import TARGETS, export
 from pronk.identify.match.gains import load_gains
-from pronk.identify.match.match import match
+from pronk.identify.match.match import compared_flags, match
 from pronk.identify.match.predict import predict
+from pronk.identify.match.result import NO_MATCH
 from pronk.identify.match.translate import translate
 from pronk.identify.simulators.profiles import profile
 from pronk.robots import load_robot
@@ -47,7 +50,7 @@ def test_a_match_that_is_none_has_a_status_and_a_mark(compliant: Path) -> None:
     gains = load_gains(compliant / "gains.yaml")
     assert not gains.joints["j"].matched
     assert list(gains.unmatched) == ["j"]
-    (reason,) = gains.joints["j"].reasons
+    reason = " ".join(gains.joints["j"].reasons)
     assert f"{gains.joints['j'].quality.error_db:.2g} dB" in reason
 
 
@@ -80,7 +83,7 @@ def test_commands_refuse_marked_joints_and_write_nothing(
     gains = compliant / "gains.yaml"
     filled = [word.format(gains=gains, out=tmp_path, folder=compliant) for word in words]
     sentence = refused(*filled)
-    (reason,) = load_gains(gains).joints["j"].reasons
+    reason = load_gains(gains).joints["j"].reasons[0]
     for part in ("gains.yaml", "j (", reason[:40], "--allow-unmatched"):
         assert part in sentence
     assert list(tmp_path.iterdir()) == []
@@ -172,10 +175,29 @@ def test_joints_that_move_together_are_judged_too(tmp_path: Path) -> None:
     robot = load_robot(write_model(tmp_path / "bench.xml", ("a", "b")))
     gains = {"a": (STIFFNESS, DAMPING), "b": (STIFFNESS, DAMPING)}
     rigid = moved_together({"a": float("inf"), "b": float("inf")}, tmp_path)
-    assert match([rigid], robot, drive_gains=gains).matched_joints == ("a", "b")
-    log = moved_together({"a": float("inf"), "b": 30.0}, tmp_path)
-    result = match([log], robot, drive_gains=gains)
-    assert "b" in result.gains.unmatched
-    assert result.gains.joints["b"].reasons
+    result = match([rigid], robot, drive_gains=gains)
+    assert result.matched_joints == ("a", "b")
+    responses = result.joints["b"].responses
+    assert responses is not None
+    assert compared_flags(responses) == ()
+    (flag,) = compared_flags(replace(responses, matched=1.5 * responses.matched))
+    assert flag.startswith(NO_MATCH)
+    position = rigid.position[:, 0]
+    assert check_explained_motion([position], [position + 0.1]) == ()
+    (flag,) = check_explained_motion([position], [0.0 * position])
+    assert flag.startswith(NO_MATCH)
     with pytest.raises(PronkError, match="method paper"):
-        match([log], robot, method="paper", drive_gains=gains)
+        match([rigid], robot, method="paper", drive_gains=gains)
+
+
+def test_a_robot_without_rotor_inertia_is_no_match(tmp_path: Path) -> None:
+    """The gains of such a model may answer alike and be several times too small."""
+    model = write_model(tmp_path / "bench.xml")
+    model.write_text(model.read_text().replace('armature="0.03"', ""))
+    log = write_log(tmp_path / "log.csv", gear=float("inf"))
+    command = invoke(match_words(tmp_path, log))
+    assert command.exit_code == ExitStatus.NO_MATCH
+    assert "nan" not in command.output.lower()
+    assert any(
+        "armature" in reason for reason in load_gains(tmp_path / "gains.yaml").unmatched["j"]
+    )

@@ -222,9 +222,9 @@ def print_summary(result: MatchResult) -> None:
     for name, reasons in result.gains.unmatched.items():
         console.say(f"{name} is no match: {'; '.join(reasons)}")
     for name, flags in result.flags.items():
-        others = [flag for flag in flags if not flag.startswith(NO_MATCH)]
-        if others:
-            console.say(f"{name}: {'; '.join(others)}")
+        warnings = [flag for flag in flags if not flag.startswith(NO_MATCH)]
+        if warnings:
+            console.say(f"{name}: {'; '.join(warnings)}")
     for note in result.notes:
         console.say(f"note: {note}")
 

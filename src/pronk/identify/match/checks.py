@@ -599,6 +599,32 @@ def unexplained_motion(
     )
 
 
+def check_armature(
+    joint: Joint, parameters: Sequence[str], excitations: Sequence[Excitation]
+) -> tuple[str, ...]:
+    """Check that the rotor inertia with which gains are matched can be that of a motor.
+
+    Gains of a joint whose rotor inertia is left out may answer nearly alike and be several times
+    too small. The virtual robot of a model without it has none either.
+
+    Args:
+        joint: The joint.
+        parameters: Names of the parameters that are fitted.
+        excitations: Its excitations.
+
+    Returns:
+        A flag that begins with `NO_MATCH` if the robot's file has no rotor inertia for the joint.
+    """
+    virtual = all(excitation.log.virtual for excitation in excitations)
+    if joint.drive.armature > 0.0 or "armature" in parameters or virtual:
+        return ()
+    return (
+        f"{NO_MATCH}armature: the rotor inertia of {joint.name} is 0 in the robot's file; write "
+        "the motor's rotor inertia times the gear ratio squared there, from its data sheet, or fit "
+        "it with --mode drive",
+    )
+
+
 def check_explained_motion(
     measured: Sequence[Array], simulated: Sequence[Array]
 ) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.logs.velocity import velocity_note
 from pronk.identify.match.checks import (
     EFFORT_LIMIT,
+    check_armature,
     check_excitations,
     check_explained_motion,
     check_response,
@@ -167,7 +168,11 @@ def match(
         measured = {}
         nominal: dict[str, dict[str, float]] = {}
         for name, joint_logs in sources.items():
-            excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
+            excitations = excitations_of(joint_logs, name)
+            excitation_flags[name] = (
+                *check_armature(robot.joint(name), parameters, excitations),
+                *check_excitations(excitations, robot),
+            )
             try:
                 measured[name] = measured_joints(joint_logs, name, rigs.robot, settings)
             except ShortExcitationError as error:
@@ -384,7 +389,11 @@ def match_chains(
     logs_in_motion = [log for log in logs if log.excited_joints]
     excitation_flags = {}
     for name, joint_logs in logs_by_joint(logs_in_motion, robot).items():
-        excitation_flags[name] = check_excitations(excitations_of(joint_logs, name), robot)
+        excitations = excitations_of(joint_logs, name)
+        excitation_flags[name] = (
+            *check_armature(robot.joint(name), parameters, excitations),
+            *check_excitations(excitations, robot),
+        )
     fits: dict[str, DriveFit] = {}
     physical: dict[str, dict[str, FittedValue]] = {}
     responses: dict[str, ComparedResponses] = {}

@@ -343,9 +343,9 @@ def _conditions(
         iterations=law.iterations,
         substeps=robot.decimation * law.iterations,
     )
-    made = "fitted but not matched" if gains.unmatched else "matched"
+    verb = "fitted but not matched" if gains.unmatched else "matched"
     return [
-        f"Gains of {gains.robot}, {made} by pronk for {gains_profile.name} "
+        f"Gains of {gains.robot}, {verb} by pronk for {gains_profile.name} "
         f"({gains_profile.framework}).",
         f"They hold for {engine}, {simulator.actuator}, drive law {law.label}, timestep "
         f"{timestep_s:g} s, decimation {robot.decimation}.",
