@@ -100,11 +100,12 @@ def motion_in_mujoco(
 def peaks_in_mujoco(
     robot: RobotSpec, joint: str, offsets: Array, timestep_s: float = TIMESTEP_S
 ) -> Peaks:
-    """Return the peaks of `motion_in_mujoco`."""
+    """Return the peaks of `motion_in_mujoco` from the end of the rest on."""
     motion = motion_in_mujoco(robot, joint, offsets, timestep_s)
+    rest = round(REST_S / motion.timestep_s)
     pose = robot.joint(joint).default_position
     return Peaks(
-        torque=float(np.abs(motion.torque).max()),
-        speed=float(np.abs(motion.speed).max()),
-        reach=float(np.abs(motion.position - pose).max()),
+        torque=float(np.abs(motion.torque[rest:]).max()),
+        speed=float(np.abs(motion.speed[rest:]).max()),
+        reach=float(np.abs(motion.position[rest:] - pose).max()),
     )

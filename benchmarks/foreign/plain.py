@@ -270,17 +270,20 @@ def _peaks_of(
     torque = 0.0
     speed = 0.0
     positions: list[float] = []
-    for begin in range(0, len(controls), CHUNK):
-        control = controls[begin : begin + CHUNK]
+    rest = round(SETTLE_S / STEP_S)
+    for begin in (0, *range(rest, len(controls), CHUNK)):
+        control = controls[begin : begin + CHUNK if begin else rest]
         states, _ = mujoco.rollout.rollout(model, data, state[None], control[None])
         before = np.concatenate([state[None], states[0, :-1]])
+        state = states[0, -1].copy()
+        if begin == 0:
+            continue  # The robot has sagged into its pose before a sweep begins.
         q = before[:, 1 + address]
         v = before[:, 1 + model.nq + dof]
         forces = held.stiffness * (control[:, column] - q) - held.damping * v
         torque = max(torque, float(np.abs(forces).max()))
         speed = max(speed, float(np.abs(v).max()))
         positions += [float(q.min()), float(q.max())]
-        state = states[0, -1].copy()
     return MotionPeaks(torque=torque, speed=speed, lowest=min(positions), highest=max(positions))
 
 

@@ -222,3 +222,26 @@ def test_gains_that_no_step_can_follow_are_said_to_be_so(tmp_path: Path) -> None
     with pytest.raises(PlanError, match="cannot be forecast") as caught:
         make_plan(robot, [JOINT], Chirp(length_s=1.0, stop_hz=15.0), repeats=1)
     assert "2000 / 0.0001" in str(caught.value)
+
+
+def test_the_fall_into_the_pose_is_no_part_of_a_forecast(tmp_path: Path) -> None:
+    path = tmp_path / "sagging.xml"
+    path.write_text(
+        """\
+<mujoco model="sagging">
+  <worldbody>
+    <body name="link">
+      <inertial pos="0.3 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+      <joint name="lift" axis="0 -1 0" range="-90 90" limited="true"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="lift" kp="30" kv="3" forcerange="-20 20"/>
+  </actuator>
+</mujoco>
+"""
+    )
+    plan = make_plan(load_robot(str(path)), ["lift"], amplitudes=(0.001,), repeats=1)
+    (row,) = plan.rows()
+    assert float(row["highest_rad"]) < -0.05  # it hangs below its command
+    assert float(row["speed_rad_s"]) < 0.1

@@ -190,6 +190,8 @@ class _Bench:
         ticks = np.tile(pose, (round(SETTLE_S * self.rate_hz) + len(self.offsets), 1))
         ticks[-len(self.offsets) :, names.index(self.joint)] += self.offsets
         command = np.repeat(ticks, steps_a_tick, axis=0)
+        # A robot has sagged into its pose when a sweep begins; the model falls into it.
+        settled = len(command) - steps_a_tick * len(self.offsets)
         forecasts = []
         threads = os.cpu_count() or 1
         # No more corners at once than run at once, so that small steps do not need much memory.
@@ -214,9 +216,9 @@ class _Bench:
             for k, (_, strength, _) in enumerate(some_corners):
                 chain = []
                 for column, name in enumerate(names):
-                    q = position[k, :, column]
-                    v = velocity[k, :, column]
-                    lag = command[:, column] - q
+                    q = position[k, settled:, column]
+                    v = velocity[k, settled:, column]
+                    lag = command[settled:, column] - q
                     torque = strength * (self.stiffness[name] * lag - self.damping[name] * v)
                     chain.append(self._extremes(name, q, v, torque))
                 forecasts.append(chain)
