@@ -63,6 +63,8 @@ _CLEAR = 0.7
 """The best law is clear if its residual is less than this share of the next one's."""
 _LARGE_RESIDUAL = 0.01
 """Share of the motion that a right answer leaves unexplained at most."""
+_NO_DAMPING = 1e-3
+"""Damping that acts over the one that is set below which there is none."""
 _DELAY_SHOWS = 0.05
 """Share of a step from which on a delay is named."""
 _GRAVITY_SHOWS = 0.002
@@ -643,7 +645,7 @@ def _fit_law(
     free = [index for index, name in enumerate(_PARAMETERS) if name not in fixed]
     size = np.array([start[0], start[1], runs.damping.max(), 0.1 * runs.torque, 1.0, 1.0, 1.0])
     low = np.array([0.0, 1e-3 * runs.inertia, -np.inf, 0.0, -1.0, -np.inf, -np.inf])
-    high = np.array([np.inf, np.inf, np.inf, np.inf, start[4] + 2.0, np.inf, np.inf])
+    high = np.array([np.inf, np.inf, np.inf, np.inf, max(start[4] + 2.0, 1.0), np.inf, np.inf])
     start = np.clip(start, low, high)
     step = 1e-6 * size[free]
 
@@ -714,14 +716,18 @@ def _best_laws(runs: _Runs, delay: int, stated: DriveLaw, armature_settable: boo
     candidates.sort(key=lambda fit: fit.residual)
     # The stated law too, which is the answer where others explain the motion no better.
     tried = candidates[:3]
+    plain_laws = [stated, DriveLaw(), DriveLaw(kind="implicit_damping")]
     for candidate in candidates[3:]:
-        if candidate.law.moves_as(ActingLaw(drive=stated)):
+        if any(candidate.law.moves_as(ActingLaw(drive=drive)) for drive in plain_laws):
             tried.append(candidate)
     finals: list[_Fit] = []
     for candidate in tried:
         is_stated = candidate.law.moves_as(ActingLaw(drive=stated))
         is_far = finals and candidate.residual > _FAR * max(finals[0].residual, _SAME_RESIDUAL)
-        if is_far and not is_stated:
+        # Where no damping acts, explicit and implicit damping are the same.
+        undamped = len(finals) > 0 and finals[0].theta[0] < _NO_DAMPING
+        is_plain = any(candidate.law.moves_as(ActingLaw(drive=drive)) for drive in plain_laws)
+        if is_far and not is_stated and not (undamped and is_plain):
             continue
         if finals and runs.late:
             break
