@@ -581,3 +581,54 @@ def test_a_pipe_in_place_of_a_mesh_is_refused(tmp_path: Path) -> None:
         "<geom type='mesh' mesh='m'/></body></worldbody></mujoco>"
     )
     refused("robot", "new", path)
+
+
+REACHING = """
+<mujoco>
+  <compiler angle="radian"/>
+  <default><joint axis="0 1 0" limited="true" armature="0.02" frictionloss="0.1"/></default>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" range="-0.5 1.6" stiffness="{spring}"/>
+      <inertial pos="0.2 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
+      <body name="lower" pos="0.4 0 0">
+        <joint name="elbow" range="-2 2"/>
+        <inertial pos="0.2 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+        <body name="tip" pos="0.4 0 0">
+          <joint name="lock" range="0 0.015"/>
+          <inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="shoulder" ctrlrange="-9 9"/><motor joint="elbow" ctrlrange="-9 9"/>
+    <motor joint="lock" ctrlrange="-9 9"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_the_pose_is_one_that_the_drives_can_hold(tmp_path: Path) -> None:
+    """Stretched out, gravity asks for 10.8 N m of a shoulder with 9; hanging, for little."""
+    path = tmp_path / "arm.xml"
+    path.write_text(REACHING.format(spring=0))
+    accepted("robot", "new", path)
+    robot = load_robot(tmp_path / "robot.yaml")
+    assert robot.held_joints == ("lock",)
+    model = free_spec(robot).compile()
+    state = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, state, model.key("default").id)
+    mujoco.mj_forward(model, state)
+    for joint in robot.joints:
+        gravity = abs(state.qfrc_bias[model.joint(joint.name).dofadr[0]])
+        assert gravity <= 0.5 * joint.drive.effort_limit
+        assert gravity <= 0.2 * joint.stiffness
+        low, high = joint.range
+        assert low + 0.3 < joint.default_position < high - 0.3
+
+
+def test_assumed_gains_are_stiffer_than_a_spring_of_the_joint(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(REACHING.format(spring=30))
+    assert load_robot(path).joint("shoulder").stiffness >= 60.0

@@ -6,6 +6,7 @@ Each number has a mark: `read` from the model, `derived` from its numbers by a s
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,9 +34,20 @@ SWING = 0.1
 """Angle at which assumed gains ask for all the torque that gravity leaves of the effort limit
 [rad]."""
 NO_LOAD_SPEED = 30.0
-"""No-load speed where the model does not say one [rad/s]; typical of geared robot joints."""
+"""No-load speed where the model does not say one [rad/s], typical of geared robot joints; small
+joints are faster and get that of half a radian at their natural frequency."""
 BAND_HZ = (0.2, 10.0)
 """Band of a joint of which nothing is known [Hz]."""
+EFFORT_SHARE = 0.5
+"""Largest share of an effort limit that gravity may ask for in the pose."""
+MOST_SAG = 0.1
+"""Largest angle by which gravity may move a joint under its own gains in the pose [rad]."""
+RELIEF_ROUNDS = 2
+"""Times each joint is turned to relieve the drives of gravity."""
+RELIEF_ANGLES = 9
+"""Angles at which each is tried."""
+SMALLEST_RANGE = 0.02
+"""Range of a hinge below which it is held: a sweep has no room [rad]."""
 STOP_DISTANCE = 0.4
 """Distance of the pose from a stop, for a sweep of 0.25 rad and its overshoot [rad]."""
 STOP_SHARE = 0.4
@@ -91,9 +103,10 @@ def describe_model(path: Path) -> ModelDescription:
     frequency of 3 Hz and a damping ratio of 0.7 in the default pose, or stiffer ones where the
     joint is damped or gravity pulls at it, within its effort limit. Effort limits are those of
     actuators or joints, else twice the torque of gravity and of 0.5 rad of stiffness. The default
-    pose is the keyframe `home` or the first one, else zero, moved away from the stops. Slides, ball
-    joints, joints that follow another one, and hinges without an actuator in a model with
-    actuators are held at that pose.
+    pose is the keyframe `home` or the first one, else zero, moved away from the stops and, where
+    gravity asks for more than half of an effort limit, to where it asks for less. Slides, ball
+    joints, joints that follow another one, hinges with a range below 0.02 rad, and hinges without
+    an actuator in a model with actuators are held at that pose.
 
     Args:
         path: MJCF or URDF.
@@ -110,13 +123,14 @@ def describe_model(path: Path) -> ModelDescription:
         )
     qpos, moves = _default_pose(source)
     servos = joint_servos(model, qpos)
-    held_joints = _held_joints(source, servos, qpos)
+    held_joints = _held_joints(source, servos)
     hinges = [index for index in source.hinges if source.joint_names[index] not in held_joints]
     if not hinges:
         raise RobotError(
             f"{path}: no hinge joint of the model has an actuator, and all are held: "
             f"{', '.join(held_joints)}."
         )
+    _relieve(source, hinges, servos, qpos, moves)
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -209,9 +223,69 @@ def _default_pose(source: SourceModel) -> tuple[Array, dict[int, Remark]]:
     return pose, remarks
 
 
-def _held_joints(
-    source: SourceModel, servos: tuple[JointServo, ...], qpos: Array
-) -> dict[str, str]:
+def _relieve(
+    source: SourceModel,
+    hinges: list[int],
+    servos: tuple[JointServo, ...],
+    qpos: Array,
+    moves: dict[int, Remark],
+) -> None:
+    """Turn joints, one after the other, until gravity leaves each drive room for a sweep.
+
+    Gravity may take half of an effort limit, and move a joint under the gains of its position servo
+    by 0.1 rad. A pose in which it does is kept.
+
+    Args:
+        source: The model.
+        hinges: The hinges that are driven.
+        servos: What drives each joint.
+        qpos: The pose, which is changed.
+        moves: Remarks on the pose by joint, to which those of the turned joints are added.
+    """
+    model = copy.copy(source.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data = mujoco.MjData(model)
+    dofs = model.jnt_dofadr[hinges]
+    allowed = np.full(len(hinges), np.inf)
+    for number, hinge in enumerate(hinges):
+        servo = servos[hinge]
+        if servo.effort_limit > 0.0:
+            allowed[number] = EFFORT_SHARE * servo.effort_limit
+        if servo.servo_type == "position":
+            allowed[number] = min(allowed[number], MOST_SAG * servo.stiffness)
+
+    def excess(pose: Array) -> float:
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        load = np.abs(data.qfrc_bias - data.qfrc_passive)[dofs] / allowed
+        return float(np.sum(np.maximum(load - 1.0, 0.0)))
+
+    lowest = excess(qpos)
+    for hinge in hinges * RELIEF_ROUNDS:
+        if lowest <= 0.0:
+            return
+        address = model.jnt_qposadr[hinge]
+        low, high = -math.pi, math.pi
+        if model.jnt_limited[hinge]:
+            low, high = model.jnt_range[hinge]
+        distance = min(STOP_DISTANCE, STOP_SHARE * (high - low))
+        before = float(qpos[address])
+        best = before
+        for angle in np.linspace(low + distance, high - distance, RELIEF_ANGLES):
+            qpos[address] = angle
+            angle_excess = excess(qpos)
+            if angle_excess < 0.99 * lowest:
+                lowest = angle_excess
+                best = _short(float(angle))
+        qpos[address] = best
+        if best != before:
+            moves[hinge] = Remark(
+                mark="derived",
+                text=f"moved from {before:.4g}, so that gravity asks for less torque",
+            )
+
+
+def _held_joints(source: SourceModel, servos: tuple[JointServo, ...]) -> dict[str, str]:
     """Return which joints are held at the pose, with the reason."""
     model = source.model
     has_actuators = any(servos[index].actuators for index in source.hinges)
@@ -233,6 +307,8 @@ def _held_joints(
             held_joints[name] = "ball joint, a quaternion"
         elif name in source.mimics:
             held_joints[name] = f"follows {source.mimics[name]} in the URDF"
+        elif model.jnt_limited[index] and np.ptp(model.jnt_range[index]) < SMALLEST_RANGE:
+            held_joints[name] = f"hinge with a range of {np.ptp(model.jnt_range[index]):.2g} rad"
         elif not source.has_mass(index):
             held_joints[name] = "hinge with no mass behind it [rad]"
         elif has_actuators and not servo.actuators and not model.jnt_actfrclimited[index]:
@@ -291,6 +367,7 @@ def _joint_entries(
             f"{NATURAL_HZ:g} Hz with {inertia:.3g} kg m^2": inertia * natural**2,
             f"{NATURAL_HZ:g} Hz with {passive_damping:.3g} N m s/rad": passive_damping * natural,
             f"{SAG:g} rad under gravity": gravity / SAG,
+            "twice the spring of the joint": 2.0 * float(model.jnt_stiffness[hinge]),
         }
         rule = max(candidates, key=lambda name: candidates[name])
         stiffness = candidates[rule]
@@ -327,7 +404,7 @@ def _joint_entries(
         text = "the model has no limit; twice gravity and 0.5 rad of stiffness"
         remarks["effort_limit"] = Remark(mark="CHECK", text=text)
     remarks["stall_torque"] = Remark(mark="CHECK", text="assumed, twice the effort limit")
-    no_load_speed = NO_LOAD_SPEED
+    no_load_speed = _short(max(NO_LOAD_SPEED, 0.5 * math.sqrt(stiffness / inertia)))
     remarks["no_load_speed"] = Remark(mark="CHECK", text="assumed; the model has no speed limit")
     if name in source.speed_limits:
         no_load_speed = source.speed_limits[name]

@@ -212,6 +212,11 @@ class RobotSpec:
         for joint in self.joints:
             if joint.name == name:
                 return joint
+        if name in self.held_joints:
+            raise RobotError(
+                f"{name} of {self.name} is held and not driven: it is no hinge, has no actuator, "
+                "follows another joint, or has no range to speak of; see `held` in its robot.yaml."
+            )
         raise RobotError(
             f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."
         )
