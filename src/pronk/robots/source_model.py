@@ -349,6 +349,9 @@ def _samples(name: str, attributes: Mapping[str, str]) -> float:
     elif name != "replicate":
         for attribute in SIZES:
             samples *= _product(attributes.get(attribute, "1"))
+        # A mesh that is computed has as many points as the square of its resolution.
+        for word in attributes.get("params", "").split():
+            samples = max(samples, _product(word) ** 2)
     return samples
 
 
