@@ -630,5 +630,5 @@ def test_the_pose_is_one_that_the_drives_can_hold(tmp_path: Path) -> None:
 
 def test_assumed_gains_are_stiffer_than_a_spring_of_the_joint(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
-    path.write_text(REACHING.format(spring=30))
+    path.write_text(REACHING.format(spring=30).replace('"-9 9"', '"-90 90"'))
     assert load_robot(path).joint("shoulder").stiffness >= 60.0

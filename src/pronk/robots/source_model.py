@@ -115,8 +115,8 @@ class SourceModel:
         """Return the text of an MJCF that has nothing but what a robot needs; else nothing."""
         model = self.model
         extras = (model.nu, model.nmesh, model.nsensor, model.nkey, model.ntendon, model.neq)
-        others = (model.ntuple, model.ncam, model.nmat, model.ntex, model.nskin, model.nhfield)
-        if self.is_urdf or any(extras) or any(others) or model.npair or model.nflex:
+        more_extras = (model.ntuple, model.ncam, model.nmat, model.ntex, model.nskin, model.nhfield)
+        if self.is_urdf or any(extras) or any(more_extras) or model.npair or model.nflex:
             return ""
         unnamed = [index for index in range(model.njnt) if not model.joint(index).name]
         unnamed_bodies = [index for index in range(model.nbody) if not model.body(index).name]
