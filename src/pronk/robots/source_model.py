@@ -99,16 +99,16 @@ class SourceModel:
         """Index of the free joint of the body with most hinges behind it; -1 if none has any."""
         model = self.model
         best = -1
-        most = 0
+        largest_count = 0
         for index in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
             root = model.body_rootid[model.jnt_bodyid[index]]
             count = 0
             for hinge in self.hinges:
                 if model.body_rootid[model.jnt_bodyid[hinge]] == root:
                     count += 1
-            if count > most:
+            if count > largest_count:
                 best = int(index)
-                most = count
+                largest_count = count
         return best
 
     def plain_text(self) -> str:
