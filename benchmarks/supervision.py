@@ -228,8 +228,8 @@ BODY_FAULTS = {
     "battery-6-V": -1,
 }
 """Faults of the robot itself, and the joint of each; the bus voltage is that of the battery."""
-_SEIZED_STIFFNESS = 1000.0
-_SEIZED_DAMPING = 5.0
+_SEIZED_STIFFNESS = 10000.0
+_SEIZED_DAMPING = 20.0
 """Of a seized rotor against its housing [N m/rad, N m s/rad]."""
 
 

@@ -160,9 +160,9 @@ class ResponseLimits:
     """Longest time for which a joint is pushed so without following [s]; landings of the virtual
     Mini Cheetah take 0.14 s."""
     far: float = 0.8
-    """Motion of a target in 0.25 s that a joint must follow [rad]."""
-    still: float = 0.03
-    """Least motion of the joint then [rad]; the least measured is 0.076."""
+    """Motion of a target in 0.4 s that a joint must follow [rad]."""
+    still: float = 0.01
+    """Least motion of the joint then [rad]; the least measured, in 0.25 s, is 0.033."""
     low_s: float = 0.06
     """Longest time for which the trunk may be collapsed [s]."""
 

@@ -23,7 +23,7 @@ _STEP_S = 0.01
 _LAG_S = 0.06
 """Time from a target to a motion that follows it, on the way there and back and in the drive, at
 most [s]."""
-SEIZED_S = 0.25
+SEIZED_S = 0.4
 """Time for which a seized joint does not move [s]."""
 _SAMPLES = round((SEIZED_S + _LAG_S) / _STEP_S) + 1
 _LAG_SAMPLES = round(_LAG_S / _STEP_S)
@@ -173,9 +173,9 @@ def pushed_in_vain(history: ResponseHistory, limits: Limits) -> str:
 def seized_joint(history: ResponseHistory, limits: Limits) -> str:
     """Find a joint that stands still while its target moves far.
 
-    Rule: over 0.25 s the position stayed within `still`, 0.03 rad, while the target, 60 ms earlier,
+    Rule: over 0.4 s the position stayed within `still`, 0.01 rad, while the target, 60 ms earlier,
     moved over more than `far`, 0.8 rad, and stiffness times target over more than 0.45 of the
-    effort limit. Least motion of walks and jumps while targets moved as far: 0.076 rad.
+    effort limit. Least motion of walks and jumps in 0.25 s while targets moved as far: 0.033 rad.
     """
     response = limits.response
     far = (history.target_range > response.far) & (
