@@ -264,9 +264,9 @@ process. What it takes to find a fault is in [hardware.md](hardware.md).
 - Hip roll and hip pitch of one leg swapped with each other: a knee swings before the robot rises.
 - Swapped encoders in a sweep, before their joint is excited.
 - A motor without torque or a seized joint, before a target needs it. Walking at 1 m/s on the
-  virtual clock, three runs each: a free knee 0.37 to 0.60 s, a free hip pitch 0.56 to 1.57 s, a
-  free front hip roll 0.75 to 1.07 s, a free hind hip roll not in 4 s; a seized knee, once its
-  target has moved by 0.8 rad in 0.4 s; a seized hip pitch or roll not in 4 s: the robot walks on.
+  virtual clock, three runs each: a free knee 0.4 to 0.65 s, a free hip pitch 0.6 to 1.6 s, a free
+  front hip roll 0.8 to 1.1 s, a free hind hip roll not in 4 s; a seized knee 0.40 s; a seized hip
+  pitch or roll not in 4 s, and the robot walks on.
 - An encoder that drifts together with its velocity: a knee or hip roll at 0.5 rad/s is beyond its
   range after 1.8 to 2.1 s. If the position alone drifts it is found after 0.08 to 0.10 s; a drift
   below 0.07 rad/s is not.
