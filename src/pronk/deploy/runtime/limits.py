@@ -274,6 +274,12 @@ class Limits:
         return 0.0 if self.legs is None else self.legs.collapsed
 
     @cached_property
+    def far_targets(self) -> tuple[Array, Array]:
+        """Lowest and highest targets that are no fault [rad], (joints,) each."""
+        beyond = self.operating.far_target
+        return self.joints.low - beyond, self.joints.high + beyond
+
+    @cached_property
     def push(self) -> Array:
         """Commanded torque that each joint must follow [N m], (joints,).
 

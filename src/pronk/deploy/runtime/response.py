@@ -19,7 +19,7 @@ from pronk.deploy.runtime.reasons import Decision, Reason
 from pronk.robots.machine import Command, State
 
 _STEP_S = 0.01
-"""Time between two samples of targets and positions [s]."""
+"""Time between two ticks that count [s]."""
 _LAG_S = 0.06
 """Time from a target to a motion that follows it, on the way there and back and in the drive, at
 most [s]."""
@@ -53,7 +53,6 @@ class ResponseHistory:
         self._direction: Array = self._zeros
         self._worst: Array = self._zeros
         self._judged: float | None = None
-        self._sampled = -np.inf
         self._targets: deque[Array] = deque(maxlen=_SAMPLES)
         self._torques: deque[Array] = deque(maxlen=_SAMPLES)
         self._positions: deque[Array] = deque(maxlen=_SAMPLES)
@@ -69,7 +68,6 @@ class ResponseHistory:
         self.low_s = 0.0
         self._direction = self._zeros
         self._judged = None
-        self._sampled = -np.inf
         self._targets.clear()
         self._torques.clear()
         self._positions.clear()
@@ -77,7 +75,7 @@ class ResponseHistory:
     def observe(
         self, t: float, command: Command, state: State, limits: Limits, *, on_feet: bool
     ) -> None:
-        """Take a tick.
+        """Take a tick; of those within 10 ms only the first counts.
 
         Args:
             t: Time of the tick [s].
@@ -86,6 +84,8 @@ class ResponseHistory:
             limits: Limits that apply.
             on_feet: Whether the trunk should be up, as while a policy runs.
         """
+        if self._judged is not None and 0.0 <= t - self._judged < _STEP_S - 1e-6:
+            return
         seconds = 0.0 if self._judged is None else t - self._judged
         if not 0.0 <= seconds <= _LONGEST_STEP_S:
             self.begin()
@@ -105,14 +105,9 @@ class ResponseHistory:
         self._worst = np.where(moved, position, self._worst)
         self._direction = direction
         self.pushed_s = np.where(begins | moved, 0.0, self.pushed_s + seconds)
-        if t - self._sampled >= _STEP_S - 1e-6:
-            self._sampled = t
-            self._sample(command, position)
-            self._measure_height(state, limits, on_feet)
-        if self.trunk_height < limits.collapsed:
-            self.low_s += seconds
-        else:
-            self.low_s = 0.0
+        self._sample(command, position)
+        self._measure_height(state, limits, on_feet)
+        self.low_s = self.low_s + seconds if self.trunk_height < limits.collapsed else 0.0
 
     def _sample(self, command: Command, position: Array) -> None:
         """Keep a sample, and update the ranges."""

@@ -118,9 +118,8 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     state_age = np.asarray(checked.state_age)
     command_age = np.asarray(checked.command_age)
 
-    low = limits.joints.low - limits.operating.far_target
-    high = limits.joints.high + limits.operating.far_target
-    is_far = ((target < low) | (target > high)) & (stiffness > _NO_STIFFNESS)
+    lowest, highest = limits.far_targets
+    is_far = ((target < lowest) | (target > highest)) & (stiffness > _NO_STIFFNESS)
     far_target = is_far.any(axis=-1)
 
     # The target: held if the state is old, then moved into all limits.

@@ -37,6 +37,8 @@ DRIFT_S = 0.5
 """Time over which a slow drift of a position against its velocity is summed [s]."""
 ON_TIME_SHARE = 0.25
 """Largest deviation of the time between two states that arrived on time, in periods."""
+SLOW_STATES = 5
+"""States from one comparison of the slow drift to the next."""
 SPEED_STEP = 0.016
 """Largest constant velocity of a joint at rest: the Mini Cheetah's drives send 12 bits over 130
 rad/s, of which none is zero [rad/s]."""
@@ -73,7 +75,7 @@ class SensorHistory:
         self.restarts = 0
         """Restarts of the comparison since states were last compared for `WINDOW_S` without one."""
         self._undisturbed_s = 0.0
-        self._drift_window = max(2, round(DRIFT_S * state_rate_hz))
+        self._drift_window = max(2, round(DRIFT_S * state_rate_hz / SLOW_STATES))
         self._voltages: deque[float] = deque(maxlen=max(1, round(VOLTAGE_S * state_rate_hz)))
         self._newest: State | None = None
         self._command_torque = np.zeros(joints)
@@ -123,9 +125,11 @@ class SensorHistory:
         self._joint_speeds = np.zeros((window, n))
         self._row = 0
         # The same over the longer window, and the largest speeds within it and the one before.
+        self._slow_drift = np.zeros(n)
         self._slow_drifts = np.zeros((self._drift_window, n))
         self._slow_speeds = np.zeros((2, n))
         self._slow_row = 0
+        self._slow_count = 0
         # Integral of the velocity, and the range of it and of the position while constant.
         self._travel = np.zeros(n)
         self._lowest = np.concatenate((self._travel, position))
@@ -282,21 +286,12 @@ class SensorHistory:
         uncertainty = self._joint_speeds.max(axis=0) * self._late_spread
         self.encoder = np.abs(drift - oldest_drift) - uncertainty
 
-        newest_slow = self._slow_drifts[self._slow_row]
-        self._slow_row = (self._slow_row + 1) % self._drift_window
-        oldest_slow = self._slow_drifts[self._slow_row].copy()
         late = abs(seconds - self._period)
         if state.sequence - before.sequence == 1 and late < ON_TIME_SHARE * self._period:
-            newest_slow = newest_slow + position - before.position - path
-        self._slow_drifts[self._slow_row] = newest_slow
-        # Largest speed of the present and of the last window.
-        speed = self._joint_speeds[self._row]
-        self._slow_speeds[0] = np.maximum(self._slow_speeds[0], speed)
-        if self._slow_row == 0:
-            self._slow_speeds[1] = self._slow_speeds[0]
-            self._slow_speeds[0] = speed
-        slow_uncertainty = (ON_TIME_SHARE * self._period) * self._slow_speeds.max(axis=0)
-        self.slow_drift = np.abs(newest_slow - oldest_slow) - slow_uncertainty
+            self._slow_drift = self._slow_drift + position - before.position - path
+        self._slow_count += 1
+        if self._slow_count % SLOW_STATES == 0:
+            self._compare_slow_drift(self._joint_speeds.max(axis=0))
 
         # A position is compared with the integral of the velocity, a velocity with the position.
         compared = np.concatenate((self._travel, position))
@@ -317,6 +312,19 @@ class SensorHistory:
         self.load = self._largest_torque - self._least_torque
         self._origins[changing] = position
         self.others = np.abs(position - self._origins).sum(axis=1)
+
+    def _compare_slow_drift(self, speed: Array) -> None:
+        """Update `slow_drift`; `speed` is the largest of the last 60 ms [rad/s], (n,)."""
+        self._slow_row = (self._slow_row + 1) % len(self._slow_drifts)
+        oldest = self._slow_drifts[self._slow_row].copy()
+        self._slow_drifts[self._slow_row] = self._slow_drift
+        # Largest speed of the present and of the last window.
+        self._slow_speeds[0] = np.maximum(self._slow_speeds[0], speed)
+        if self._slow_row == 0:
+            self._slow_speeds[1] = self._slow_speeds[0]
+            self._slow_speeds[0] = speed
+        uncertainty = (ON_TIME_SHARE * self._period) * self._slow_speeds.max(axis=0)
+        self.slow_drift = np.abs(self._slow_drift - oldest) - uncertainty
 
 
 def _small_rotation(first: list[float], second: list[float]) -> Vector:
