@@ -65,12 +65,12 @@ def nod_poses(legs: LegKinematics, default: Array, folded: Array) -> list[Array]
     arms = legs.feet - legs.anchors[0]
     leftward = np.sign((legs.crosses[0] @ arms[:, :, None])[:, 1, 0])
     poses = []
-    for half, side in zip(halves, (1.0, -1.0), strict=True):
+    for shortened, direction in zip(halves, (1.0, -1.0), strict=True):
         pose = default.copy()
-        for leg in np.flatnonzero(half):
+        for leg in np.flatnonzero(shortened):
             of_leg = legs.joints[:, leg]
             pose[of_leg] += NOD_SHARE * (folded - default)[of_leg]
-        pose[first] += side * SWAY * leftward
+        pose[first] += direction * SWAY * leftward
         poses += [pose, default]
     return poses
 

@@ -97,10 +97,11 @@ def _stream(
         )
     if age < -limits.ages.future_s:
         yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; correct the link's clock."
-    first, last = states[0], states[-1]
-    if first.robot_time is not None and last.robot_time is not None:
-        arrived_s = last.time - first.time
-        stamped_s = last.robot_time - first.robot_time
+    oldest = states[0]
+    newest = states[-1]
+    if oldest.robot_time is not None and newest.robot_time is not None:
+        arrived_s = newest.time - oldest.time
+        stamped_s = newest.robot_time - oldest.robot_time
         if not abs(stamped_s - arrived_s) <= CLOCK_SHARE * seconds:
             yield (
                 f"the robot's own clock advanced by {stamped_s:.3g} s while states arrived for "
