@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pronk.errors import RobotError
 from pronk.plugins import load_entry_point
+from pronk.robots.menagerie import MENAGERIE, menagerie_file
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
@@ -27,7 +28,8 @@ def load_robot(name: str | Path) -> RobotSpec:
 
     Args:
         name: A shipped robot (`mini_cheetah`, `go2`, `so101`); a path to a `robot.yaml` or its
-            folder, to an MJCF or a URDF; or an entry point of the group `pronk.robots`, a function
+            folder, to an MJCF or a URDF; `menagerie:NAME`, a robot of MuJoCo Menagerie through the
+            package `mujoco-menagerie`; or an entry point of the group `pronk.robots`, a function
             that returns such a path.
 
     Returns:
@@ -46,21 +48,24 @@ def load_robot(name: str | Path) -> RobotSpec:
         robot = _read(path.resolve(), path.stat().st_mtime_ns)
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
-    shipped = str(name) in ROBOT_NAMES
-    return replace(robot, source=str(name) if shipped else str(path.resolve()))
+    named = str(name) in ROBOT_NAMES or str(name).startswith(MENAGERIE)
+    return replace(robot, source=str(name) if named else str(path.resolve()))
 
 
 def robot_file_path(name: str | Path) -> Path:
     """Return the robot.yaml or the model of a robot; see `load_robot`."""
     if str(name) in ROBOT_NAMES:
         return Path(__file__).parent / str(name) / "robot.yaml"
+    if str(name).startswith(MENAGERIE):
+        return menagerie_file(str(name))
     path = Path(name)
     if not path.exists():
         installed = entry_points(group="pronk.robots")
         if str(name) not in installed.names:
             raise RobotError(
                 f"there is no robot {str(name)!r}; the robots are {', '.join(ROBOT_NAMES)}, or "
-                "give the path of a robot.yaml, an MJCF or a URDF."
+                f"give the path of a robot.yaml, an MJCF or a URDF, or {MENAGERIE}NAME for a robot "
+                "of MuJoCo Menagerie."
             )
         path = Path(load_entry_point(installed[str(name)])())
     if path.is_dir():

@@ -122,7 +122,12 @@ class SourceModel:
         unnamed_bodies = [index for index in range(model.nbody) if not model.body(index).name]
         if unnamed or unnamed_bodies or model.nplugin:
             return ""
-        text = self.path.read_text(encoding="utf-8")
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise RobotError(
+                f"{self.path}: byte {error.start} is not UTF-8; save the model as UTF-8 text."
+            ) from None
         spec = mujoco.MjSpec.from_string(text) if "<include" not in text else None
         if spec is None or spec.compiler.degree or spec.compiler.fusestatic or spec.frames:
             return ""

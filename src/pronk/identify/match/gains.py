@@ -19,6 +19,7 @@ from pronk.errors import ArtefactError, UnmatchedError
 from pronk.files import converted, read_yaml, write_text
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.names import check_names
+from pronk.robots.menagerie import MENAGERIE
 
 SCHEMA = "pronk/gains/2"
 FIRST_SCHEMA = "pronk/gains/1"
@@ -238,7 +239,9 @@ def save_gains(path: Path, gains: MatchedGains) -> None:
         groups[name] = _group_entry(group)
     body: dict[str, Any] = {"schema": SCHEMA, "robot": gains.robot}
     if gains.robot_path:
-        body["robot_path"] = _relative_path(gains.robot_path, path.parent)
+        body["robot_path"] = gains.robot_path
+        if not gains.robot_path.startswith(MENAGERIE):
+            body["robot_path"] = _relative_path(gains.robot_path, path.parent)
     body |= {
         "virtual": gains.virtual,
         "simulator": _simulator_entry(gains.simulator),
@@ -280,7 +283,7 @@ def load_gains(path: Path) -> MatchedGains:
         _check_joint(joint, f"{path}: joints.{name}")
     for name, group in gains.groups.items():
         _check_group(group, f"{path}: groups.{name}")
-    if gains.robot_path:
+    if gains.robot_path and not gains.robot_path.startswith(MENAGERIE):
         robot_path = (path.resolve().parent / gains.robot_path).resolve()
         gains = replace(gains, robot_path=str(robot_path))
     return gains

@@ -74,6 +74,7 @@ from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.progress import Progress, no_progress
 from pronk.robots import ROBOT_NAMES
+from pronk.robots.menagerie import MENAGERIE
 from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
@@ -636,7 +637,12 @@ def match_result(
 
 
 def file_of_robot(robot: RobotSpec) -> str:
-    """Return the file of a robot; empty for one that ships with pronk or has no file."""
+    """Return the file of a robot, or its name in MuJoCo Menagerie.
+
+    It is empty for a robot that ships with pronk or has no file.
+    """
+    if robot.source.startswith(MENAGERIE):
+        return robot.source
     if robot.source in ROBOT_NAMES or not Path(robot.source).is_file():
         return ""
     return robot.source

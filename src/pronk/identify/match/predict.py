@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
+from pronk.frames import data_frame
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.match.measured import rms
@@ -36,6 +38,9 @@ from pronk.identify.simulators.load import joint_rigs
 from pronk.identify.simulators.profiles import profile_of
 from pronk.identify.simulators.simulator import JointRigs
 from pronk.robots.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 SCHEMA = "pronk/prediction/3"
 WITHOUT_GAINS = (
@@ -114,6 +119,33 @@ class Prediction:
         """Name the log and the errors of its joints."""
         errors = [f"{joint.joint} {joint.rmse_matched:.4g} {joint.unit}" for joint in self.joints]
         return f"<Prediction of {self.source or 'log'}: RMSE matched {', '.join(errors)}>"
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the positions as a data frame of pandas, a row for each instant of each joint.
+
+        The names of the columns end with the unit, `rad` or the log's own scale (`unknown`), so
+        that the joints of one data frame must have one unit.
+
+        Raises:
+            PronkError: pandas is not installed, or the joints have different units.
+        """
+        units = sorted({joint.unit for joint in self.joints})
+        if len(units) > 1:
+            raise PronkError(
+                f"the positions are in {' and '.join(units)}, and a data frame has one unit a "
+                "column; read the log with the option scale (--scale JOINT=RAD)."
+            )
+        unit = units[0] if units else "rad"
+        columns: dict[str, list[Any]] = {}
+        for joint in self.joints:
+            columns.setdefault("joint", []).extend([joint.joint] * len(joint.time))
+            columns.setdefault("time_s", []).extend(joint.time)
+            columns.setdefault(f"command_{unit}", []).extend(joint.command)
+            columns.setdefault(f"measured_{unit}", []).extend(joint.measured)
+            columns.setdefault(f"nominal_{unit}", []).extend(joint.nominal)
+            columns.setdefault(f"nominal_delayed_{unit}", []).extend(joint.nominal_delayed)
+            columns.setdefault(f"matched_{unit}", []).extend(joint.matched)
+        return data_frame(columns)
 
 
 def rmse(simulated: Array, measured: Array) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from pronk.arrays import Array, ComplexArray
 from pronk.errors import ArtefactError
 from pronk.files import load_artefact, save_artefact
+from pronk.frames import data_frame
 from pronk.identify.match.compared import ComparedResponses
 from pronk.identify.match.gains import (
     NAN,
@@ -33,6 +34,7 @@ from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 SCHEMA = "pronk/match/4"
 NO_MATCH = "no match: "
@@ -325,6 +327,47 @@ class MatchResult:
             "groups": {name: asdict(group) for name, group in self.groups.items()},
             "excluded": dict(self.excluded),
         }
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the gains as a data frame of pandas, a row for each joint.
+
+        Each gain has its value and the ends of its 95 % interval (`FittedValue.total95`); the names
+        of the columns end with the unit.
+
+        Raises:
+            PronkError: pandas is not installed.
+        """
+        columns: dict[str, list[Any]] = {
+            "joint": [],
+            "matched": [],
+            "error_db": [],
+            "nominal_error_db": [],
+        }
+        for joint, result in self.joints.items():
+            gains = result.gains
+            columns["joint"].append(joint)
+            columns["matched"].append(gains.matched)
+            columns["error_db"].append(gains.quality.error_db)
+            columns["nominal_error_db"].append(gains.quality.nominal_error_db)
+            fitted_values = (
+                ("stiffness", "_nm_per_rad", gains.stiffness),
+                ("damping", "_nms_per_rad", gains.damping),
+                ("armature", "_kgm2", gains.armature),
+                ("frictionloss", "_nm", gains.frictionloss),
+                ("stribeck", "", gains.stribeck),
+                ("delay", "_s", gains.delay_s),
+            )
+            for name, unit, fitted in fitted_values:
+                low, high = fitted.total95
+                columns.setdefault(f"{name}{unit}", []).append(fitted.value)
+                columns.setdefault(f"{name}_low{unit}", []).append(low)
+                columns.setdefault(f"{name}_high{unit}", []).append(high)
+        columns["coherence_min"] = []
+        columns["flags"] = []
+        for result in self.joints.values():
+            columns["coherence_min"].append(result.gains.quality.coherence_min)
+            columns["flags"].append(" ".join(result.gains.flags))
+        return data_frame(columns)
 
     def plot(self, joint: str | None = None) -> Figure:
         """Draw the measured and the simulated gain and phase.

@@ -18,10 +18,12 @@ from scipy import stats
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import ArtefactError, LogError, PronkError
 from pronk.files import load_artefact, save_artefact
+from pronk.frames import data_frame
 from pronk.names import check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 SCHEMA = "pronk/response/2"
 
@@ -208,6 +210,33 @@ class FrequencyResponse:
             "virtual": self.virtual,
             "source": self.source,
         }
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the response as a data frame of pandas, a row for each frequency.
+
+        The names of the columns end with the unit; the absolute gain and the coherence have none.
+        Columns `low` and `high` are the ends of the 95 % interval.
+
+        Raises:
+            PronkError: pandas is not installed.
+        """
+        low_gain, high_gain = self.gain_interval()
+        low_phase, high_phase = self.phase_interval()
+        return data_frame(
+            {
+                "joint": [self.joint] * len(self.omega),
+                "amplitude_rad": np.full(len(self.omega), self.amplitude),
+                "frequency_hz": self.frequency_hz,
+                "gain": self.gain,
+                "gain_low": low_gain,
+                "gain_high": high_gain,
+                "phase_rad": self.phase,
+                "phase_low_rad": low_phase,
+                "phase_high_rad": high_phase,
+                "coherence": self.coherence,
+                "averages": self.averages,
+            }
+        )
 
     @property
     def frequency_hz(self) -> Array:

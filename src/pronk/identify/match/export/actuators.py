@@ -15,6 +15,7 @@ from pronk.identify.match.gains import JointGains, MatchedGains
 from pronk.identify.match.ranges import gain_and_range
 from pronk.identify.simulators.profiles import Profile, load_profiles, profile_of
 from pronk.robots import load_robot
+from pronk.robots.menagerie import MENAGERIE
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 Per = Literal["group", "joint"]
@@ -244,7 +245,8 @@ def robot_of(gains: MatchedGains) -> RobotSpec:
         RobotError: The file cannot be read.
     """
     if gains.robot_path:
-        if not Path(gains.robot_path).is_file():
+        named = gains.robot_path.startswith(MENAGERIE)
+        if not named and not Path(gains.robot_path).is_file():
             raise PronkError(
                 f"the robot of the gains was {gains.robot_path}, which is not there; give "
                 "--robot PATH, the robot.yaml or model that they were matched with."
