@@ -127,5 +127,5 @@ def test_one_scale_of_gains_inertia_and_gravity_is_not_taken_for_another() -> No
     )
     probe = probed(truth)
     assert probe.law.drive == DriveLaw()
-    assert probe.stiffness_factor == pytest.approx(1.0, rel=1e-3)
+    assert probe.gains.stiffness_factor == pytest.approx(1.0, rel=1e-3)
     assert not probe.faults

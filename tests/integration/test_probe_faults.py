@@ -179,7 +179,7 @@ def test_an_old_position_is_named_as_such(law: str, robot: RobotSpec) -> None:
     assert probe.law.stale_speed == 0
     assert probe.law.drive.label == law
     # The gains are those that are set: the age is no damping.
-    assert probe.damping_factor == pytest.approx(1.0, rel=1e-3)
+    assert probe.gains.damping_factor == pytest.approx(1.0, rel=1e-3)
     # Stiffness times a step.
     assert "0.085" in probe.faults["stale"]
 
@@ -200,7 +200,7 @@ def test_a_clipped_torque_is_named_with_its_limit(
     assert "clipped" in probe.faults
     assert probe.clip == pytest.approx(torque_limit, rel=0.1)
     assert probe.law.drive.label == "E"
-    assert probe.stiffness_factor == pytest.approx(1.0, rel=0.02)
+    assert probe.gains.stiffness_factor == pytest.approx(1.0, rel=0.02)
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
@@ -221,7 +221,7 @@ def test_without_damping_no_law_is_claimed_that_moves_alike(law: str, robot: Rob
     for stated in ("E", "IF"):
         probe = probed(robot, law=law, stated=stated, damping_factor=0.0, viscous=0.05)
         assert "law" not in probe.faults
-        assert probe.damping_factor == pytest.approx(0.0, abs=1e-3)
+        assert probe.gains.damping_factor == pytest.approx(0.0, abs=1e-3)
         assert probe.law.drive.label == stated
         assert {other.drive.label for other in probe.alike} == {"E", "IF"} - {stated}
 

@@ -40,8 +40,8 @@ def probe(
         acting_law += f" or {other.label}"
     if "residual" in result.faults:
         acting_law = "none of the laws"
-    acting_stiffness = probed_joint.stiffness * result.stiffness_factor
-    acting_damping = probed_joint.damping * result.damping_factor
+    acting_stiffness = probed_joint.stiffness * result.gains.stiffness_factor
+    acting_damping = probed_joint.damping * result.gains.damping_factor
     # Adding 0 makes -0 a 0.
     viscous_damping = round(result.viscous_damping, 4) + 0.0
     delay_ms = round(1e3 * result.delay_s, 4) + 0.0

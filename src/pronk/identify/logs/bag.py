@@ -31,12 +31,12 @@ _MAX_DEFINITION = 2**18
 """Longest definition of a message [bytes]; LowState has 3 KiB."""
 
 
-def read_bag(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
+def read_bag(path: Path, is_wanted: Wanted) -> tuple[list[Record], str]:
     """Read the messages of a bag: an MCAP, SQLite or ROS 1 file, or the folder of a rosbag2.
 
     Args:
         path: The bag.
-        wanted: Says which messages are kept, as bags hold images too; of every other topic the
+        is_wanted: Says which messages are kept, as bags hold images too; of every other topic the
             first message is kept, empty.
 
     Returns:
@@ -50,11 +50,11 @@ def read_bag(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
     damages = []
     for file in files:
         if file.suffix.lower() == ".mcap":
-            messages, damage = read_records(file, wanted)
+            messages, damage = read_records(file, is_wanted)
         elif file.suffix.lower() == ".bag":
-            messages, damage = _read_ros1(file, wanted)
+            messages, damage = _read_ros1(file, is_wanted)
         else:
-            messages, damage = _read_sqlite(file, _compression(path), wanted)
+            messages, damage = _read_sqlite(file, _compression(path), is_wanted)
         records += messages
         if damage:
             damages.append(damage)
@@ -102,7 +102,7 @@ def _compression(path: Path) -> str:
     return "" if mode == "none" else mode
 
 
-def _read_sqlite(path: Path, compression: str, wanted: Wanted) -> tuple[list[Record], str]:
+def _read_sqlite(path: Path, compression: str, is_wanted: Wanted) -> tuple[list[Record], str]:
     """Read a `.db3` file; also returns why its end may be missing."""
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -118,7 +118,7 @@ def _read_sqlite(path: Path, compression: str, wanted: Wanted) -> tuple[list[Rec
     try:
         messages = reader.messages(reader.connections)
         unpack = _zstd if compression == "message" else None
-        return _records(path, messages, "cdr", unpack, wanted), damage
+        return _records(path, messages, "cdr", unpack, is_wanted), damage
     finally:
         reader.close()
 
@@ -133,13 +133,13 @@ def _check_sqlite(path: Path) -> None:
         database.close()
     except sqlite3.Error as error:
         raise LogError(f"{path}: not a readable SQLite file ({error}).") from None
-    for kind, definition in rows:
+    for entry_type, definition in rows:
         computes = re.search(r"\b(as|virtual)\b", str(definition), flags=re.IGNORECASE)
-        if kind in ("view", "trigger") or (kind == "table" and computes):
+        if entry_type in ("view", "trigger") or (entry_type == "table" and computes):
             raise LogError(f"{path}: a database with computed tables, which no recorder writes.")
 
 
-def _read_ros1(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
+def _read_ros1(path: Path, is_wanted: Wanted) -> tuple[list[Record], str]:
     """Read a bag of ROS 1; one that was cut has to be indexed again by `rosbag reindex`."""
     from rosbags.rosbag1 import Reader
     from rosbags.rosbag1.reader import ReaderError
@@ -158,7 +158,7 @@ def _read_ros1(path: Path, wanted: Wanted) -> tuple[list[Record], str]:
                 reader.chunks[position] = chunk._replace(decompressor=_bz2)
             elif chunk.decompressor is lz4.frame.decompress:
                 reader.chunks[position] = chunk._replace(decompressor=_lz4)
-        return _records(path, reader.messages(), "ros1", None, wanted), ""
+        return _records(path, reader.messages(), "ros1", None, is_wanted), ""
     finally:
         reader.close()
 
@@ -168,11 +168,11 @@ def _records(
     messages: Iterable[tuple[Any, int, bytes]],
     encoding: str,
     unpack: Callable[[bytes], bytes] | None,
-    wanted: Wanted,
+    is_wanted: Wanted,
 ) -> list[Record]:
     """Records of the messages that a reader of rosbags gives."""
     schemas: dict[tuple[int, str], Schema] = {}
-    keep = MessageFilter(wanted)
+    keep = MessageFilter(is_wanted)
     records = []
     size = 0
     for connection, log_time, data in messages:
@@ -262,8 +262,8 @@ class MessageDecoder:
 
 def message_type(schema: Schema) -> str:
     """Name of a message's type as ROS 2 writes it, as in `sensor_msgs/msg/JointState`."""
-    package, _, rest = schema.name.partition("/")
-    return schema.name if "/" in rest else f"{package}/msg/{rest}"
+    package, _, short_name = schema.name.partition("/")
+    return schema.name if "/" in short_name else f"{package}/msg/{short_name}"
 
 
 def _typestore(schema: Schema, encoding: str) -> Any:

@@ -137,9 +137,9 @@ def wanted_messages(options: ReadOptions) -> Wanted:
     topics = (options.measured_topic, options.command_topic)
 
     def is_wanted(record: Record) -> bool:
-        kind = "" if record.schema is None else message_type(record.schema)
+        type_name = "" if record.schema is None else message_type(record.schema)
         is_own = record.topic.startswith("/sweep/")
-        return is_own or kind in types or record.topic in topics
+        return is_own or type_name in types or record.topic in topics
 
     return is_wanted
 
@@ -222,10 +222,10 @@ def join_topics(
     )
     columns = replace(columns, origin=origin, notes=tuple(notes))
     names = {}
-    for theirs, ours in (options.joint_names or {}).items():
+    for logged_name, ours in (options.joint_names or {}).items():
         # Names of joints that were left out are no mistake.
-        if theirs in columns.joints or theirs not in state_joints:
-            names[theirs] = ours
+        if logged_name in columns.joints or logged_name not in state_joints:
+            names[logged_name] = ours
     read = import_columns(
         columns, robot, replace(options, joint_order=None, joint_names=names or None)
     )
@@ -297,9 +297,13 @@ def _guess_measured(types: Mapping[str, str], command: str | None) -> str:
     unitree = _only(types, STATE_TYPES)
     if unitree and _only(types, COMMAND_TYPES) and command is None:
         return unitree
-    others = {topic: kind for topic, kind in types.items() if topic != command}
-    states = _only(others, (JOINT_STATE,)) or _only(
-        {topic: kind for topic, kind in others.items() if topic.endswith("joint_states")},
+    other_types = {topic: type_name for topic, type_name in types.items() if topic != command}
+    states = _only(other_types, (JOINT_STATE,)) or _only(
+        {
+            topic: type_name
+            for topic, type_name in other_types.items()
+            if topic.endswith("joint_states")
+        },
         (JOINT_STATE,),
     )
     return states or unitree or _only(types, CONTROLLER_STATES)
@@ -307,10 +311,10 @@ def _guess_measured(types: Mapping[str, str], command: str | None) -> str:
 
 def _guess_command(types: Mapping[str, str], measured: str) -> str:
     """Topic that alone can hold the commands to the measured joints, or ""."""
-    kind = types[measured]
-    if kind in CONTROLLER_STATES:
+    measured_type = types[measured]
+    if measured_type in CONTROLLER_STATES:
         return measured
-    if kind in STATE_TYPES:
+    if measured_type in STATE_TYPES:
         return _only(types, COMMAND_TYPES)
     candidates = {}
     for topic, other in types.items():
@@ -324,7 +328,7 @@ def _guess_command(types: Mapping[str, str], measured: str) -> str:
 
 def _only(types: Mapping[str, str], kinds: Sequence[str]) -> str:
     """The topic of some types if there is one alone, or the usual one among them; or ""."""
-    topics = [topic for topic, kind in types.items() if kind in kinds]
+    topics = [topic for topic, type_name in types.items() if type_name in kinds]
     usual = [topic for topic in topics if topic in _USUAL_TOPICS]
     if len(topics) > 1 and len(usual) == 1:
         return usual[0]
@@ -544,8 +548,8 @@ class _CommandReader:
     def _in_states(self) -> dict[str, str]:
         """Names in the states by these and, where a robot is known, by its own names."""
         names = {joint: joint for joint in self._state_joints}
-        for theirs, ours in robot_names(self._state_joints, self._robot).items():
-            names.setdefault(ours, theirs)
+        for logged_name, ours in robot_names(self._state_joints, self._robot).items():
+            names.setdefault(ours, logged_name)
         return names
 
     def _of_motors(self, message: Any) -> _Sample:
@@ -699,7 +703,7 @@ def _join(
         if np.ptp(active) > MOVED_RAD:
             moving.append(joint)
     base = _base_series(path, state_series, moving)
-    known = robot_names(list(commands), robot)
+    names_in_robot = robot_names(list(commands), robot)
     joints = []
     no_command = []
     for series in (base, *(part for part in state_series if part is not base)):
@@ -720,7 +724,7 @@ def _join(
             f"of {stated}; the names have to be the same (record both with one set of names)."
         )
     if robot is not None:
-        renamed = {**known, **(options.joint_names or {})}
+        renamed = {**names_in_robot, **(options.joint_names or {})}
         foreign = []
         for joint in joints:
             is_foreign = renamed.get(joint, joint) not in robot.joint_names
@@ -887,12 +891,12 @@ def _constant_gains(
                 f"{gains[1, :, column].min():g} to {gains[1, :, column].max():g} N m s/rad); "
                 "record with constant gains, or cut the bag."
             )
-        for row, what in ((2, "target speed"), (3, "added torque")):
+        for row, addition in ((2, "target speed"), (3, "added torque")):
             values = gains[row, rows, column]
             if np.isfinite(values).all() and np.ptp(values) > _FEED_FORWARD:
                 raise LogError(
-                    f"{path}: the {what} in the commands to {joint} changes, so that its drive "
-                    f"follows more than the position; record with a constant {what}."
+                    f"{path}: the {addition} in the commands to {joint} changes, so that its drive "
+                    f"follows more than the position; record with a constant {addition}."
                 )
     if len(rows) < len(command):
         notes.append(

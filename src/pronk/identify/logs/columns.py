@@ -84,9 +84,9 @@ def import_columns(columns: Columns, robot: RobotSpec | None, options: ReadOptio
     joints = _joint_names(columns, robot, options)
     notes = list(columns.notes)
     renamed = []
-    for theirs, ours in zip(columns.joints, joints, strict=False):
-        if theirs != ours:
-            renamed.append(f"{theirs}: {ours}")
+    for logged_name, ours in zip(columns.joints, joints, strict=False):
+        if logged_name != ours:
+            renamed.append(f"{logged_name}: {ours}")
     if renamed and robot is not None:
         notes.append(f"joints by their names in {robot.name}: {', '.join(renamed)}")
     command = columns.command

@@ -171,13 +171,13 @@ class CsvTable:
         for row, line in zip(self.rows, self.lines, strict=True):
             cell = row[index].strip()
             try:
-                whole, fraction = _clock(cell)
+                clock_seconds, fraction = _clock(cell)
             except ValueError:
                 raise LogError(
                     f"{self.path}: row {line} holds {cell[:40]!r} in the column of the time; "
                     f"expected a timestamp as {first_cell!r}; repair or remove that row."
                 ) from None
-            seconds.append(whole)
+            seconds.append(clock_seconds)
             fractions.append(fraction)
         whole_seconds = np.array(seconds, dtype=np.float64)
         return whole_seconds - whole_seconds[0] + np.array(fractions), True
@@ -207,8 +207,8 @@ def _clock(cell: str) -> tuple[float, float]:
     if match is None:
         raise ValueError(cell)
     hours, minutes, seconds, digits = match.groups()
-    whole = 3600.0 * int(hours) + 60.0 * int(minutes) + int(seconds)
-    return whole, float(f"0.{digits or 0}")
+    clock_seconds = 3600.0 * int(hours) + 60.0 * int(minutes) + int(seconds)
+    return clock_seconds, float(f"0.{digits or 0}")
 
 
 def read_text(path: Path) -> str:
@@ -251,17 +251,17 @@ def _unzipped(path: Path, data: bytes) -> bytes:
     limit = max_bytes()
     parts = []
     size = 0
-    rest = data
+    remaining = data
     try:
-        while rest:
+        while remaining:
             member = zlib.decompressobj(wbits=31)
-            part = member.decompress(rest, limit - size + 1)
+            part = member.decompress(remaining, limit - size + 1)
             parts.append(part)
             size += len(part)
             check_size(path, size, LogError)
             if not member.eof:
                 raise LogError(f"{path}: the gzip file is cut short; unpack or record it again.")
-            rest = member.unused_data.lstrip(b"\0")
+            remaining = member.unused_data.lstrip(b"\0")
     except zlib.error as error:
         raise LogError(f"{path}: not a sound gzip file ({error}).") from None
     return b"".join(parts)
@@ -485,10 +485,10 @@ def _refuse_length(
     path: Path, line: int, row: Sequence[str], width: int, header: Sequence[str]
 ) -> None:
     """Raise a LogError for a row of another length than the others."""
-    others = "header" if header else "others"
+    reference = "header" if header else "others"
     raise LogError(
-        f"{path}: row {line} has {len(row)} cells and the {others} {width}; repair or remove that "
-        "row."
+        f"{path}: row {line} has {len(row)} cells and the {reference} {width}; repair or remove "
+        "that row."
     )
 
 

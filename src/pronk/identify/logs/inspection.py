@@ -292,26 +292,26 @@ def _parts_of(table: CsvTable, index: int) -> _Parts:
     parts = _Parts("", "", _unit_in(unit_text), words)
     if not words and table.header:
         parts.quantity = "index"
-    rest = list(bare)
+    unread = list(bare)
     kinds = set()
     for position, match in enumerate(found_words):
         word = words[position]
         is_unit = word in _ANGLE_WORDS or (position > 0 and word in _TIME_UNIT_WORDS)
-        kind = ""
+        matched_kind = ""
         if is_unit and not parts.unit and len(words) > 1:
             parts.unit = word
-            kind = "unit"
+            matched_kind = "unit"
         elif word in _TIME_UNIT_WORDS and parts.unit in _ANGLE_WORDS:
-            kind = "unit"  # Of rad/s or deg/s.
+            matched_kind = "unit"  # Of rad/s or deg/s.
         else:
             for name_of_kind, kind_words in _KINDS.items():
                 if word in kind_words:
-                    kind = name_of_kind
+                    matched_kind = name_of_kind
                     break
-        if kind:
-            kinds.add(kind)
+        if matched_kind:
+            kinds.add(matched_kind)
             for character in range(*match.span()):
-                rest[character] = "_"
+                unread[character] = "_"
     kinds.discard("unit")
     if "current" in words and "position" in kinds:
         kinds.discard("other")  # The current position is no electric current.
@@ -336,7 +336,7 @@ def _parts_of(table: CsvTable, index: int) -> _Parts:
         parts.quantity = "command"
     elif kinds:
         parts.quantity = "position"
-    parts.joint = re.sub(r"[_\s./:-]{2,}", "_", "".join(rest)).strip("_ ./:-")
+    parts.joint = re.sub(r"[_\s./:-]{2,}", "_", "".join(unread)).strip("_ ./:-")
     return parts
 
 

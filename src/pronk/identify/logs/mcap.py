@@ -117,15 +117,15 @@ Wanted = Callable[[Record], bool]
 
 
 def records(
-    stream: IO[bytes], size: int, most: int | None = None, wanted: Wanted | None = None
+    stream: IO[bytes], size: int, memory_limit: int | None = None, is_wanted: Wanted | None = None
 ) -> Iterator[list[Record]]:
     """Read the messages of a file, chunk by chunk, in the order written.
 
     Args:
         stream: The file, at its beginning.
         size: Size of the file, which no record can exceed [bytes].
-        most: Most memory that all messages may take [bytes]; `max_bytes()` if None.
-        wanted: Says which messages are kept and counted; all of them if None.
+        memory_limit: Most memory that all messages may take [bytes]; `max_bytes()` if None.
+        is_wanted: Says which messages are kept and counted; all of them if None.
 
     Yields:
         Messages of one chunk, or one message that stands outside of chunks.
@@ -135,10 +135,10 @@ def records(
             before is sound.
         TooLargeError: The messages take more memory than allowed.
     """
-    limit = max_bytes() if most is None else most
+    limit = max_bytes() if memory_limit is None else memory_limit
     memory = 0
     messages = _MessageReader()
-    keep = None if wanted is None else MessageFilter(wanted)
+    keep = None if is_wanted is None else MessageFilter(is_wanted)
     try:
         for opcode, content in _file_records(stream, size):
             if opcode == Opcode.CHUNK:
@@ -248,16 +248,16 @@ class _MessageReader:
 class MessageFilter:
     """Keeps the messages that are wanted, and one empty message of every other topic."""
 
-    def __init__(self, wanted: Wanted) -> None:
+    def __init__(self, is_wanted: Wanted) -> None:
         """Begin without a topic."""
-        self._wanted = wanted
+        self._is_wanted = is_wanted
         self._topics: set[str] = set()
 
     def kept(self, messages: Iterable[Record]) -> list[Record]:
         """Return the messages that are kept."""
         kept_messages = []
         for message in messages:
-            if self._wanted(message):
+            if self._is_wanted(message):
                 kept_messages.append(message)
             elif message.topic not in self._topics:
                 kept_messages.append(msgspec.structs.replace(message, data=b""))
@@ -265,12 +265,12 @@ class MessageFilter:
         return kept_messages
 
 
-def read_records(path: Path, wanted: Wanted | None = None) -> tuple[list[Record], str]:
+def read_records(path: Path, is_wanted: Wanted | None = None) -> tuple[list[Record], str]:
     """Read the messages of a file as far as it is sound.
 
     Args:
         path: The file.
-        wanted: Says which messages are kept; all of them if None.
+        is_wanted: Says which messages are kept; all of them if None.
 
     Returns:
         The messages in the order written, and why reading ended early ("" if it did not).
@@ -282,7 +282,7 @@ def read_records(path: Path, wanted: Wanted | None = None) -> tuple[list[Record]
     damage = ""
     try:
         with path.open("rb") as stream:
-            for batch in records(stream, path.stat().st_size, wanted=wanted):
+            for batch in records(stream, path.stat().st_size, is_wanted=is_wanted):
                 messages += batch
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None

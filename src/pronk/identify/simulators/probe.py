@@ -134,6 +134,18 @@ class Clip:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ActingGains:
+    """What acts of the gains that are set."""
+
+    stiffness_factor: float
+    """Stiffness that acts over the one that is set."""
+    damping_factor: float
+    """Damping that acts over the one that is set."""
+    stable_share: float
+    """Share of the gains at which the simulator is stable: 1, or less."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Probe:
     """What a joint responds like."""
 
@@ -141,10 +153,8 @@ class Probe:
     """Name of the joint."""
     law: ActingLaw
     """Law by which it moves."""
-    stiffness_factor: float
-    """Stiffness that acts over the one that is set."""
-    damping_factor: float
-    """Damping that acts over the one that is set."""
+    gains: ActingGains
+    """What acts of the gains that are set."""
     armature: float
     """Armature that acts [kg m^2]."""
     armature_applied: float | None
@@ -159,8 +169,6 @@ class Probe:
     """Delay of the command [s]."""
     hold: int
     """Steps that a command is held for."""
-    stable_share: float
-    """Share of the gains at which the simulator is stable: 1, or less."""
     residual: float
     """RMS of the motion that the answer does not explain, as a share of the motion."""
     alike: tuple[ActingLaw, ...] = ()
@@ -326,8 +334,11 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
     probe = Probe(
         joint=joint,
         law=answer.fit.law,
-        stiffness_factor=scale,
-        damping_factor=scale * damping,
+        gains=ActingGains(
+            stiffness_factor=scale,
+            damping_factor=scale * damping,
+            stable_share=stable_share,
+        ),
         armature=scale * inertia - answer.runs.inertia,
         armature_applied=scale * applied if bench.armature_settable else None,
         viscous_damping=scale * viscous,
@@ -335,7 +346,6 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
         gravity=scale * gravity,
         delay_s=delay_steps * answer.runs.timestep,
         hold=answer.hold,
-        stable_share=stable_share,
         residual=answer.fit.residual,
         alike=answer.alike,
     )
@@ -735,7 +745,7 @@ def _best_laws(runs: _Runs, delay: int, stated: DriveLaw, armature_settable: boo
         if is_far:
             # Whether the stated law explains the motion with the values of the best one.
             other_fit = _fit_law(runs, fit.law, finals[0].theta, fixed, _FINAL_EVALUATIONS)
-            fit = min(fit, other_fit, key=lambda each: each.residual)
+            fit = min(fit, other_fit, key=lambda law_fit: law_fit.residual)
         # A factor on one of the gains must explain more than none.
         plain_start = fit.theta.copy()
         plain_start[0] = 1.0
@@ -937,12 +947,12 @@ def _faults(
         labels.append(other.label)
     if probe.law.stale_position:
         taken = probe.law.stale_position * runs.timestep * joint.stiffness
-        what = "position and speed are" if probe.law.stale_speed else "the position is"
+        stale_parts = "position and speed are" if probe.law.stale_speed else "the position is"
         steps = probe.law.stale_position
         age = "one step old" if steps == 1 else f"{steps} steps old"
         faults["stale"] = (
-            f"{what} {age} where the torque is computed, which takes about {taken:.3g} N m s/rad "
-            f"from the damping of {joint.damping:g}"
+            f"{stale_parts} {age} where the torque is computed, which takes about {taken:.3g} "
+            f"N m s/rad from the damping of {joint.damping:g}"
         )
         if law != stated_law:
             faults["law"] = f"law {stated_law.label} is stated, the joint responds by {law.label}"
@@ -970,8 +980,8 @@ def _faults(
         )
     else:
         for name, factor in (
-            ("stiffness", probe.stiffness_factor),
-            ("damping", probe.damping_factor),
+            ("stiffness", probe.gains.stiffness_factor),
+            ("damping", probe.gains.damping_factor),
         ):
             if abs(factor - 1.0) > 0.05:
                 faults[name] = f"the {name} that acts is {factor:.3g} times the one that is set"
@@ -1010,15 +1020,16 @@ def _faults(
             f"passive damping of {probe.viscous_damping:.3g} N m s/rad acts, "
             f"{drive.viscous_damping:.3g} is set"
         )
-    if probe.stable_share < 1.0:
+    if probe.gains.stable_share < 1.0:
         faults["unstable"] = (
-            f"the joint diverges with its gains; it was probed with {probe.stable_share:g} of them"
+            f"the joint diverges with its gains; it was probed with {probe.gains.stable_share:g} of "
+            "them"
         )
     return faults
 
 
 def _both_near(probe: Probe, scale: float) -> bool:
     """Tell whether both gains act about `scale` times as they are set."""
-    stiffness_near = abs(probe.stiffness_factor / scale - 1.0) < 0.05
-    damping_near = abs(probe.damping_factor / scale - 1.0) < 0.05
+    stiffness_near = abs(probe.gains.stiffness_factor / scale - 1.0) < 0.05
+    damping_near = abs(probe.gains.damping_factor / scale - 1.0) < 0.05
     return stiffness_near and damping_near
