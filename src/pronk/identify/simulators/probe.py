@@ -1022,8 +1022,8 @@ def _faults(
         )
     if probe.gains.stable_share < 1.0:
         faults["unstable"] = (
-            f"the joint diverges with its gains; it was probed with {probe.gains.stable_share:g} of "
-            "them"
+            "the joint diverges with its gains; it was probed with "
+            f"{probe.gains.stable_share:g} of them"
         )
     return faults
 
