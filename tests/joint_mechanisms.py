@@ -84,6 +84,8 @@ class Mechanism:
     """One of `FAULTS`, or nothing."""
     size: float = 0.0
     """Size of the fault, 0 (small) to 1 (large)."""
+    effort_limit: float = 0.0
+    """Torque limit in the robot's file [N m]; 0 for that of the drive."""
 
     @property
     def link_inertia(self) -> float:
@@ -335,7 +337,7 @@ def mechanism_robot(joint: Mechanism, folder: Path) -> RobotSpec:
       <inertial pos="{place}" mass="{joint.mass:.9g}" diaginertia="1e-12 1e-12 1e-12"/>
     </body></body></worldbody></mujoco>"""
     )
-    limit = joint.true_limit
+    limit = joint.effort_limit or joint.true_limit
     if joint.fault == "saturation, limit wrong":
         limit = 10.0 * joint.stiffness * joint.amplitude
     speed = 100.0 * joint.amplitude * np.sqrt(joint.stiffness / joint.inertia)

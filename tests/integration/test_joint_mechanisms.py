@@ -23,7 +23,7 @@ from joint_mechanisms import (
     simulate_mechanisms,
     with_fault,
 )
-from pronk.identify.match.checks import unwrapped
+from pronk.identify.match.checks import unwrapped, wrong_unit
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
 from pronk.identify.match.tables import dead_band_notes
@@ -98,6 +98,39 @@ def test_no_other_mechanism_is_taken_for_a_torque_limit(tmp_path: Path) -> None:
     for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
         limited = [flag for flag in gains.flags if flag.startswith("effort limit")]
         assert limited == [], mechanism
+
+
+def test_stated_gains_do_not_tell_a_torque_limit(tmp_path: Path) -> None:
+    mechanisms = drawn(29, ("", "", "", "saturation, limit known"))
+    command = chirp_commands(mechanisms)
+    reading = simulate_mechanisms(mechanisms, command)
+    rng = np.random.default_rng(0)
+    for number, joint in enumerate(mechanisms):
+        log = mechanism_log(joint, command[:, number], reading[:, number], rng)
+        error = command[:, number] - reading[:, number]
+        asked = float(np.abs(joint.stiffness * error).max())
+        if not joint.fault:
+            joint = replace(joint, effort_limit=1.3 * asked)
+        # The gains that are stated ask for 1.6 times what those of the drive do.
+        stated = replace(log, stiffness=1.6 * log.stiffness, damping=1.6 * log.damping)
+        robot = mechanism_robot(joint, tmp_path / str(number))
+        gains = match([stated.segmented()], robot).gains.joints["j"]
+        limited = [flag for flag in gains.flags if flag.startswith("effort limit")]
+        assert len(limited) == (1 if joint.fault else 0), (joint, gains.flags)
+        stiffness, _ = equivalent_gains(joint)
+        assert gains.stiffness.value == pytest.approx(stiffness, rel=0.1)
+
+
+def test_a_joint_at_rest_is_not_taken_for_one_in_degrees(tmp_path: Path) -> None:
+    (joint,) = drawn(31, ("",))
+    command = chirp_commands([joint])
+    reading = simulate_mechanisms([joint], command)
+    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
+    robot = mechanism_robot(joint, tmp_path)
+    (shaken,) = replace(log, position=log.position / 55.0).segmented().excitations("j")
+    (in_degrees,) = replace(log, command=np.rad2deg(log.command)).segmented().excitations("j")
+    assert wrong_unit(shaken, robot.joint("j")) == ""
+    assert "degrees" in wrong_unit(in_degrees, robot.joint("j"))
 
 
 @pytest.mark.parametrize("fault", ["compliance, motor encoder", "compliance, link encoder"])

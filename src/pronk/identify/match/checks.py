@@ -23,7 +23,6 @@ import numpy as np
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.logs.velocity import velocity_column
 from pronk.identify.match.measured import DB
 from pronk.identify.match.result import NO_MATCH
 from pronk.identify.response.response import FrequencyResponse
@@ -31,6 +30,10 @@ from pronk.robots.robot import Joint, RobotSpec
 
 DEGREES = 180.0 / math.pi
 """Degrees in a radian, the factor by which a wrong unit scales a column."""
+LEAST_DEGREES = 0.7
+"""Least half of the travel of a command that may be in degrees: 0.7 degrees, 0.012 rad, are less
+than the dry friction of most drives lets through, and 0.7 rad are more than most joints are
+excited with."""
 
 LOWEST_HZ = 0.25
 """Lowest frequency of the slow response [Hz]: below it a chirp of 20 s is in its ramp."""
@@ -100,7 +103,7 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
 
     Returns:
         Flags, one sentence each: too few samples, another clock, a joint that stands still, a
-        drive at its effort limit. Empty for a joint whose unit is not radians.
+        measured torque at the effort limit. Empty for a joint whose unit is not radians.
 
     Raises:
         LogError: Another joint moved, a sign is flipped, or angles are in degrees.
@@ -118,13 +121,12 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
             if problem:
                 source = excitation.source or "log"
                 raise LogError(f"{source}: {excitation.joint}: {problem}.")
-        jump = position_jump(excitation, joint)
         for flag in (
-            jump,
+            position_jump(excitation, joint),
             standstill(excitation, joint),
             too_few_samples(excitation, joint),
             wrong_clock(excitation, robot.policy_rate_hz),
-            "" if jump else effort_limit_reached(excitation, joint),
+            effort_limit_measured(excitation, joint),
         ):
             if flag and not _is_repeated(flag, flags):
                 flags.append(flag)
@@ -215,7 +217,9 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
 
     The command leaves the range of the joint by more than a radian and is inside of it in degrees,
     or the slow response has a gain of 180 / pi or pi / 180, within a factor of two: drives follow
-    slow commands with a gain near 1.
+    slow commands with a gain near 1. A position that is 180 / pi times too small is also that of a
+    joint at rest which the excited one shakes; its command is in degrees only if it is large enough
+    for that (`LEAST_DEGREES`).
 
     Args:
         excitation: Excitation of a joint.
@@ -237,7 +241,9 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
             f"{high:.3g} rad; {remedy}"
         )
     gain = abs(slow_response(excitation, joint))
-    if 0.5 < gain / DEGREES < 2.0 or 0.5 < gain * DEGREES < 2.0:
+    position_in_degrees = 0.5 < gain / DEGREES < 2.0
+    command_in_degrees = 0.5 < gain * DEGREES < 2.0 and 0.5 * (highest - lowest) > LEAST_DEGREES
+    if position_in_degrees or command_in_degrees:
         return f"at low frequency the position is {gain:.3g} times the command; {remedy}"
     return ""
 
@@ -450,11 +456,12 @@ def _period_of_changes(times: Array, changes: Array, tick_s: float) -> tuple[flo
     return 1.0 / float(fine_hz[best]), float(lengths[best] / changes.sum())
 
 
-def effort_limit_reached(excitation: Excitation, joint: Joint) -> str:
-    """Say for how much of the time a drive is at its effort limit.
+def effort_limit_measured(excitation: Excitation, joint: Joint) -> str:
+    """Say for how much of the time the measured torque of a drive is at its effort limit.
 
-    The torque is the measured one where the log has it, or else the one that the drive's law asks
-    for with the gains of the log: `stiffness (command - position) - damping velocity`.
+    Without a torque column nothing is said before the fit: the gains that are stated for a drive
+    may be off by half, and so would be the torque that they ask for
+    (`torque_limit.effort_limit_reached` judges by the matched ones).
 
     Args:
         excitation: Excitation of a joint.
@@ -463,41 +470,41 @@ def effort_limit_reached(excitation: Excitation, joint: Joint) -> str:
     Returns:
         What was seen and the way out; empty if the torque stays below the limit.
     """
-    torque = _drive_torque(excitation)
+    torque = excitation.torque
     limit = joint.drive.effort_limit
-    if torque is None or not math.isfinite(limit):
+    if excitation.log.origin.metadata.get("torque") == TORQUE_COMPUTED or torque is None:
         return ""
-    share = float(np.mean(np.abs(torque) >= limit))
+    stiffness = excitation.log.stiffness
+    column = excitation.log.column(excitation.joint)
+    stated = math.nan if stiffness is None else float(stiffness[column])
+    return effort_limit_flag(np.abs(torque), limit, stated, excitation.amplitude)
+
+
+def effort_limit_flag(torque: Array, limit: float, stiffness: float, amplitude: float) -> str:
+    """Say for how much of the time torques are at or above a limit.
+
+    Args:
+        torque: Sizes of the torque [N m], shape (n,).
+        limit: The limit [N m]; infinite where there is none.
+        stiffness: Stiffness of the drive [N m/rad], for a fitting amplitude; NaN if unknown.
+        amplitude: Amplitude of the excitation [rad].
+
+    Returns:
+        What was seen and the way out; empty for less than `LIMITED_SHARE` of the time.
+    """
+    if not math.isfinite(limit) or not np.ptp(torque) > 0.0:
+        return ""
+    share = float(np.mean(torque >= limit))
     if share < LIMITED_SHARE:
         return ""
     remedy = "excite it with a smaller amplitude"
-    stiffness = excitation.log.stiffness
-    if stiffness is not None:
-        fitting = FITTING_SHARE * limit / float(stiffness[excitation.log.column(excitation.joint)])
-        if fitting < excitation.amplitude:
-            remedy = f"excite it with {fitting:.2g} rad or less"
+    if FITTING_SHARE * limit < amplitude * stiffness:
+        remedy = f"excite it with {FITTING_SHARE * limit / stiffness:.2g} rad or less"
     return (
         f"{EFFORT_LIMIT}for {100.0 * share:.0f} % of the excitation the torque is at or above the "
-        f"{limit:g} N m of the drive (up to {np.abs(torque).max():.3g} N m), where the joint does "
+        f"{limit:g} N m of the drive (up to {torque.max():.3g} N m), where the joint does "
         f"not respond linearly; {remedy}, or correct effort_limit in the robot's file"
     )
-
-
-def _drive_torque(excitation: Excitation) -> Array | None:
-    """Return the torque of the drive during an excitation [N m], (n,); None if it is not known."""
-    log = excitation.log
-    measured = log.origin.metadata.get("torque") != TORQUE_COMPUTED
-    if excitation.torque is not None and measured and np.ptp(excitation.torque) > 0.0:
-        return excitation.torque
-    if log.stiffness is None or log.damping is None:
-        return None
-    column = log.column(excitation.joint)
-    velocity = excitation.velocity
-    comparison = velocity_column(log, excitation.joint)
-    if velocity is None or (comparison is not None and not comparison.usable):
-        velocity = np.gradient(excitation.position, excitation.time)
-    error = excitation.command - excitation.position
-    return np.asarray(log.stiffness[column] * error - log.damping[column] * velocity)
 
 
 # ---- after the fit ----

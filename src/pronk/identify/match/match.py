@@ -65,7 +65,7 @@ from pronk.identify.match.result import (
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
 from pronk.identify.match.torque_fit import fit_torque_drives, left_out_by_torque, with_torque
-from pronk.identify.match.torque_limit import MISFIT, fit_torque_limit
+from pronk.identify.match.torque_limit import MISFIT, effort_limit_reached, fit_torque_limit
 from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.response.estimate import resolution_note
 from pronk.identify.response.response import ShortExcitationError
@@ -218,6 +218,9 @@ def match(
 
         joints: dict[str, JointResult] = {}
         for name, fit in with_torque(fits, torque_fits, robot).items():
+            if name in measured:
+                reached = effort_limit_reached(excitations_of(sources[name], name), robot, fit)
+                excitation_flags[name] = with_limit_flag(excitation_flags[name], reached)
             if not measured.get(name):
                 flags = excitation_flags.get(name, ())
                 if name in measured:
@@ -442,6 +445,9 @@ def match_chains(
                     replay, chain_fits, robot, settings.gain_uncertainty
                 )
                 physical |= drive_values
+            for name, fit in chain_fits.items():
+                reached = effort_limit_reached(excitations_of(logs_in_motion, name), robot, fit)
+                excitation_flags[name] = with_limit_flag(excitation_flags[name], reached)
             fits.update(chain_fits)
             excluded.update(chain.excluded)
     joints = {}
@@ -566,6 +572,13 @@ def joint_flags(
         )
     flags.extend(target.warnings)
     return tuple(flags)
+
+
+def with_limit_flag(flags: Sequence[str], reached: Sequence[str]) -> tuple[str, ...]:
+    """Add to the flags of a joint's excitations that its torque limit was reached, once."""
+    if any(flag.startswith(EFFORT_LIMIT) for flag in flags):
+        return tuple(flags)
+    return (*flags, *reached)
 
 
 def match_by_torque(

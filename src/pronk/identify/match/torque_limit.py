@@ -1,8 +1,9 @@
 """A drive at its torque limit, found from the motion alone, with the limit as a free parameter.
 
 Where the limit in the robot's file is right, the simulation is limited as the drive was, and the
-commanded torque tells for how long (`checks.effort_limit_reached`). Where it is wrong, no gains
-explain the log: those of a plain fit are several times too small, with tight intervals. What the
+torque that the matched gains ask for tells for how long (`effort_limit_reached`). The gains that
+are stated for a drive do not tell: those of a robot's file may be off by half. Where the limit is
+wrong, no gains explain the log: those of a plain fit are several times too small, with tight intervals. What the
 drive gave shows in the motion itself, as inertia times acceleration. `fit_torque_limit` compares it
 with what the stated gains ask for, and fits the limit with everything else.
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.identify.logs.joint_log import Excitation
+from pronk.identify.match.checks import effort_limit_flag
 from pronk.identify.match.drive_fit import fit_drives
 from pronk.identify.match.replay import JointReplay
 from pronk.identify.match.result import DriveFit
@@ -98,6 +100,33 @@ def drive_torques(
     return LimitedDrive(
         given=float(np.quantile(np.concatenate(given), 0.9)), asked=np.concatenate(asked)
     )
+
+
+def effort_limit_reached(
+    excitations: Sequence[Excitation], robot: RobotSpec, fit: DriveFit
+) -> tuple[str, ...]:
+    """Say for how much of the time the matched gains ask for more torque than the drive has.
+
+    Args:
+        excitations: Excitations of one joint.
+        robot: The robot, whose limit the fit was made with.
+        fit: The fit of the joint.
+
+    Returns:
+        A flag; none where less than `checks.LIMITED_SHARE` of the time is beyond the limit, and
+        where the fit leaves more than `EXPLAINED` of the amplitude unexplained: its gains are not
+        those of the drive then, and do not tell its torque.
+    """
+    if any(excitation.log.unit(fit.joint) != "rad" for excitation in excitations):
+        return ()
+    amplitude = max(excitation.amplitude for excitation in excitations)
+    if fit.rmse > EXPLAINED * amplitude or "effort_limit" in fit.sd:
+        return ()
+    delay_s = max(fit.values.get("delay", 0.0), 0.0)
+    torques = drive_torques(excitations, robot, {**fit.values, "delay": delay_s})
+    limit = robot.joint(fit.joint).drive.effort_limit
+    flag = effort_limit_flag(torques.asked, limit, fit.values["stiffness"], amplitude)
+    return (flag,) if flag else ()
 
 
 def fit_torque_limit(
