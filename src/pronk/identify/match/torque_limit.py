@@ -3,9 +3,10 @@
 Where the limit in the robot's file is right, the simulation is limited as the drive was, and the
 torque that the matched gains ask for tells for how long (`effort_limit_reached`). The gains that
 are stated for a drive do not tell: those of a robot's file may be off by half. Where the limit is
-wrong, no gains explain the log: those of a plain fit are several times too small, with tight intervals. What the
-drive gave shows in the motion itself, as inertia times acceleration. `fit_torque_limit` compares it
-with what the stated gains ask for, and fits the limit with everything else.
+wrong, no gains explain the log: those of a plain fit are several times too small, with tight
+intervals. What the drive gave shows in the motion itself, as inertia times acceleration.
+`fit_torque_limit` compares it with what the stated gains ask for, and fits the limit with
+everything else.
 
 The limit is taken for the cause only where that explains the log: with `EXPLAINED` of the amplitude
 as the error on held-out samples, `BETTER` times smaller than without. Over 21 mechanisms of
