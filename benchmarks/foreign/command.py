@@ -1,6 +1,6 @@
 """`python -m benchmarks foreign`: robots and logs that pronk's makers did not make.
 
-Four measurements over robots that come with public packages (`population` says which count):
+Five measurements over robots that come with public packages (`population` says which count):
 
 - `robots`: each drawn robot goes by the command line from `robot new` to two exports (`walk`). Its
   numbers are compared with those of its model, and the planned peaks with those of plain MuJoCo
@@ -11,6 +11,8 @@ Four measurements over robots that come with public packages (`population` says 
   (`logs.true_gains`).
 - `faults`: the same with one fault each; the rule of right, none, silent and wrong is that of
   `faults`.
+- `translate`: gains translated between two frameworks beside gains matched for the second to a log
+  of the first (`translations`); they agree within 2 %, or the translation says why not.
 - `pack`: copies the files of the drawn robots into a folder that takes the place of `--packages` on
   a machine without them.
 
@@ -29,15 +31,16 @@ from typing import Any, Literal
 import tyro
 
 from benchmarks.foreign.population import Candidate, drawn_robots, pack
-from benchmarks.foreign.tables import faults_table, honest_table, robots_tables
+from benchmarks.foreign.tables import faults_table, honest_table, robots_tables, translate_tables
+from benchmarks.foreign.translations import translation_trial
 from benchmarks.foreign.trials import log_trial
 from benchmarks.foreign.walk import walk
 from benchmarks.runner import Row, finish, in_parallel, rows_in
 from pronk.cli import console
 from pronk.errors import PronkError
 
-What = Literal["robots", "honest", "faults", "pack"]
-COUNTS = {"robots": 40, "honest": 200, "faults": 200, "pack": 40}
+What = Literal["robots", "honest", "faults", "translate", "pack"]
+COUNTS = {"robots": 40, "honest": 200, "faults": 200, "translate": 30, "pack": 40}
 """Robots or logs, where --count is left out."""
 ROBOTS = 40
 """Robots whose joints logs are of."""
@@ -52,12 +55,12 @@ def foreign(
     jobs: int = 2,
     numbers: tuple[int, ...] = (),
 ) -> console.Outcome:
-    """Take public robots to an export, and match honest and faulty logs of their joints.
+    """Take public robots to an export; match and translate gains of their joints.
 
     Args:
-        what: robots, honest, faults, or pack.
+        what: robots, honest, faults, translate, or pack.
         seed: Of the draw.
-        count: Robots or logs; 40 and 200 if left out.
+        count: Robots or logs; 40, 200 and 30 if left out.
         packages: Folder in which the packages are installed or unpacked, or a packed one; that of
             this Python if left out.
         out: Folder of the results, or of the packed robots.
@@ -65,7 +68,7 @@ def foreign(
         numbers: Only these robots or logs of the draw, counted from 0; repeat it.
     """
     wanted = COUNTS[what] if count is None else count
-    robots_wanted = wanted if what in ("robots", "pack") else ROBOTS
+    robots_wanted = wanted if what in ("robots", "translate", "pack") else ROBOTS
     folder, drawn = drawn_robots(packages, seed, robots_wanted)
     if what == "pack":
         pack(folder, drawn, out)
@@ -98,6 +101,7 @@ def foreign(
         "robots": robots_tables,
         "honest": honest_table,
         "faults": faults_table,
+        "translate": translate_tables,
     }[what](rows, seed)
     return finish(figures, *tables)
 
@@ -119,4 +123,6 @@ def _trial(
         finally:
             shutil.rmtree(scratch / str(number), ignore_errors=True)
         return row | {"number": number}
+    if what == "translate":
+        return translation_trial(seed, number, folder, drawn, scratch / f"translate{number}")
     return log_trial(what, seed, number, folder, list(drawn))

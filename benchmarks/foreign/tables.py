@@ -159,6 +159,47 @@ def faults_table(rows: Sequence[Row], seed: int) -> list[Table]:
     return tables
 
 
+def translate_tables(rows: Sequence[Row], seed: int) -> list[Table]:
+    """Return a table of translations beside matches, one row for each joint."""
+    cells: list[tuple[Cell, ...]] = []
+    counts = {"agree": 0, "explained": 0, "match flagged": 0, "silent": 0, "refused": 0}
+    for row in rows:
+        outcome = translate_outcome(row)
+        counts[outcome] += 1
+        shown: list[Cell] = ["", ""]
+        if "differences" in row:
+            shown = [f"{100.0 * difference:+.2f}" for difference in row["differences"]]
+        said = row["defect"] or row["refusal"] or "; ".join(row["flags"] + row["match_flags"])
+        begin = [row[name] for name in ("number", "robot", "joint", "from", "to")]
+        cells.append((*begin, *shown, outcome, said[:SHOWN]))
+    headings = ("n", "robot", "joint", "from", "to")
+    columns = (
+        *(Column(heading=heading) for heading in headings),
+        Column(heading="stiffness", unit="%"),
+        Column(heading="damping", unit="%"),
+        Column(heading="outcome"),
+        Column(heading="what is said"),
+    )
+    note = (
+        f"{counts['agree']} of {len(rows)} agree within 2 %; of the others the translation says "
+        f"why in {counts['explained']}, the match has a flag in {counts['match flagged']}, "
+        f"{counts['refused']} were refused, {counts['silent']} differ without a word."
+    )
+    title = f"Translated over matched gains, seed {seed}"
+    return [Table(title=title, columns=columns, rows=tuple(cells), notes=(note,))]
+
+
+def translate_outcome(row: Row) -> str:
+    """Return what became of one joint: agree, explained, match flagged, silent, or refused."""
+    if row["refusal"] or row["defect"]:
+        return "refused"
+    if row["agree"]:
+        return "agree"
+    if row["explained"]:
+        return "explained"
+    return "match flagged" if row["match_flags"] else "silent"
+
+
 def _words(row: Row) -> str:
     """Return what a match says, cut to what a table shows."""
     return (row["defect"] or row["refusal"] or "; ".join(row["flags"]))[: 2 * SHOWN]
