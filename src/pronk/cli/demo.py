@@ -41,6 +41,9 @@ def demo(
 ) -> console.Outcome:
     """Sweep and match all joints of the virtual robot, let trained policies jump on it, report.
 
+    Example:
+        pronk demo --quick
+
     Args:
         quick: One leg, two repeats, one policy and one jump with each command: half a minute.
         out: Folder for everything.

@@ -40,6 +40,9 @@ def deploy_command(
 ) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
 
+    Example:
+        pronk deploy policies/matched/policy.onnx --script 1,0,0 --log run.mcap
+
     Args:
         policy: policy.onnx, as `pronk train` writes it.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.

@@ -28,6 +28,9 @@ def evaluate_command(
 ) -> None:
     """Walk and jump with many robots at once; errors, heights, falls, acceptance criteria.
 
+    Example:
+        pronk evaluate runs/matched --gains gains.yaml
+
     Args:
         policy: policy.onnx, a checkpoint, or the folder of a run (its last checkpoint).
         gains: Gains of the simulated drives: gains.yaml, or naive.

@@ -10,10 +10,10 @@ import tyro
 from pronk.cli import console
 
 TargetName = Literal[
+    "isaaclab-implicit",
     "mjlab",
     "mjlab-idealpd",
     "mjlab-builtin",
-    "isaaclab-implicit",
     "isaaclab-dcmotor",
     "isaaclab-delayed",
     "isaaclab-implicit-2.3",
@@ -39,9 +39,13 @@ def export_gains(
 ) -> console.Outcome:
     """Write matched gains as actuator configuration of a simulator.
 
+    Example:
+        pronk export out/isaaclab-implicit/gains.yaml --to isaaclab-implicit --out actuators.py
+
     Args:
         gains: gains.yaml of `pronk match` or `pronk translate`.
-        to: What reads the file; it must have the drive law and the step that the gains hold for.
+        to: What reads the file, as isaaclab-implicit, the default actuator of Isaac Lab. It must
+            have the drive law and the step that the gains hold for.
         out: The file to write.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
         per: One actuator per joint group, with the group's gains, or per joint, with its own.

@@ -29,9 +29,10 @@ def log(
     """Guess how a log is read, show it, and write it beside the log for every later command.
 
     Columns, units, rate and joints are told by names and values. Where two readings are plausible
-    both are named, and an option decides. For example:
+    both are named, and an option decides.
 
-    pronk log inspect chirp.csv --robot robot.yaml --unit deg --yes
+    Example:
+        pronk log inspect chirp.csv --robot robot.yaml --unit deg --yes
 
     Args:
         action: inspect: guess, show, and with --yes write chirp.log.yaml beside chirp.csv.

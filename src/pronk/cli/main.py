@@ -20,6 +20,7 @@ import re
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -146,8 +147,7 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
         return 0
     if name not in commands:
         raise PronkError(f"there is no command {name!r}; the commands are {', '.join(commands)}.")
-    location, _ = commands[name]
-    command = pkgutil.resolve_name(location)
+    command = command_of(name, commands)
     values = _parse(command, arguments[1:], f"{program} {name}")
     json_file = values.pop(_JSON_PARAMETER, None)
     outcome = command(**values)
@@ -156,6 +156,31 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
     if outcome.pages_of:
         outcome = _with_pages(outcome)
     return int(outcome.end(json_file))
+
+
+def command_of(
+    name: str, commands: Mapping[str, tuple[str, str]] = COMMANDS
+) -> Callable[..., Outcome | None]:
+    """Return the function of a command."""
+    location, _ = commands[name]
+    command: Callable[..., Outcome | None] = pkgutil.resolve_name(location)
+    return command
+
+
+def parsed_command(arguments: Sequence[str]) -> dict[str, Any]:
+    """Parse a command line without running it; return the values of the command's parameters.
+
+    Args:
+        arguments: The words after `pronk`.
+
+    Raises:
+        PronkError: There is no such command, or an option is unknown, missing or impossible.
+        SystemExit: The help of the command was printed.
+    """
+    name = arguments[0] if arguments else ""
+    if name not in COMMANDS:
+        raise PronkError(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
+    return _parse(command_of(name), list(arguments[1:]), f"pronk {name}")
 
 
 def _with_pages(outcome: Outcome) -> Outcome:
@@ -193,6 +218,7 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> d
     """
     import tyro
 
+    from pronk.cli import help_text
     from pronk.cli.console import JsonFile, Outcome
 
     signature = inspect.signature(command, eval_str=True)
@@ -209,8 +235,16 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> d
     # tyro makes the options of what it finds at a function.
     annotations = {parameter.name: parameter.annotation for parameter in parameters}
     collect.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    collect.__doc__ = command.__doc__
+    collect.__doc__ = help_text.without_examples(command.__doc__ or "")
     collect.__annotations__ = annotations
+    config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
+    if "--help" in arguments or "-h" in arguments:
+        with warnings.catch_warnings():
+            # tyro has no other public way to the texts of a command line's options.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            parser: Any = tyro.extras.get_parser(collect, config=config)
+        print(help_text.help_text(parser, program, help_text.examples_of(command)))  # noqa: T201
+        raise SystemExit(0)
     words = _with_explicit_values(arguments, annotations)
     messages = io.StringIO()
     try:
@@ -219,7 +253,7 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> d
                 collect,
                 prog=program,
                 args=words,
-                config=(tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes),
+                config=config,
             )
     except SystemExit as stop:
         if not stop.code:

@@ -40,6 +40,10 @@ def match_command(
 ) -> console.Outcome:
     """Find the gains with which the simulator responds like the robot.
 
+    Example:
+        pronk match chirp.csv --robot robot.yaml --drive-gains default \
+            --for isaaclab-implicit --out out/gains.yaml
+
     Args:
         paths: Logs, or folders of logs.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
@@ -236,7 +240,11 @@ def summary(result: MatchResult) -> dict[str, Any]:
 
 
 def profiles() -> console.Outcome:
-    """List the frameworks that gains can be matched for."""
+    """List the frameworks that gains can be matched for.
+
+    Example:
+        pronk profiles
+    """
     from dataclasses import asdict
 
     from pronk.identify.simulators.profiles import load_profiles

@@ -23,6 +23,9 @@ def play(
 ) -> console.Outcome:
     """Walk and jump the virtual robot from a browser: sliders, keys or gamepad.
 
+    Example:
+        pronk play policies/matched/policy.onnx
+
     Args:
         policy: policy.onnx.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.

@@ -30,7 +30,10 @@ def predict_logs(
     allow_unmatched: bool = False,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
-    """Replay logs in the simulator with nominal and with matched gains; RMSE and R2 per joint.
+    """Replay logs in the simulator with nominal and with matched gains; RMSE and R² per joint.
+
+    Example:
+        pronk predict fresh.csv --gains out/gains.yaml --drive-gains default
 
     Args:
         paths: Logs, or folders of logs.
@@ -124,8 +127,8 @@ PREDICTION_COLUMNS = {
     "rmse_nominal": Column(heading="RMSE nominal", digits=4),
     "rmse_nominal_delayed": Column(heading="nominal with the delay", digits=4),
     "rmse_matched": Column(heading="RMSE matched", digits=4),
-    "r2_nominal": Column(heading="R2 nominal"),
-    "r2_matched": Column(heading="R2 matched"),
+    "r2_nominal": Column(heading="R² nominal"),
+    "r2_matched": Column(heading="R² matched"),
 }
 """Columns of the table, by the figures of `prediction_rows`."""
 

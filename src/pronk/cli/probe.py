@@ -19,6 +19,9 @@ def probe(
 ) -> console.Outcome:
     """Excite one joint of a simulator; name its drive law and what acts otherwise than it is set.
 
+    Example:
+        pronk probe mujoco --robot mini_cheetah --joint FR_knee
+
     Args:
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.

@@ -12,6 +12,9 @@ from pronk.cli import console
 def report(folder: tyro.conf.Positional[Path]) -> console.Outcome:
     """Write one HTML page of all matches, trials and deployments in a folder, or of one log.
 
+    Example:
+        pronk report out
+
     Args:
         folder: Folder that matches and trials were written to, or one above; or the log
             of a deployment, .mcap.

@@ -35,6 +35,9 @@ def response(
 ) -> console.Outcome:
     """Estimate the frequency response of every joint that was excited.
 
+    Example:
+        pronk response chirp.csv --robot robot.yaml --out out/responses
+
     Args:
         paths: Logs, or folders of logs.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the log's if left out.

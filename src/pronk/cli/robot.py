@@ -32,6 +32,9 @@ def robot(
 ) -> None:
     """Write a filled-in robot.yaml for an MJCF or URDF, or check a robot.
 
+    Example:
+        pronk robot new my_robot.urdf
+
     Args:
         action: new: write a robot.yaml; check: list what is missing or inconsistent.
         path: MJCF or URDF for new; robot.yaml, its folder, or a model for check.

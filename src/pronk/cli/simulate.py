@@ -52,6 +52,9 @@ def simulate(
 
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
 
+    Example:
+        pronk simulate mini_cheetah --link lcm
+
     Args:
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         link: The wire.

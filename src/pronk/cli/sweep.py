@@ -42,6 +42,9 @@ def sweep(
 ) -> console.Outcome:
     """Excite every joint: plan, check against the limits, excite, record.
 
+    Example:
+        pronk sweep mini_cheetah --joints FR_knee --out logs
+
     Args:
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: Folder for the logs, one MCAP per joint.

@@ -15,6 +15,9 @@ from pronk.tables import Column, Table
 def train_command(settings: TrainSettings) -> console.Outcome:
     """Train a policy that walks, runs and jumps on command.
 
+    Example:
+        pronk train all --gains gains.yaml --out runs/matched
+
     Args:
         settings: What is trained.
     """

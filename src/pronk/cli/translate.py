@@ -45,6 +45,9 @@ def translate_gains(
 ) -> console.Outcome:
     """Translate gains for a framework of another drive law, in which the joints respond alike.
 
+    Example:
+        pronk translate out/gains.yaml --to isaaclab-implicit --out out/isaaclab.yaml
+
     Args:
         to: A name that `pronk profiles` lists, NAME,timestep_s=S,iterations=N, or all. Of several
             each is written into a folder of its name.

@@ -86,6 +86,9 @@ def trial(
 ) -> console.Outcome:
     """Stand, run, jump, stop: 20 times with each command; the paper's table beside ours.
 
+    Example:
+        pronk trial policies/matched/policy.onnx --also policies/naive/policy.onnx
+
     Args:
         policies: policy.onnx, one or more; the others are compared with the first.
         output: What is kept and printed.

@@ -128,6 +128,7 @@ def _of_isaaclab_2_3(target: ExportTarget) -> ExportTarget:
 
 
 TARGETS: Mapping[str, ExportTarget] = {
+    "isaaclab-implicit": ISAACLAB_IMPLICIT,
     "mjlab": ExportTarget(
         profile="mjlab",
         write=mjlab_config,
@@ -147,7 +148,6 @@ TARGETS: Mapping[str, ExportTarget] = {
         config_class="BuiltinPositionActuatorCfg",
         settings=f"{SET_STEP}, the integrator to implicitfast.",
     ),
-    "isaaclab-implicit": ISAACLAB_IMPLICIT,
     "isaaclab-dcmotor": ISAACLAB_DC_MOTOR,
     "isaaclab-delayed": ISAACLAB_DELAYED,
     "isaaclab-implicit-2.3": _of_isaaclab_2_3(ISAACLAB_IMPLICIT),
