@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 Cell = str | int | float | tuple[float, float] | None
 """Text, a number, an interval as (lower, upper), or None where nothing was measured."""
@@ -23,6 +23,8 @@ class Column:
     """Unit, written in brackets behind the heading; empty for text and counts."""
     digits: int = 3
     """Digits behind the decimal point."""
+    is_detail: bool = False
+    """True for a column that a terminal shows with --wide alone."""
 
     @property
     def title(self) -> str:
@@ -64,6 +66,15 @@ class Table:
                     f"table {self.title!r}: a row has {len(row)} cells; expected "
                     f"{len(self.columns)}, one for each column."
                 )
+
+    def without_details(self) -> Table:
+        """Return the table without the columns that are details."""
+        kept = [index for index, column in enumerate(self.columns) if not column.is_detail]
+        rows = []
+        for row in self.rows:
+            rows.append(tuple(row[index] for index in kept))
+        columns = tuple(self.columns[index] for index in kept)
+        return replace(self, columns=columns, rows=tuple(rows))
 
     def text_rows(self) -> list[list[str]]:
         """Return the cells as text, row by row."""

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import re
-from contextlib import redirect_stdout
 
 import pytest
 
 from command_line import refused
+from documented_commands import LABEL, help_of
 from pronk.cli.help_text import WIDTH, examples_of
 from pronk.cli.main import COMMANDS, command_of, parsed_command
 from pronk.errors import PronkError
-
-LABEL = re.compile(r"\b[SMFNCPDERLA]\d{1,2}\b(?!-)")
-"""Labels of the checklist of the paper, as in E5 or A17."""
-
-
-def help_of(name: str) -> str:
-    """Return the help of a command."""
-    printed = io.StringIO()
-    with redirect_stdout(printed), pytest.raises(SystemExit) as stop:
-        parsed_command([name, "--help"])
-    assert not stop.value.code
-    return printed.getvalue()
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -108,11 +108,18 @@ def _json_value(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
 
 
-def show(table: Table) -> None:
-    """Print a table and its notes.
+def show(table: Table, *, wide: bool = False) -> None:
+    """Print a table and its notes; what does not fit is folded, and nothing is cut.
 
-    A stream that is not a terminal gets the width that the table needs.
+    A stream that is not a terminal gets the width that the table needs, unless the variable COLUMNS
+    says how wide it is.
+
+    Args:
+        table: The table.
+        wide: True to print the columns that are details as well.
     """
+    if not wide:
+        table = table.without_details()
     rich_table = RichTable(
         title=Text(table.title), title_style="bold", header_style="bold", title_justify="left"
     )
@@ -121,11 +128,11 @@ def show(table: Table) -> None:
         is_name = index == 0
         is_long = any(len(text_row[index]) > _LONG_TEXT for text_row in text_rows)
         justify = "left" if is_name or is_long else "right"
-        rich_table.add_column(Text(column.title), justify=justify, no_wrap=is_name)  # type: ignore[arg-type]
+        rich_table.add_column(Text(column.title), justify=justify, overflow="fold")  # type: ignore[arg-type]
     for text_row in text_rows:
         rich_table.add_row(*map(Text, text_row))
     console = PipeConsole(highlight=False)
-    if not console.is_terminal:
+    if not console.is_terminal and "COLUMNS" not in os.environ:
         console = PipeConsole(highlight=False, width=_PIPED_WIDTH)
     console.print(rich_table)
     for sentence in table.notes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,20 +23,47 @@ Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How gains are fitted."""
+
+    mode: Mode = "gains"
+    """gains: stiffness and damping (the paper's). drive: damping, armature, friction and delay at
+    known stiffness; by a torque channel armature, friction and torque scale."""
+    method: Method = "time"
+    """time: gains, dry friction and delay in the time domain, all amplitudes together. paper: gains
+    by the magnitude of the largest amplitude, over the paper's whole grid."""
+    fitted: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = ()
+    """With --mode drive: fit this instead; repeat it. What the logs do not identify is refused."""
+    gain_uncertainty: float = 0.2
+    """With --mode drive: share by which the stated gains and the torque constant may be wrong; it
+    counts in the intervals. On recordings of AK80-6 drives it is 0.2."""
+    zero_armature: bool = True
+    """With --method paper: repeat the paper's search without rotor inertia."""
+    segment_s: float | None = None
+    """Length of the segments of a response in s, whose inverse is the spacing of its frequencies;
+    8, or less for shorter excitations, if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorOptions:
+    """What is simulated with."""
+
+    simulator: str = "mujoco"
+    """mujoco, FILE.py:NAME, or the name of an installed simulator."""
+    simulator_python: Path | None = None
+    """Python that the simulator runs in (3.11 or later, with NumPy)."""
+
+
 def match_command(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str,
     out: Path = Path("gains.yaml"),
-    mode: Mode = "gains",
-    method: Method = "time",
-    drive_gains: tuple[str, ...] = (),
-    zero_armature: bool = True,
-    fitted: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
-    simulator: str = "mujoco",
-    simulator_python: Path | None = None,
-    segment_s: float | None = None,
-    gain_uncertainty: float = 0.2,
     frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
+    drive_gains: tuple[str, ...] = (),
+    wide: bool = False,
+    fit: FitOptions = FitOptions(),
+    engine: SimulatorOptions = SimulatorOptions(),
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Find the gains with which the simulator responds like the robot.
@@ -48,22 +76,13 @@ def match_command(
         paths: Logs, or folders of logs.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: The gains file.
-        mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
-            delay at known stiffness; by a torque channel armature, friction and torque scale.
-        method: time: gains, dry friction and delay in the time domain, all amplitudes together.
-            paper: gains by the magnitude of the largest amplitude, over the paper's whole grid.
-        drive_gains: Gains on the real drives if the logs do not have them: JOINT=STIFFNESS,DAMPING
-            or GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
-        zero_armature: Repeat the paper's search without rotor inertia (--method paper).
-        fitted: drive: fit this instead; repeat it. What the logs do not identify is refused.
-        simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
-        segment_s: Length of the segments of a response in s, whose inverse is the spacing of its
-            frequencies; 8, or less for shorter excitations, if left out.
-        gain_uncertainty: Share by which the stated gains and the torque constant may be wrong
-            (--mode drive); it counts in the intervals. On recordings of AK80-6 drives it is 0.2.
-        simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
             repeat it. A name of `pronk profiles`, or NAME,timestep_s=S,iterations=N,friction=none.
+        drive_gains: Gains on the real drives if the logs do not have them: JOINT=STIFFNESS,DAMPING
+            or GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
+        wide: Print every column: both intervals, errors with the nominal gains, coherence.
+        fit: How gains are fitted.
+        engine: What is simulated with.
         reading: How logs are read.
     """
     from pronk.identify.match import gains as gains_file
@@ -78,7 +97,9 @@ def match_command(
     robot_spec = load_robot(robot)
     if out.suffix not in (".yaml", ".yml"):
         raise PronkError(f"--out {out}: expected a name that ends in .yaml, as in gains.yaml.")
-    if fitted and mode != "drive":
+    mode = fit.mode
+    simulator = engine.simulator
+    if fit.fitted and mode != "drive":
         raise PronkError("--fit names what --mode drive fits; give --mode drive as well.")
     if frameworks and (mode != "gains" or simulator != "mujoco"):
         raise PronkError(
@@ -90,11 +111,11 @@ def match_command(
     gains_on_drives = options.drive_gains(drive_gains)
     logs = reading.read(paths, robot_spec)
     settings = MatchSettings(
-        fitted=fitted,
-        zero_armature=zero_armature,
-        simulator_python=simulator_python,
-        estimator=Estimator(segment_s=segment_s),
-        gain_uncertainty=gain_uncertainty,
+        fitted=fit.fitted,
+        zero_armature=fit.zero_armature,
+        simulator_python=engine.simulator_python,
+        estimator=Estimator(segment_s=fit.segment_s),
+        gain_uncertainty=fit.gain_uncertainty,
     )
     results: dict[str, MatchResult] = {}
     written: list[Path] = []
@@ -109,7 +130,7 @@ def match_command(
                 logs,
                 robot_spec,
                 name,
-                method=method,
+                method=fit.method,
                 mode=mode,
                 drive_gains=gains_on_drives,
                 settings=settings,
@@ -130,7 +151,10 @@ def match_command(
     if mode == "drive":
         console.show(tables.drives_table(result))
     if mode == "gains" or has_responses:
-        console.show(tables.gains_table(result))
+        if wide:
+            console.show(tables.gains_table(result), wide=True)
+        else:
+            console.show(tables.gains_summary_table(result))
         console.show(tables.ranges_table(result, members))
     positions = tables.positions_table(result)
     if positions.rows:

@@ -31,7 +31,7 @@ AMPLITUDES = (0.25, 0.125)
 
 def sweep(
     robot: tyro.conf.Positional[str],
-    out: Path,
+    out: Path = Path("logs"),
     machine: LinkOptions = LinkOptions(),  # noqa: B008
     joints: tuple[str, ...] = (),
     signal: SignalName = "chirp",
@@ -47,7 +47,7 @@ def sweep(
 
     Args:
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
-        out: Folder for the logs, one MCAP per joint.
+        out: Folder for the logs, one MCAP file per joint.
         machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
         signal: Excitation signal.

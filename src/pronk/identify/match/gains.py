@@ -26,6 +26,39 @@ FIRST_SCHEMA = "pronk/gains/1"
 """Schema whose joints had one flat list of numbers. It is still read: the contract of a policy
 holds the SHA-256 of the file that it was trained with, so those files cannot be written anew."""
 
+HEADER = """\
+# Matched gains. Which numbers to use:
+#   groups   For training: stiffness and damping of each joint group, and how far to
+#            randomize them (plus or minus the range). `pronk export` writes these.
+#   joints   For the simulation of one joint, or of this one robot: the values of the
+#            joint, with dry friction and delay, which go with them.
+# They hold for the simulator below and for no other: its drive law, its step, and
+# the inertia of this robot's model. They are not the gains of the drive itself.
+# Intervals are 95 % intervals. total95: use this one. repeat95: spread of the
+# repeats alone. matched: false says that no gains explain the log.
+"""
+"""First lines of the file, for the people who open it."""
+FIELD_COMMENTS = {
+    "timestep_s": "s",
+    "stiffness": "N m/rad",
+    "damping": "N m s/rad",
+    "armature": "kg m^2, rotor inertia through the gear",
+    "frictionloss": "N m, dry friction",
+    "stribeck": "share of the dry friction that motion takes away",
+    "delay_s": "s, delay of the command",
+    "covariance": "of stiffness and damping",
+    "band_hz": "Hz, compared frequencies",
+    "error_db": "dB, error of the gain over frequency",
+    "nominal_error_db": "dB, the same with the gains of the real drive",
+    "coherence_min": "0 to 1, lowest of the measured response",
+    "amplitude_spread": "relative change of the stiffness between amplitudes",
+    "stiffness_range": "N m/rad, half of the width",
+    "damping_range": "N m s/rad, half of the width",
+    "ellipsoid": "shape matrix that covers stiffness and damping of the joints",
+    "logs": "SHA-256 of each recording",
+}
+"""Comment behind a field of the file, by its name."""
+
 NAN = float("nan")
 Interval = tuple[float, float]
 """Lower and upper end."""
@@ -249,7 +282,8 @@ def save_gains(path: Path, gains: MatchedGains) -> None:
         "groups": groups,
         "logs": dict(gains.logs),
     }
-    write_text(path, yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=10_000))
+    text = yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=10_000)
+    write_text(path, f"{HEADER}{_with_units(text)}")
 
 
 def load_gains(path: Path) -> MatchedGains:
@@ -322,8 +356,14 @@ def _check_value(value: float, largest: float, place: str) -> None:
 # ---- entries of the file ----
 
 
-class _OneLine(dict[str, Any]):
-    """A mapping that is written on one line."""
+def _with_units(text: str) -> str:
+    """Write the unit of each field as a comment at the end of its line."""
+    lines = []
+    for line in text.rstrip("\n").split("\n"):
+        name = line.strip().partition(":")[0]
+        comment = FIELD_COMMENTS.get(name)
+        lines.append(f"{line}  # {comment}" if comment else line)
+    return "\n".join(lines) + "\n"
 
 
 class _OneLineList(list[Any]):
@@ -331,24 +371,19 @@ class _OneLineList(list[Any]):
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that writes `_OneLine` and `_OneLineList`."""
-
-
-def _represent_mapping(dumper: yaml.SafeDumper, entry: _OneLine) -> yaml.Node:
-    return dumper.represent_mapping("tag:yaml.org,2002:map", entry, flow_style=True)
+    """SafeDumper that writes `_OneLineList`."""
 
 
 def _represent_list(dumper: yaml.SafeDumper, entry: _OneLineList) -> yaml.Node:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", entry, flow_style=True)
 
 
-_Dumper.add_representer(_OneLine, _represent_mapping)
 _Dumper.add_representer(_OneLineList, _represent_list)
 
 
-def _simulator_entry(simulator: SimulatorInfo) -> _OneLine:
-    """Return the entry of the simulator on one line; an empty name is left out."""
-    entry = _OneLine()
+def _simulator_entry(simulator: SimulatorInfo) -> dict[str, Any]:
+    """Return the entry of the simulator; an empty name is left out."""
+    entry: dict[str, Any] = {}
     if simulator.profile:
         entry["profile"] = simulator.profile
     entry["engine"] = simulator.engine
@@ -372,7 +407,7 @@ def _relative_path(path: str, folder: Path) -> str:
 
 
 def _joint_entry(joint: JointGains) -> dict[str, Any]:
-    """Return the entry of a joint: a line for each parameter; what is not known is left out."""
+    """Return the entry of a joint; what is not known is left out."""
     entry: dict[str, Any] = {"matched": joint.matched}
     if joint.reasons:
         entry["reasons"] = list(joint.reasons)
@@ -401,8 +436,8 @@ def _joint_entry(joint: JointGains) -> dict[str, Any]:
     return entry
 
 
-def _value_entry(fitted: FittedValue) -> _OneLine:
-    entry = _OneLine(value=_rounded(fitted.value))
+def _value_entry(fitted: FittedValue) -> dict[str, Any]:
+    entry: dict[str, Any] = {"value": _rounded(fitted.value)}
     if math.isfinite(fitted.repeat95[0]):
         entry["repeat95"] = _interval_entry(fitted.repeat95)
     if math.isfinite(fitted.total95[0]):
@@ -410,8 +445,8 @@ def _value_entry(fitted: FittedValue) -> _OneLine:
     return entry
 
 
-def _quality_entry(quality: MatchQuality) -> _OneLine:
-    entry = _OneLine()
+def _quality_entry(quality: MatchQuality) -> dict[str, Any]:
+    entry: dict[str, Any] = {}
     if math.isfinite(quality.band_hz[0]):
         entry["band_hz"] = _interval_entry(quality.band_hz)
     numbers = {
@@ -426,20 +461,23 @@ def _quality_entry(quality: MatchQuality) -> _OneLine:
     return entry
 
 
-def _torque_entry(parameter: TorqueParameter) -> _OneLine:
-    entry = _OneLine(value=_rounded(parameter.value), ci95=_interval_entry(parameter.ci95))
+def _torque_entry(parameter: TorqueParameter) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "value": _rounded(parameter.value),
+        "ci95": _interval_entry(parameter.ci95),
+    }
     if parameter.reason:
         entry["reason"] = parameter.reason
     return entry
 
 
-def _group_entry(group: GroupGains) -> _OneLine:
-    entry = _OneLine(
-        stiffness=_rounded(group.stiffness),
-        damping=_rounded(group.damping),
-        stiffness_range=_rounded(group.stiffness_range),
-        damping_range=_rounded(group.damping_range),
-    )
+def _group_entry(group: GroupGains) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "stiffness": _rounded(group.stiffness),
+        "damping": _rounded(group.damping),
+        "stiffness_range": _rounded(group.stiffness_range),
+        "damping_range": _rounded(group.damping_range),
+    }
     if not math.isnan(group.frictionloss):
         entry["frictionloss"] = _rounded(group.frictionloss)
     entry["ellipsoid"] = _matrix_entry(group.ellipsoid)
