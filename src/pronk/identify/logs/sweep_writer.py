@@ -5,12 +5,15 @@
 - `/sweep/sample`, one per measured state: command in force, response, instantaneous frequency;
 - `/sweep/end`, last: whether the sweep is complete, and if not, why.
 
-Chunks are short and flushed as they fill, so that a power cut costs half a second.
+Times in messages are on the clock of the machine; the log times of the messages are the wall clock,
+set at the first segment or sample. Chunks are short and flushed as they fill, so that a power cut
+costs half a second.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -102,9 +105,13 @@ class McapLogWriter:
         self._file = McapWriter(path, TOPICS)
         self._samples_in_chunk = 0
         self._last_time = 0.0
+        self._opened_s = time.time()
+        """When the log was opened [s since 1970]."""
+        self._wall_offset_s: float | None = None
+        """Wall clock less the clock of the log [s]; None before its first time."""
         self._file.put(
             HEADER,
-            0.0,
+            self._opened_s,
             {
                 "schema": SCHEMA,
                 "robot": header.robot,
@@ -121,7 +128,7 @@ class McapLogWriter:
 
     def segment(self, segment: Segment) -> None:
         """Write a segment, before its samples."""
-        self._file.put(SEGMENT, segment.start, asdict(segment))
+        self._file.put(SEGMENT, self._wall_time(segment.start), asdict(segment))
         self.flush()
 
     def sample(
@@ -152,11 +159,17 @@ class McapLogWriter:
             body["torque"] = torque
         body["frequency"] = frequency
         body["segment"] = segment
-        self._file.put(SAMPLE, time, body)
+        self._file.put(SAMPLE, self._wall_time(time), body)
         self._last_time = time
         self._samples_in_chunk += 1
         if self._samples_in_chunk >= _FLUSH_SAMPLES:
             self.flush()
+
+    def _wall_time(self, log_time: float) -> float:
+        """Return the wall clock at a time of the log [s since 1970]."""
+        if self._wall_offset_s is None:
+            self._wall_offset_s = self._opened_s - log_time
+        return log_time + self._wall_offset_s
 
     def flush(self) -> None:
         """Finish the chunk and pass everything to the operating system."""
@@ -165,7 +178,8 @@ class McapLogWriter:
 
     def end(self, *, complete: bool = True, reason: str = "") -> None:
         """Write the end and close the file; `reason` says why the log is not complete."""
-        self._file.put(END, self._last_time, {"complete": complete, "reason": reason})
+        body = {"complete": complete, "reason": reason}
+        self._file.put(END, self._wall_time(self._last_time), body)
         self._file.close()
 
 
