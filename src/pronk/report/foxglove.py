@@ -1,4 +1,4 @@
-"""Motion of a robot as an MCAP file that Foxglove shows in three dimensions.
+"""The motion of a robot as an MCAP file that Foxglove shows in three dimensions.
 
 The messages are those of the package `foxglove-schemas-protobuf`:
 
@@ -25,7 +25,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.files import written_whole
-from pronk.report.motion import Motion
+from pronk.report.motion import RobotMotion
 from pronk.robots import MODEL_SUFFIXES, robot_file_path
 from pronk.robots.load import read_robot_file
 from pronk.robots.model import free_spec
@@ -54,7 +54,7 @@ class _Schemas:
     writer: Any
 
 
-def write_foxglove(path: Path, robot: RobotSpec, motion: Motion) -> int:
+def write_foxglove(path: Path, robot: RobotSpec, motion: RobotMotion) -> int:
     """Write the motion of a robot, whole or not at all.
 
     Args:
@@ -135,7 +135,7 @@ def _base_address(model: mujoco.MjModel) -> int | None:
     return int(model.jnt_qposadr[free_joints[0]]) if len(free_joints) else None
 
 
-def _moving_bodies(model: mujoco.MjModel, motion: Motion) -> list[int]:
+def _moving_bodies(model: mujoco.MjModel, motion: RobotMotion) -> list[int]:
     """Return the bodies that move in their parent, as the log has a joint between the two."""
     moving = []
     for body in range(1, model.nbody):
@@ -175,7 +175,7 @@ def _frames(
     return message
 
 
-def _joint_states(schemas: _Schemas, motion: Motion, row: int) -> Any:
+def _joint_states(schemas: _Schemas, motion: RobotMotion, row: int) -> Any:
     """Return the measured state of the joints at an instant."""
     message = schemas.joints()
     message.timestamp.FromNanoseconds(int(motion.time_ns[row]))
@@ -190,7 +190,7 @@ def _joint_states(schemas: _Schemas, motion: Motion, row: int) -> Any:
     return message
 
 
-def _joint_commands(schemas: _Schemas, motion: Motion, row: int) -> Any:
+def _joint_commands(schemas: _Schemas, motion: RobotMotion, row: int) -> Any:
     """Return the commanded positions of the joints at an instant."""
     message = schemas.joints()
     message.timestamp.FromNanoseconds(int(motion.time_ns[row]))

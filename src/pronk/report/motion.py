@@ -27,7 +27,7 @@ CLOCKS = {SAMPLE: "t", TICK_TOPIC: "begun"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class RobotMotion:
     """What a robot did: n instants of some joints."""
 
     joints: tuple[str, ...]
@@ -50,7 +50,9 @@ class Motion:
     """Sentences on the clock and on what the log does not have."""
 
 
-def read_motion(path: Path, robot: RobotSpec, read_joint_log: Callable[[], JointLog]) -> Motion:
+def read_motion(
+    path: Path, robot: RobotSpec, read_joint_log: Callable[[], JointLog]
+) -> RobotMotion:
     """Read the motion of a log.
 
     Args:
@@ -66,7 +68,7 @@ def read_motion(path: Path, robot: RobotSpec, read_joint_log: Callable[[], Joint
     return _of_joint_log(path, read_joint_log(), robot)
 
 
-def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> Motion:
+def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> RobotMotion:
     """Return the motion of a log of joints."""
     _check_joints(path, log.joints, robot)
     for joint, unit in zip(log.joints, log.units or (), strict=False):
@@ -89,7 +91,7 @@ def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> Motion:
             f"{segment.amplitude:.3g} rad, repeat {segment.repeat}"
         )
         remarks.append((offset_ns + round(segment.start * 1e9), sentence))
-    return Motion(
+    return RobotMotion(
         joints=log.joints,
         time_ns=offset_ns + np.round(log.time * 1e9).astype(np.int64),
         position=log.position,
@@ -101,7 +103,7 @@ def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> Motion:
     )
 
 
-def _of_deploy_log(log: DeployLog, robot: RobotSpec) -> Motion:
+def _of_deploy_log(log: DeployLog, robot: RobotSpec) -> RobotMotion:
     """Return the motion of a policy's run, without the ticks at which nothing was measured."""
     path = Path(log.source)
     _check_joints(path, log.joints, robot)
@@ -114,7 +116,7 @@ def _of_deploy_log(log: DeployLog, robot: RobotSpec) -> Motion:
     remarks = []
     for event in log.events:
         remarks.append((offset_ns + round(event.time * 1e9), f"{event.kind}: {event.text}"))
-    return Motion(
+    return RobotMotion(
         joints=log.joints,
         time_ns=offset_ns + np.round(ticks.begun[rows] * 1e9).astype(np.int64),
         position=state.position[rows],
