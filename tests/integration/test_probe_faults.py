@@ -198,7 +198,7 @@ def test_a_clipped_torque_is_named_with_its_limit(
 ) -> None:
     probe = probed(robot, torque_limit=torque_limit, delay_steps=delay_steps)
     assert "clipped" in probe.faults
-    assert probe.clip == pytest.approx(torque_limit, rel=0.1)
+    assert probe.law.clip == pytest.approx(torque_limit, rel=0.1)
     assert probe.law.drive.label == "E"
     assert probe.gains.stiffness_factor == pytest.approx(1.0, rel=0.02)
 

@@ -83,6 +83,8 @@ _CLIPPED_SLOPE = 0.3
 """Share of its greatest growth with the height of a step below which the motion is clipped."""
 _CLEAR_OF_CLIP = 0.35
 """Amplitude of the chirps over the height of a step that is clipped."""
+_DAMPED_SHARE = 0.3
+"""What the drive itself takes from the motion of the second step, about, over that of the first."""
 _SHORT_FIRST_STEP = 5.0
 """Motion after two steps over that after one from which on a command acts for less than a third of
 the first one; it is 3 where it acts for all of it."""
@@ -107,6 +109,9 @@ class ActingLaw:
     """Age of the position from which the torque is computed [steps]."""
     stale_speed: int = 0
     """Age of the speed from which the torque is computed [steps]."""
+    clip: float | None = None
+    """Torque [N m] or command about the pose [rad] at which it is clipped below the effort limit;
+    None where no limit was met."""
 
     @property
     def label(self) -> str:
@@ -131,6 +136,8 @@ class Clip:
     """Height of a step from which on the joint goes no further in its first step [rad]."""
     of_torque: bool
     """True if the torque is clipped, False if the command is."""
+    acting: float
+    """Share of its first step for which the command acts, about: the rest is delay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,9 +180,6 @@ class Probe:
     """RMS of the motion that the answer does not explain, as a share of the motion."""
     alike: tuple[ActingLaw, ...] = ()
     """Other laws that explain the motion as well."""
-    clip: float | None = None
-    """Torque [N m] or command about the pose [rad] at which it is clipped below the effort limit;
-    None where no limit was met."""
     faults: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word for each, and a sentence."""
 
@@ -274,7 +278,7 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
     stable_share = bench.stable_share()
     clip = bench.clip(stable_share)
     if clip is not None:
-        bench.lower_amplitude(_CLEAR_OF_CLIP * clip.height)
+        bench.lower_amplitude(_CLEAR_OF_CLIP * clip.acting * clip.height)
     deadline = time.process_time() + _MOST_SECONDS
     answers: list[_Answer] = []
     shares = [stable_share]
@@ -364,7 +368,7 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
                 # Of larger gains than are set the effort limit is met earlier; it is no fault.
                 clip = None
     if clip is not None:
-        probe = replace(probe, clip=limit)
+        probe = replace(probe, law=replace(probe.law, clip=limit))
     return replace(probe, faults=_faults(probe, clip, simulator, robot, answer.runs))
 
 
@@ -381,7 +385,7 @@ class _Bench:
         effort_limit = min(drive.effort_limit, drive.stall_torque)
         self.amplitude = min(AMPLITUDE, 0.3 * effort_limit / self._joint.stiffness)
         """Amplitude of the commands [rad]."""
-        self._highest = min(_HIGHEST_STEP, 0.95 * effort_limit / self._joint.stiffness)
+        self._highest = min(_HIGHEST_STEP, 2.0 * effort_limit / self._joint.stiffness)
 
     def lower_amplitude(self, amplitude: float) -> None:
         """Take a smaller amplitude of the commands [rad], if it is smaller."""
@@ -396,18 +400,23 @@ class _Bench:
         Returns:
             The limit; None where there is none up to the effort limit.
         """
-        height = self._clipped_height(share)
-        if height is None:
+        clipped = self._clipped_height(share)
+        if clipped is None:
             return None
+        height, acting = clipped
         # A torque is clipped at twice the height with half the stiffness, a command at the same.
-        other_height = self._clipped_height(0.5 * share)
-        of_torque = other_height is None or other_height > 1.4 * height
-        return Clip(height=height, of_torque=of_torque)
+        other = self._clipped_height(0.5 * share)
+        of_torque = other is None or other[0] > 1.4 * height
+        return Clip(height=height, of_torque=of_torque, acting=acting)
 
-    def _clipped_height(self, share: float) -> float | None:
-        """Find the height of a step from which on the joint goes no further [rad].
+    def _clipped_height(self, share: float) -> tuple[float, float] | None:
+        """Find the height of a step from which on the joint goes no further.
 
         How far it comes in the first step is in proportion to the command that acts in it.
+
+        Returns:
+            The height [rad], and the share of its first step for which the command acts, about;
+            None where the joint always goes further.
         """
         heights = self._highest * np.geomspace(1e-3, 1.0, 24)
         length = _REST + 2 * _LONGEST_HOLD
@@ -424,17 +433,21 @@ class _Bench:
         # Gravity adds to the torque to one side and takes from it to the other.
         both_sides = 0.5 * (motion[: len(heights)] - motion[len(heights) :])
         reach = both_sides[:, first]
-        first_part = both_sides[len(heights) // 2, first : first + 2]
-        if first_part[1] > _SHORT_FIRST_STEP * first_part[0]:
+        after_one, after_two = both_sides[len(heights) // 2, first : first + 2]
+        acting = 1.0
+        if after_two > _SHORT_FIRST_STEP * after_one:
             # The delay leaves little of the first step; what the second one adds to the speed.
             reach = both_sides[:, first + 1] - 2.0 * reach
+        elif after_one > 0.0:
+            # Without damping after_two / after_one is 2 + 1 / acting; damping takes some of it.
+            acting = min(1.0, 1.0 / max(after_two / after_one - 2.0 + _DAMPED_SHARE, 1.0))
         slope = np.diff(reach) / np.diff(heights)
         steepest = int(slope.argmax())
         if slope[steepest] <= 0.0 or slope[-1] > _CLIPPED_SLOPE * slope[steepest]:
             return None
         # Where the line of the steepest part reaches the height of the end.
         height = heights[steepest] + (reach[-1] - reach[steepest]) / slope[steepest]
-        return float(height)
+        return float(height), acting
 
     def stable(self, share: float) -> bool:
         """Tell whether the joint stays near with a share of the gains.
@@ -817,7 +830,7 @@ def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
 def _screen_iterations(
     runs: _Runs,
     fits: list[_Fit],
-    kind: tuple[bool, bool],
+    variant: tuple[bool, bool],
     start: Array | None,
     delay: int,
     fixed: Sequence[str],
@@ -827,12 +840,12 @@ def _screen_iterations(
     Args:
         runs: The runs.
         fits: Fits of other laws.
-        kind: True if an explicit torque acts beside it, and if friction is soft.
+        variant: True if an explicit torque acts beside it, and if friction is soft.
         start: Values of `_PARAMETERS` to begin with; None to search a grid.
         delay: Whole steps of delay.
         fixed: Names of parameters that are not fitted.
     """
-    beside, soft = kind
+    beside, soft = variant
     by_iterations: dict[int, _Fit] = {}
 
     def fit_iterations(iterations: int, begin: Array | None) -> _Fit:
@@ -930,11 +943,11 @@ def _faults(
     law = probe.law.drive
     if clip is not None and clip.of_torque:
         faults["clipped"] = (
-            f"torque is clipped at {probe.clip:.2g} N m, the effort limit is "
+            f"torque is clipped at {probe.law.clip:.2g} N m, the effort limit is "
             f"{drive.effort_limit:g} N m; the joint was probed below it"
         )
     elif clip is not None:
-        faults["clipped"] = f"the command is clipped at {probe.clip:.3g} rad about the pose"
+        faults["clipped"] = f"the command is clipped at {probe.law.clip:.3g} rad about the pose"
     if probe.residual > _LARGE_RESIDUAL:
         faults["residual"] = (
             f"{100.0 * probe.residual:.1f} % of the motion is not explained: the joint follows "
