@@ -11,6 +11,7 @@ import json
 import os
 import select
 import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Annotated, Any
 
 import msgspec
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
@@ -31,7 +33,9 @@ from pronk.tables import Table
 _PIPED_WIDTH = 200
 """Characters of a line where standard output is not a terminal."""
 _LONG_TEXT = 24
-"""Characters of a cell from which on a column of text is set to the left."""
+"""Characters of a cell from which on a column of text is set to the left and may be folded."""
+_HEADING_WIDTH = 10
+"""Characters of a line of a heading at least."""
 _POLL_S = 0.2
 """Time between two looks at standard input while a person works at the rig [s]."""
 
@@ -121,14 +125,29 @@ def show(table: Table, *, wide: bool = False) -> None:
     if not wide:
         table = table.without_details()
     rich_table = RichTable(
-        title=Text(table.title), title_style="bold", header_style="bold", title_justify="left"
+        title=Text(table.title),
+        title_style="bold",
+        header_style="bold",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+        show_edge=False,
     )
     text_rows = table.text_rows()
     for index, column in enumerate(table.columns):
         is_name = index == 0
-        is_long = any(len(text_row[index]) > _LONG_TEXT for text_row in text_rows)
-        justify = "left" if is_name or is_long else "right"
-        rich_table.add_column(Text(column.title), justify=justify, overflow="fold")  # type: ignore[arg-type]
+        longest = max((len(text_row[index]) for text_row in text_rows), default=0)
+        is_long = longest > _LONG_TEXT
+        heading = textwrap.fill(column.heading, max(longest, _HEADING_WIDTH))
+        if column.unit:
+            heading += f"\n[{column.unit}]"
+        rich_table.add_column(
+            Text(heading),
+            justify="left" if is_name or is_long else "right",
+            overflow="fold",
+            no_wrap=not (is_name or is_long),
+        )
     for text_row in text_rows:
         rich_table.add_row(*map(Text, text_row))
     console = PipeConsole(highlight=False)

@@ -271,11 +271,11 @@ def show_match(
         Column(heading="joint"),
         Column(heading="matched"),
         Column(heading="Table I"),
-        Column(heading="grid cells apart"),
-        Column(heading="gain error nominal", unit="dB", digits=2),
+        Column(heading="grid cells apart", is_detail=True),
+        Column(heading="error nominal", unit="dB", digits=2),
         Column(heading="matched", unit="dB", digits=2),
-        Column(heading="fresh RMSE nominal", unit="rad", digits=4),
-        Column(heading="matched", unit="rad", digits=4),
+        Column(heading="fresh nominal", unit="rad", digits=4, is_detail=True),
+        Column(heading="matched", unit="rad", digits=4, is_detail=True),
     )
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
     console.show(Table(title=title, columns=columns, rows=tuple(rows)))

@@ -170,7 +170,7 @@ def match_command(
         console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
     if frameworks:
         comparison = tables.simulators_table(results, members)
-        console.show(comparison)
+        console.show(comparison, wide=wide)
         headings = [column.heading for column in comparison.columns]
         figures["frameworks"] = [dict(zip(headings, row, strict=True)) for row in comparison.rows]
     return console.Outcome(
@@ -263,11 +263,14 @@ def summary(result: MatchResult) -> dict[str, Any]:
     return result.summary() | {"gains": figures["joints"], "groups": figures["groups"]}
 
 
-def profiles() -> console.Outcome:
+def profiles(wide: bool = False) -> console.Outcome:
     """List the frameworks that gains can be matched for.
 
     Example:
-        pronk profiles
+        pronk profiles --wide
+
+    Args:
+        wide: Print every column: the actuators of each framework and the source as well.
     """
     from dataclasses import asdict
 
@@ -290,19 +293,20 @@ def profiles() -> console.Outcome:
         )
     columns = (
         Column(heading="name"),
-        Column(heading="framework"),
+        Column(heading="framework", is_detail=True),
         Column(heading="law"),
         Column(heading="step", unit="ms", digits=1),
         Column(heading="decimation"),
         Column(heading="delay"),
         Column(heading="friction"),
-        Column(heading="source"),
+        Column(heading="source", is_detail=True),
     )
     notes = (
         "law E: explicit; IF: implicit damping; In: implicit stiffness and damping, n iterations.",
         "Gains of one law do not give the same joint in another; see docs/evidence/simulators.md.",
     )
-    console.show(Table(title="Frameworks", columns=columns, rows=tuple(rows), notes=notes))
+    frameworks = Table(title="Frameworks", columns=columns, rows=tuple(rows), notes=notes)
+    console.show(frameworks, wide=wide)
     return console.Outcome(
         figures={"profiles": [asdict(profile) for profile in load_profiles().values()]}
     )

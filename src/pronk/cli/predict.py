@@ -28,6 +28,7 @@ def predict_logs(
     simulator: str = "mujoco",
     simulator_python: Path | None = None,
     allow_unmatched: bool = False,
+    wide: bool = False,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Replay logs in the simulator with nominal and with matched gains; RMSE and R² per joint.
@@ -44,6 +45,7 @@ def predict_logs(
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         allow_unmatched: Also replay joints whose gains are no match.
+        wide: Print every column: signal, R² and nominal gains with the delay as well.
         reading: How logs are read.
     """
     from pronk.identify.match.export.actuators import robot_of
@@ -85,7 +87,7 @@ def predict_logs(
             done((index + 1) / len(logs))
 
     virtual = any(log.virtual for log in logs)
-    console.show(prediction_table(rows, virtual=virtual))
+    console.show(prediction_table(rows, virtual=virtual), wide=wide)
     for source in fitted_logs:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for name, reasons in matched_gains.unmatched.items():
@@ -122,12 +124,12 @@ def prediction_rows(joints: Iterable[JointPrediction]) -> list[dict[str, Any]]:
 
 PREDICTION_COLUMNS = {
     "joint": Column(heading="joint"),
-    "signal": Column(heading="signal"),
+    "signal": Column(heading="signal", is_detail=True),
     "unit": Column(heading="unit"),
     "rmse_nominal": Column(heading="RMSE nominal", digits=4),
-    "rmse_nominal_delayed": Column(heading="nominal with the delay", digits=4),
+    "rmse_nominal_delayed": Column(heading="nominal with the delay", digits=4, is_detail=True),
     "rmse_matched": Column(heading="RMSE matched", digits=4),
-    "r2_nominal": Column(heading="R² nominal"),
+    "r2_nominal": Column(heading="R² nominal", is_detail=True),
     "r2_matched": Column(heading="R² matched"),
 }
 """Columns of the table, by the figures of `prediction_rows`."""

@@ -30,6 +30,7 @@ def response(
     robot: str | None = None,
     out: Path | None = None,
     plots: bool = True,
+    wide: bool = False,
     segment_s: float | None = None,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
@@ -43,6 +44,7 @@ def response(
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the log's if left out.
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
+        wide: Print every column: repeats, lowest coherence, third harmonic.
         segment_s: Length of the segments of a response in s, whose inverse is the spacing of its
             frequencies; 8, or less for shorter excitations, if left out.
         reading: How logs are read.
@@ -82,7 +84,7 @@ def response(
                 if resolution:
                     notes.append(f"{source.name}: {resolution}")
             progress(count / len(logs))
-    console.show(response_table(rows))
+    console.show(response_table(rows), wide=wide)
     for note in notes:
         console.say(f"note: {note}")
     robot_name = robot or logs[0].robot
@@ -190,14 +192,15 @@ def response_table(rows: Sequence[Mapping[str, Any]]) -> Table:
         columns=(
             Column(heading="joint"),
             Column(heading="amplitude", unit="rad"),
-            Column(heading="repeats"),
-            Column(heading=f"coherence >= {COHERENT}", unit="Hz", digits=1),
-            Column(heading="lowest coherence"),
+            Column(heading="repeats", is_detail=True),
+            Column(heading="coherent", unit="Hz", digits=1),
+            Column(heading="lowest coherence", is_detail=True),
             Column(heading="peak", unit="dB", digits=2),
             Column(heading="at", unit="Hz", digits=2),
             Column(heading="-3 dB at", unit="Hz", digits=2),
-            Column(heading="command delay", unit="s", digits=4),
-            Column(heading="third harmonic", digits=4),
+            Column(heading="delay", unit="s", digits=4),
+            Column(heading="third harmonic", digits=4, is_detail=True),
         ),
         rows=tuple(cells),
+        notes=(f"coherent: frequencies with a coherence of {COHERENT} or more.",),
     )

@@ -17,10 +17,10 @@ COLUMNS = (
     Column(heading="joint"),
     Column(heading="group"),
     Column(heading="range", unit="rad", digits=2),
-    Column(heading="default", unit="rad", digits=2),
-    Column(heading="effort limit", unit="N m"),
-    Column(heading="chain"),
-    Column(heading="clamped"),
+    Column(heading="pose", unit="rad", digits=2),
+    Column(heading="effort limit", unit="N m", digits=1),
+    Column(heading="chain", is_detail=True),
+    Column(heading="clamped", is_detail=True),
 )
 
 
@@ -29,6 +29,7 @@ def robot(
     path: tyro.conf.Positional[Path],
     out: Path | None = None,
     overwrite: bool = False,
+    wide: bool = False,
 ) -> None:
     """Write a filled-in robot.yaml for an MJCF or URDF, or check a robot.
 
@@ -40,11 +41,12 @@ def robot(
         path: MJCF or URDF for new; robot.yaml, its folder, or a model for check.
         out: The file to write; robot.yaml beside the model if left out.
         overwrite: Replace a file that exists.
+        wide: check: print every column, with the joints that move together or are clamped.
     """
     if action == "new":
         _write_robot(path, out or path.with_name("robot.yaml"), overwrite=overwrite)
     else:
-        _check_robot(path)
+        _check_robot(path, wide=wide)
 
 
 def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
@@ -78,7 +80,7 @@ def _held_sentence(names: tuple[str, ...]) -> str:
     return f"held at the pose, as they are no hinges or have no drive: {', '.join(names)}"
 
 
-def _check_robot(path: Path) -> None:
+def _check_robot(path: Path, *, wide: bool) -> None:
     """Print the joints of a robot, and what is missing or inconsistent."""
     from pronk.robots import load_robot
     from pronk.robots.consistency import problems_of
@@ -100,7 +102,7 @@ def _check_robot(path: Path) -> None:
         rows.append(row)
     problems = problems_of(robot_spec)
     title = f"{robot_spec.name}: {len(robot_spec.joints)} joints"
-    console.show(Table(title=title, columns=COLUMNS, rows=tuple(rows)))
+    console.show(Table(title=title, columns=COLUMNS, rows=tuple(rows)), wide=wide)
     if robot_spec.held_joints:
         console.say(_held_sentence(robot_spec.held_joints))
     for problem in problems:

@@ -39,6 +39,7 @@ def sweep(
     repeats: int = 3,
     plan_only: bool = False,
     overwrite: bool = False,
+    wide: bool = False,
 ) -> console.Outcome:
     """Excite every joint: plan, check against the limits, excite, record.
 
@@ -55,6 +56,7 @@ def sweep(
         repeats: Times each amplitude is repeated.
         plan_only: Show what it would do to the robot and leave.
         overwrite: Replace logs that exist.
+        wide: Print every column of the plan: limits of the positions, power and current as well.
     """
     from pronk.deploy.bench.virtual_sweep import sweep_virtual
     from pronk.deploy.links.address import SIM
@@ -84,7 +86,7 @@ def sweep(
             repeats=repeats,
         )
         report("forecast", 1.0)
-    console.show(plan_table(plan))
+    console.show(plan_table(plan), wide=wide)
     plan.check()
     figures: dict[str, Any] = {
         "robot": spec.name,
@@ -211,15 +213,15 @@ def plan_table(plan: SweepPlan) -> Table:
             Column(heading="joint"),
             Column(heading="amplitude", unit="rad"),
             Column(heading="lowest", unit="rad", digits=2),
-            Column(heading="of", digits=2),
+            Column(heading="of", digits=2, is_detail=True),
             Column(heading="highest", unit="rad", digits=2),
-            Column(heading="of", digits=2),
+            Column(heading="of", digits=2, is_detail=True),
             Column(heading="speed", unit="rad/s", digits=1),
-            Column(heading="of no-load", digits=1),
+            Column(heading="of", digits=1),
             Column(heading="torque", unit="N m", digits=1),
-            Column(heading="of limit", digits=1),
-            Column(heading="power", unit="W", digits=0),
-            Column(heading="bus", unit="A", digits=1),
+            Column(heading="of", digits=1),
+            Column(heading="power", unit="W", digits=0, is_detail=True),
+            Column(heading="bus", unit="A", digits=1, is_detail=True),
         ),
         rows=tuple(rows),
     )

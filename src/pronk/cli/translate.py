@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 COLUMNS = (
     Column(heading="framework"),
-    Column(heading="law"),
-    Column(heading="step", unit="ms", digits=1),
+    Column(heading="law", is_detail=True),
+    Column(heading="step", unit="ms", digits=1, is_detail=True),
     Column(heading="group"),
     Column(heading="stiffness", unit="N m/rad"),
     Column(heading="damping", unit="N m s/rad"),
-    Column(heading="untranslated", unit="dB"),
-    Column(heading="translated", unit="dB"),
-    Column(heading="responds earlier", unit="ms", digits=2),
-    Column(heading="left early", unit="ms", digits=2),
+    Column(heading="before", unit="dB", digits=2),
+    Column(heading="after", unit="dB", digits=2),
+    Column(heading="responds earlier", unit="ms", digits=2, is_detail=True),
+    Column(heading="left early", unit="ms", digits=2, is_detail=True),
 )
 
 
@@ -42,6 +42,7 @@ def translate_gains(
     drive_gains: tuple[str, ...] = (),
     out: Path = Path("translated.yaml"),
     allow_unmatched: bool = False,
+    wide: bool = False,
 ) -> console.Outcome:
     """Translate gains for a framework of another drive law, in which the joints respond alike.
 
@@ -58,6 +59,7 @@ def translate_gains(
             GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         out: The gains file to write.
         allow_unmatched: Also translate joints that are no match; they stay marked.
+        wide: Print every column: law, step and times as well.
     """
     from pronk.identify.match.export.actuators import profile_held
     from pronk.identify.match.gains import require_matched, save_gains
@@ -102,12 +104,12 @@ def translate_gains(
         columns=COLUMNS,
         rows=tuple(rows),
         notes=(
-            "Means of each group. dB: RMS of the magnitude in the band over that of "
+            "Means of each group. before, after: RMS of the magnitude in the band over that of "
             f"{first_profile.name}, {law}.",
             "What responds earlier is added to the delay of the gains file.",
         ),
     )
-    console.show(table)
+    console.show(table, wide=wide)
     return console.Outcome(
         figures={"translated": figures},
         wrote=wrote,

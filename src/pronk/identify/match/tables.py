@@ -320,9 +320,9 @@ def simulators_table(
         Column(heading="stiffness", unit="N m/rad"),
         Column(heading="damping", unit="N m s/rad"),
         Column(heading="friction", unit="N m"),
-        Column(heading="delay", unit="s", digits=4),
-        Column(heading="error", unit="dB"),
-        Column(heading="flagged"),
+        Column(heading="delay", unit="s", digits=4, is_detail=True),
+        Column(heading="error", unit="dB", digits=2),
+        Column(heading="flagged", is_detail=True),
     )
     title = "The same joints in every framework, means of each group"
     return Table(title=title, columns=columns, rows=tuple(rows))
