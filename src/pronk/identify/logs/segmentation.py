@@ -3,8 +3,9 @@
 A command rests where it stands still for `REST_S`; between two rests of a joint lies a motion. A
 motion from one end of the command's travel to the other, while nothing else moves, is a change of
 pose; every other motion is an excitation. The excitations of a joint are separate segments where
-they are one signal, repeated or scaled; otherwise they count as one excitation. The segments of
-joints that are excited one after another do not overlap.
+they are one signal, repeated or scaled, and long enough: eight seconds, or two if the command
+returns to where it began and rests for half a second. Otherwise they count as one excitation. The
+segments of joints that are excited one after another do not overlap.
 """
 
 from __future__ import annotations
@@ -27,8 +28,16 @@ SHORTEST_S = 8.0
 excitation ends at rest."""
 _SHORTEST_IN_MOTION_S = 12.0
 """Shortest excitation that does not end at rest: two windows that overlap by half [s]."""
+_SHORTEST_REPEAT_S = 2.0
+"""Shortest excitation that has a segment of its own where the command returns to where it began and
+rests before the next: it has segments of a second [s]."""
+_REPEAT_REST_S = 0.5
+"""Rest between such excitations [s]: a joint of 2 Hz and a damping ratio of a half has settled to
+5 % by then."""
 _TAIL_S = 0.2
 """Time after an excitation that counts as a rest at its end [s]."""
+_SAMPLE_SLACK_S = 0.02
+"""Time by which a rest may be shorter by the samples at its ends [s]: one at 50 Hz."""
 _ROUNDING = 1e-6
 """Share of a command's travel below which a change of it is rounding."""
 _POSE_SLACK = 0.05
@@ -213,8 +222,15 @@ def _are_repeats(
         for later in motions:
             if later.begin >= motion.end:
                 next_motion = min(next_motion, later.begin)
-        ends_at_rest = time[next_motion] - time[motion.end] >= _TAIL_S
-        shortest = SHORTEST_S if ends_at_rest else _SHORTEST_IN_MOTION_S
+        rest_s = time[next_motion] - time[motion.end]
+        values = motion.values(command)
+        returns = abs(values[-1] - values[0]) <= _POSE_SLACK * np.ptp(values)
+        is_last = motion.end == max(repeat.end for repeat in repeats)
+        shortest = _SHORTEST_IN_MOTION_S
+        if rest_s >= _TAIL_S:
+            shortest = SHORTEST_S
+        if returns and rest_s >= (_TAIL_S if is_last else _REPEAT_REST_S - _SAMPLE_SLACK_S):
+            shortest = _SHORTEST_REPEAT_S
         if time[motion.end] - time[motion.begin] < shortest:
             return False
         if not _same_signal(time, command, repeats[0], motion):
