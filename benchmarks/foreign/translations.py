@@ -30,7 +30,7 @@ from pronk.identify.simulators.profiles import profile
 from pronk.identify.simulators.stability import stability_share
 from pronk.robots import load_robot
 from pronk.robots.bare import yaml_of_model
-from pronk.robots.model import bench_spec
+from pronk.robots.model import bench_inertia, bench_spec
 from pronk.robots.robot import RobotSpec
 from tests.synthetic_log import Excitation, synthetic_log
 
@@ -57,6 +57,8 @@ FRICTION_SHARES = (0.0, 0.5, 0.98)
 share stick just below what gravity asks of them."""
 MOST_FRICTION = 0.05
 """Largest dry friction of the excited joint over stiffness times amplitude."""
+LEAST_RATIO = 0.3
+"""Least damping ratio of the drives: some models have none, and ring."""
 NOISE_RAD = 1e-6
 """Standard deviation of the noise [rad]: the checks of a match want some."""
 LENGTH_S = 12.0
@@ -107,6 +109,8 @@ def _compared(seed: int, number: int, robot: RobotSpec, joint: str) -> Row:
     amplitude = rng.uniform(*AMPLITUDES)
     amplitude = min(amplitude, SHARE_OF_RANGE * (high - low))
     amplitude = min(amplitude, SHARE_OF_LIMIT * excited.drive.effort_limit / excited.stiffness)
+    robot = _with_damping(robot)
+    excited = robot.joint(joint)
     robot = _with_friction(robot, joint, amplitude, FRICTION_SHARES[number % len(FRICTION_SHARES)])
     begin, target = _frameworks(rng, robot)
     pairs = {member.name: (member.stiffness, member.damping) for member in robot.joints}
@@ -153,6 +157,16 @@ class _Drive:
         self.stiffness = joint.stiffness
         self.damping = joint.damping
         self.armature = joint.drive.armature
+
+
+def _with_damping(robot: RobotSpec) -> RobotSpec:
+    """Return a robot whose drives have a damping ratio of `LEAST_RATIO` or more."""
+    joints = []
+    for joint in robot.joints:
+        inertia, _ = bench_inertia(robot, joint.name)
+        least = 2.0 * LEAST_RATIO * float(np.sqrt(joint.stiffness * inertia))
+        joints.append(replace(joint, damping=max(joint.damping, least)))
+    return replace(robot, joints=tuple(joints))
 
 
 def _with_friction(robot: RobotSpec, joint: str, amplitude: float, share: float) -> RobotSpec:

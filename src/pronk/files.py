@@ -230,6 +230,26 @@ def locked_folder(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+def require_place(path: Path) -> None:
+    """Refuse a file that cannot be written where it is named, before work is done for it.
+
+    Args:
+        path: The file; its folder is made when it is written.
+
+    Raises:
+        PronkError: It is a folder, lies below a file, or its folder cannot be written to.
+    """
+    if path.is_dir():
+        raise PronkError(f"{path} is a folder; give the name of a file.")
+    folder = path.resolve().parent
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise PronkError(f"{path}: {folder} is a file, not a folder; give another path.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PronkError(f"{path}: {folder} cannot be written to; give another folder.")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text to a file, whole or not at all."""
     with written_whole(path) as temporary:

@@ -52,6 +52,7 @@ def demo(
         repeats: Repeats of the matched amplitude.
         seed: Seed of the virtual robot's noise.
     """
+    from pronk.files import require_place
     from pronk.jump.trial import tables
     from pronk.report import figures, style
     from pronk.report.build import write_report
@@ -59,6 +60,7 @@ def demo(
 
     if jumps < 1:
         raise PronkError(f"--jumps {jumps}; expected 1 or more.")
+    require_place(out / "gains.yaml")
     console.say(
         "All results below are of pronk's virtual robot, a simulated stand-in for the Mini "
         "Cheetah whose parameters the match cannot read."

@@ -69,12 +69,18 @@ def deploy_command(
         ScriptedOperator,
         TimeLimit,
     )
+    from pronk.files import require_place
     from pronk.policy.runtime import load_policy
 
     contract = load_policy(policy).contract
     address = machine.address(base)
     if capture is not None and (address.scheme != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
+    if seconds is not None and not seconds > 0.0:
+        raise HardwareError(f"--seconds {seconds:g}; expected a time above 0 s.")
+    for path in (log, capture):
+        if path is not None:
+            require_place(path)
     plan = RunPlan(
         link=Link(robot=robot or contract.robot, address=address, release=machine.release),
         policy=policy,

@@ -79,6 +79,7 @@ def simulate(
     from pronk.deploy.bench.server import RobotServer, Watchdog
     from pronk.deploy.links.address import Address
     from pronk.deploy.links.realtime import Interrupts, RealTimeSettings, enter
+    from pronk.files import require_place
     from pronk.jump.virtual.capture import save_capture
     from pronk.jump.virtual.robot import VirtualRobot, hold_of
     from pronk.jump.virtual.sim_params import load_sim_params
@@ -86,6 +87,10 @@ def simulate(
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
+    if duration is not None and not duration > 0.0:
+        raise HardwareError(f"--duration {duration:g}; expected a time above 0 s.")
+    if capture is not None:
+        require_place(capture)
     robot_spec = load_robot(robot)
     link_faults = parse_faults(faults)
     watchdog = Watchdog(silence=silence, silence_after=silence_after)

@@ -74,7 +74,7 @@ def translate_gains(
     first_profile = profile_held(first)
     names = _framework_names(to)
     rows: list[tuple[Cell, ...]] = []
-    wrote = []
+    written: dict[Path, MatchedGains] = {}
     figures: dict[str, dict[str, Any]] = {}
     for name in names:
         target_profile = profile(name)
@@ -82,8 +82,7 @@ def translate_gains(
             first, robot_spec, target_profile, allow_unmatched=allow_unmatched
         )
         path = out if len(names) == 1 else out.parent / name / out.name
-        save_gains(path, translated)
-        wrote.append(path)
+        written[path] = translated
         figures[name] = {}
         for joint, translation in translations.items():
             figures[name][joint] = asdict(translation)
@@ -97,6 +96,11 @@ def translate_gains(
             for flag in joint_gains.flags:
                 console.warn(f"{name}, {joint}: {flag}.")
         _warn_of_friction(name, first_profile, target_profile)
+
+    # Nothing is written where one of several frameworks is refused.
+    for path, translated in written.items():
+        save_gains(path, translated)
+    wrote = list(written)
 
     law = f"law {first_profile.drive_law.label} at {1000.0 * first_profile.timestep_s:g} ms"
     table = Table(

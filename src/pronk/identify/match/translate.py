@@ -40,6 +40,8 @@ LOW_HZ = 1.0
 """Lowest frequency compared [Hz]: below it a joint follows its command in every drive law."""
 DELAY_SCALE_S = 0.01
 """Unit of the delay in the search with phase [s]."""
+LEAST_DAMPING_S = 1e-6
+"""Least damping in the search, over the stiffness [s]: no joint responds otherwise at 0."""
 POINTS = 60
 """Frequencies compared, evenly spaced."""
 NOT_ALIKE_DB = 0.5
@@ -75,10 +77,17 @@ class JointTranslation:
     delay. Laws that can be alike give the same gains as `after`."""
 
     @property
+    def scales(self) -> Pair:
+        """Translated stiffness and damping over those before; 1 for a damping that was 0."""
+        damping_scale = self.after[1] / self.before[1] if self.before[1] else 1.0
+        return self.after[0] / self.before[0], damping_scale
+
+    @property
     def criteria_spread(self) -> float:
         """Largest relative difference between `after` and `with_phase`."""
-        differences = np.divide(self.with_phase, self.after) - 1.0
-        return float(np.abs(differences).max())
+        stiffness_spread = abs(self.with_phase[0] / self.after[0] - 1.0)
+        damping_difference = abs(self.with_phase[1] - self.after[1])
+        return max(stiffness_spread, damping_difference / max(self.after[1], 1e-300))
 
 
 def translate(
@@ -164,10 +173,13 @@ def translated(
             response = other.response(stiffness, damping)[0]
             return np.asarray(DB * np.log(np.abs(response / goal)))
 
-    start = np.log(np.maximum(gains, 1e-6))
+    # Damping 0 has no logarithm.
+    start = np.log([gains[0], max(gains[1], LEAST_DAMPING_S * gains[0])])
     solution = least_squares(error_db, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
     stiffness = float(np.exp(solution.x[0]))
     damping = float(np.exp(solution.x[1]))
+    if damping < LEAST_DAMPING_S * stiffness:
+        damping = 0.0
 
     def complex_error(point: Array) -> Array:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -178,6 +190,8 @@ def translated(
 
     phase_solution = least_squares(complex_error, np.append(solution.x, 0.0), x_scale=0.1)
     with_phase = np.exp(phase_solution.x[:2])
+    if with_phase[1] < LEAST_DAMPING_S * with_phase[0]:
+        with_phase[1] = 0.0
     phase = np.unwrap(np.angle(other.response(stiffness, damping)[0] / goal))
     # Slope of a straight line through zero by least squares.
     lead_s = float(phase @ first.omega / (first.omega @ first.omega))
@@ -251,11 +265,15 @@ def _translated_joint(joint: JointGains, translation: JointTranslation, begin: s
 
     Intervals are scaled as their gain is, the dry friction as the stiffness is.
     """
-    stiffness_scale = translation.after[0] / translation.before[0]
-    damping_scale = translation.after[1] / translation.before[1]
+    stiffness_scale, damping_scale = translation.scales
     flags = [flag for flag in joint.flags if not flag.startswith((NOT_ALIKE, NOT_UNIQUE))]
     if translation.after_db > NOT_ALIKE_DB:
         flags.append(f"{NOT_ALIKE}: {translation.after_db:.2f} dB from {begin}")
+    elif translation.after[1] == 0.0:
+        flags.append(
+            f"{NOT_ALIKE}: the drive law damps the joint as much as that of {begin} or more, so "
+            "that the damping is 0"
+        )
     elif translation.criteria_spread > CRITERIA_SPREAD_MAX:
         stiffness_with_phase, damping_with_phase = translation.with_phase
         flags.append(
@@ -281,7 +299,7 @@ def _translated_group(
     group: GroupGains, translations: list[JointTranslation], frictions: list[float]
 ) -> GroupGains:
     """Return the training gains of a group, scaled by the mean of its joints."""
-    scales = [np.divide(joint.after, joint.before) for joint in translations]
+    scales = [joint.scales for joint in translations]
     stiffness_scale, damping_scale = np.mean(scales, axis=0).tolist()
     center = group.ellipsoid_center
     return GroupGains(
