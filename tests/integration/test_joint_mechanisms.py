@@ -156,13 +156,30 @@ def test_what_a_fit_leaves_unexplained_is_said_without_a_cause(tmp_path: Path) -
     mechanisms = [
         with_fault(joint, "velocity feed-forward", 0.9),
         with_fault(joint, "backlash", 0.9),
-        with_fault(joint, "stribeck", 0.9),
     ]
     for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
         warnings = [flag for flag in gains.flags if "So would look" in flag]
         assert len(warnings) == 1, mechanism
         assert "friction" in warnings[0]
         assert "backlash" in warnings[0]
+
+
+def test_intervals_hold_the_gains_where_the_motion_is_not_all_explained(tmp_path: Path) -> None:
+    (joint,) = drawn(17, ("",))
+    mechanisms = [
+        with_fault(joint, "backlash", 0.3),
+        with_fault(joint, "stribeck", 0.9),
+        with_fault(joint, "dead band", 0.5),
+        with_fault(joint, "integral", 0.1),
+    ]
+    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+        warned = any("So would look" in flag for flag in gains.flags)
+        inside = []
+        fitted_gains = (gains.stiffness, gains.damping)
+        for fitted, true in zip(fitted_gains, equivalent_gains(joint), strict=True):
+            low, high = fitted.total95
+            inside.append(low <= true <= high)
+        assert warned or all(inside), mechanism
 
 
 def test_a_late_command_column_is_named_where_the_rest_is_explained(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ from pronk.identify.match.uncertainty import (
     jackknife,
     repeat_moves,
     total_intervals,
+    widen_by_misfit,
 )
 from pronk.identify.simulators.chain import DriveValues, published
 from pronk.robots.robot import RobotSpec
@@ -608,6 +609,8 @@ def _total95(
         moves[:, columns],
         by_amplitude,
     )
+    misfit = residuals.misfit(best.residual, joint) / float(np.max(residuals.amplitude))
+    intervals = widen_by_misfit(intervals, joint_estimate.values, misfit)
     if "delay" in intervals:
         low, high = intervals["delay"]
         earlier, later = residuals.replay.uncertain_s

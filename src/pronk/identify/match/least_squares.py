@@ -204,6 +204,20 @@ class Residuals:
         squares = float(np.sum(residual[rows] ** 2))
         return float(np.sqrt(squares / np.sum(self.weight[rows] ** 2)))
 
+    def misfit(self, residual: Array, joint: str) -> float:
+        """Root mean square difference of a joint without its noise, weighted as `rmse` [rad].
+
+        Noise of two samples is independent, so that products of neighbouring differences have
+        none of it: `sqrt(mean(r_i r_(i+1)))`.
+        """
+        rows = self.rows(joint)
+        of_joint = residual[rows]
+        weight = self.weight[rows]
+        neighbours = self.recording[rows][1:] == self.recording[rows][:-1]
+        products = float(np.sum((of_joint[1:] * of_joint[:-1])[neighbours]))
+        weights = float(np.sum((weight[1:] * weight[:-1])[neighbours]))
+        return float(np.sqrt(max(products, 0.0) / weights)) if weights > 0.0 else 0.0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Optimum:
