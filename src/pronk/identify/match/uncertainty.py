@@ -268,14 +268,17 @@ def widen_by_step(
     return _widened_gains(total95, values, max(STEP_SHARE * step_share, LEAST_SHARE))
 
 
-HONEST_MISFIT = 0.007
-"""Unexplained motion, as a share of the amplitude, that widens no interval: 50 of 60 honest joints
-of `tests/joint_mechanisms.py` (seed 4101) leave less than 0.006, and the virtual robot 0.008."""
-MISFIT_FACTOR = 8.0
-"""Largest relative error of a gain over the unexplained share of the motion. Of 42 joints with the
-faults of `tests/joint_mechanisms.py` (seed 4102) it is 4 to 8 for backlash, an integral part,
-filters of the position and Stribeck friction, and 2 for a dead band. A lag of torque or command has
-up to 30, which no record of one joint tells from other gains."""
+HONEST_MISFIT = 0.008
+"""Unexplained motion, as a share of the amplitude, that widens no interval: 54 of 60 honest joints
+of `tests/joint_mechanisms.py` (seed 4101) leave less than 0.010 and half of them less than 0.003,
+the virtual robot 0.008."""
+MISFIT_FACTOR = 13.0
+"""Relative error of a gain over the unexplained share of the motion. For 42 joints with the faults
+of `tests/joint_mechanisms.py` (seed 4102) it is 4 to 8 for backlash, an integral part, filters of
+the position and Stribeck friction, and 2 for a dead band. Of 26 logs with such faults of the
+benchmark `foreign` (seed 41), matched with gains that are off by 15 % or more, the intervals then
+hold the gains of 11, and without it of none. A lag of the torque or of the command, friction that
+grows with the load and a payload look as other gains do, and leave less unexplained."""
 
 
 def widen_by_misfit(
