@@ -63,6 +63,8 @@ _CLEAR = 0.7
 """The best law is clear if its residual is less than this share of the next one's."""
 _LARGE_RESIDUAL = 0.01
 """Share of the motion that a right answer leaves unexplained at most."""
+_DIVERGED = 1e9
+"""Position, or its change with a parameter, from which on a simulation has diverged."""
 _NO_DAMPING = 1e-3
 """Damping that acts over the one that is set below which there is none."""
 _DELAY_SHOWS = 0.05
@@ -75,7 +77,7 @@ _EXACT_RESIDUAL = 1e-6
 """Residual of a law that is certainly right: no other is tried."""
 _STALE_STEPS = (1, 2, 3, 4)
 """Ages of the position in the torque that are tried [steps]."""
-_MOST_SECONDS = 18.0
+_MOST_SECONDS = 12.0
 """Time of the processor after which no further law is tried [s]."""
 _HIGHEST_STEP = 3.0
 """Highest step of the command with which a limit of the torque is looked for [rad]."""
@@ -649,8 +651,8 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
     return positions.transpose(1, 0, 2)
 
 
-class _OutOfTimeError(Exception):
-    """The time for the fits is over."""
+class _FitEndError(Exception):
+    """A fit ends before it has converged: its time is over, or its simulation diverges."""
 
 
 def _fit_law(
@@ -691,7 +693,7 @@ def _fit_law(
                 least_square = square
                 best_values = values.copy()
             if runs.late:
-                raise _OutOfTimeError
+                raise _FitEndError
         return latest[key]
 
     def residuals(values: Array) -> Array:
@@ -699,11 +701,14 @@ def _fit_law(
 
     def jacobian(values: Array) -> Array:
         positions = positions_at(values)
-        return np.asarray((positions[1:] - positions[0]).T / step)
+        differences = np.asarray((positions[1:] - positions[0]).T / step)
+        if not np.abs(differences).max() < _DIVERGED:
+            raise _FitEndError
+        return differences
 
     with np.errstate(all="ignore"):
         try:
-            if not np.isfinite(positions_at(start[free])).all():
+            if not np.abs(positions_at(start[free])).max() < _DIVERGED:
                 return _Fit(law=law, theta=start, residual=np.inf)
             least_squares(
                 residuals,
@@ -716,8 +721,8 @@ def _fit_law(
                 gtol=None,
                 max_nfev=evaluations,
             )
-        except _OutOfTimeError:
-            # The best values until then.
+        except (_FitEndError, np.linalg.LinAlgError, ValueError):
+            # The best values until then; SciPy's decompositions refuse numbers that overflow.
             pass
     theta = start.copy()
     theta[free] = best_values
