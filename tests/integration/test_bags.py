@@ -19,6 +19,7 @@ from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import find_logs, read_log
 from pronk.identify.logs.unitree import DEFINITIONS, QUADRUPED_JOINTS
 from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
 from ros_bags import CONTROLLER_STATE, START_NS, Build, Builder, Message, write_bag
 
 GO2 = load_robot("go2")
@@ -301,6 +302,7 @@ def unitree(
     torque: Sequence[float] = (0.0,) * COUNT,
     passive: Sequence[int] = (),
     moving: int = 5,
+    mode_pr: int = 0,
 ) -> Build:
     """Motors of Unitree's, one of which follows the chirp; the others of the message idle."""
 
@@ -335,7 +337,8 @@ def unitree(
                     )
                 )
             command = zeros(builder, f"{package}/msg/LowCmd", motor_cmd=commands)
-            state = zeros(builder, f"{package}/msg/LowState", motor_state=states)
+            modes = {} if package == "unitree_go" else {"mode_pr": mode_pr}
+            state = zeros(builder, f"{package}/msg/LowState", motor_state=states, **modes)
             messages.append(("/lowcmd", f"{package}/msg/LowCmd", nano(k), command))
             messages.append(("/lowstate", f"{package}/msg/LowState", nano(k) + 1000, state))
         return messages
@@ -406,6 +409,73 @@ def test_humanoids_need_an_order_where_it_is_not_known(tmp_path: Path) -> None:
     log = read(path, joint_order=order)
     assert log.joints == tuple(order.split(","))
     np.testing.assert_allclose(log.command[:, 5], CHIRP, atol=1e-7)
+
+
+G1_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+G1_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
+G1_WRIST = ("wrist_pitch", "wrist_yaw")
+G1_MOTORS = {
+    "left_hip_pitch_joint": 0,
+    "left_knee_joint": 3,
+    "right_hip_yaw_joint": 8,
+    "right_ankle_roll_joint": 11,
+    "waist_yaw_joint": 12,
+    "left_shoulder_pitch_joint": 15,
+    "left_elbow_joint": 18,
+    "right_shoulder_roll_joint": 23,
+    "right_wrist_roll_joint": 26,
+}
+"""Numbers of motors in the enumeration G1JointIndex of unitree_sdk2, for 23 and for 29 joints."""
+
+
+def humanoid(folder: Path, *, whole: bool) -> RobotSpec:
+    """A robot with the joints of a G1 of 29 or of 23 joints, in an order of its own."""
+    names = ["waist_yaw_joint"]
+    if whole:
+        names += ["waist_roll_joint", "waist_pitch_joint"]
+    for side in ("right", "left"):
+        for part in (*G1_ARM, *(G1_WRIST if whole else ()), *G1_LEG):
+            names.append(f"{side}_{part}_joint")
+    bodies = ""
+    servos = ""
+    for name in names:
+        bodies += (
+            f'<body name="{name}_link"><joint name="{name}" range="-2 2" armature=".01"/>'
+            '<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2"/></body>'
+        )
+        servos += f'<position joint="{name}" kp="40" kv="1" forcerange="-50 50"/>'
+    path = folder / f"humanoid{len(names)}.xml"
+    path.write_text(
+        '<mujoco model="g1"><compiler angle="radian"/><worldbody><body name="pelvis" pos="0 0 1">'
+        f'<geom size=".1"/>{bodies}</body></worldbody><actuator>{servos}</actuator></mujoco>'
+    )
+    return load_robot(path)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("joint", G1_MOTORS)
+def test_motors_of_a_g1_have_the_numbers_of_unitree(
+    tmp_path: Path, joint: str, whole: bool
+) -> None:
+    number = G1_MOTORS[joint]
+    build = unitree("unitree_hg", motors=29, moving=number)
+    path = write_bag(tmp_path / "bag", build, definitions=DEFINITIONS)
+    log = read(path, humanoid(tmp_path, whole=whole))
+    assert log.excited_joints == (joint,)
+    np.testing.assert_allclose(log.command[:, log.column(joint)], CHIRP, atol=1e-7)
+    for other, motor in G1_MOTORS.items():
+        if other != joint:
+            resting = log.position[:, log.column(other)]
+            np.testing.assert_allclose(resting, 0.1 + 0.01 * motor, atol=1e-7)
+
+
+def test_linkages_of_a_g1_are_not_taken_for_its_joints(tmp_path: Path) -> None:
+    build = unitree("unitree_hg", motors=29, moving=4, mode_pr=1)
+    path = write_bag(tmp_path / "bag", build, definitions=DEFINITIONS)
+    with pytest.raises(LogError, match="mode_pr"):
+        read(path, humanoid(tmp_path, whole=True))
+    order = ",".join(f"m{k}" for k in range(29))
+    assert read(path, joint_order=order).excited_joints == ("m4",)
 
 
 # --- Hostile and damaged files --------------------------------------------------------------------

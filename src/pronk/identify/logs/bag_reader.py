@@ -34,7 +34,7 @@ from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record, Wanted
 from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
 from pronk.identify.logs.segmentation import MOVED_RAD
-from pronk.identify.logs.unitree import COMMAND_TYPES, STATE_TYPES, motor_joints
+from pronk.identify.logs.unitree import COMMAND_TYPES, PARALLEL_MODE, STATE_TYPES, motor_joints
 from pronk.robots.robot import RobotSpec
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -391,11 +391,20 @@ def _joints_of_motors(
     if topics.measured_type not in STATE_TYPES and topics.command_type not in COMMAND_TYPES:
         return ()
     used_motors = 0
+    in_parallel = False
     if topics.measured_type in STATE_TYPES:
         for record in records[:: max(1, len(records) // 50)]:
-            for index, motor in enumerate(_motors(decoder.decode(record))):
+            state = decoder.decode(record)
+            in_parallel |= int(getattr(state, "mode_pr", 0)) == PARALLEL_MODE
+            for index, motor in enumerate(_motors(state)):
                 if float(motor.q) != 0.0:
                     used_motors = max(used_motors, index + 1)
+    if in_parallel and options.joint_order is None:
+        raise LogError(
+            f"{path}: {topics.measured} says mode_pr {PARALLEL_MODE}: ankles and waist are "
+            "positions of the motors A and B of their linkages, not of pitch and roll; record with "
+            "mode_pr 0, or give --joint-order NAME,NAME,... if you mean the motors."
+        )
     try:
         return motor_joints(topics.measured_type, used_motors, robot, options.joint_order)
     except LogError as error:

@@ -122,6 +122,9 @@ G1_JOINTS = (
     "right_wrist_yaw_joint",
 )
 """Motors 0 to 28 of a G1, by the names of Unitree's models (unitree_sdk2, example/g1)."""
+PARALLEL_MODE = 1
+"""Value of `mode_pr` with which the motors of ankles and waist of a G1 are those of their linkages,
+A and B (unitree_sdk2, example/g1: enumeration Mode)."""
 _G1_ALONE = "waist_yaw_joint"
 """Joint that a G1 has and Unitree's other humanoids, whose order differs, do not."""
 
