@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,11 +174,12 @@ def match_command(
         console.show(comparison, wide=wide)
         headings = [column.heading for column in comparison.columns]
         figures["frameworks"] = [dict(zip(headings, row, strict=True)) for row in comparison.rows]
+    stated_gains = "".join(f" --drive-gains {shlex.quote(entry)}" for entry in drive_gains)
     return console.Outcome(
         figures=figures,
         wrote=written,
         pages_of=result_paths,
-        following=next_commands(result, out),
+        following=next_commands(result, out, f"{stated_gains}{reading.words()}"),
         status=match_status(results.values()),
     )
 
@@ -193,8 +195,14 @@ def match_status(results: Iterable[MatchResult]) -> ExitStatus:
     return status
 
 
-def next_commands(result: MatchResult, out: Path) -> list[str]:
-    """Return the commands that may follow a match, or what to do about joints that are none."""
+def next_commands(result: MatchResult, out: Path, options: str = "") -> list[str]:
+    """Return the commands that may follow a match, or what to do about joints that are none.
+
+    Args:
+        result: The match.
+        out: File of its gains.
+        options: Options with which logs were read, for the command that reads another log.
+    """
     if result.gains.unmatched:
         joints = ", ".join(result.gains.unmatched)
         return [f"record {joints} again; --allow-unmatched exports these gains all the same"]
@@ -202,7 +210,7 @@ def next_commands(result: MatchResult, out: Path) -> list[str]:
         robot = result.robot_path or result.robot
         return [f"pronk sweep {robot} --out LOGS, for torque tells no gains: match that sweep"]
     return [
-        f"pronk predict FRESH_LOG --gains {out}",
+        f"pronk predict FRESH_LOG --gains {out}{options}",
         f"pronk export {out} --to mjlab --out actuators.py",
     ]
 
