@@ -54,8 +54,16 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of `__all__` from the module that defines it."""
+    """Import a name of `__all__` from the module that defines it.
+
+    Errors of functions name their parameters, where those of the command line name options.
+    """
     if name not in _HOMES:
         raise AttributeError(f"module 'pronk' has no attribute {name!r}")
     module, attribute = _HOMES[name]
-    return getattr(import_module(module), attribute)
+    value = getattr(import_module(module), attribute)
+    if isinstance(value, type):
+        return value
+    from pronk.python_words import with_python_words
+
+    return with_python_words(value)
