@@ -109,7 +109,8 @@ def test_sweep_writes_a_log_of_the_virtual_robot(swept):
 
 def test_plan_only_writes_nothing(tmp_path):
     printed = accepted("sweep", *KNEE, "--out", tmp_path / "x", "--plan-only")
-    assert "torque [N m]" in printed
+    assert "torque" in printed
+    assert "[N m]" in printed
     assert not (tmp_path / "x").exists()
 
 
@@ -174,7 +175,7 @@ def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
         fits += ["--fit", name]
     assert "FR_knee" in refused(*common, "--mode", "drive", *fits)
     assert not out.exists()
-    printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
+    printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay", "--wide")
     assert "held" in printed
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,7 @@ def response(
     from pronk.identify.logs.velocity import velocity_note
     from pronk.identify.response.estimate import resolution_note
     from pronk.identify.response.response import Estimator, save_responses
-    from pronk.robots import load_robot
+    from pronk.robots import ROBOT_NAMES, load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)
     estimator = Estimator(segment_s=segment_s)
@@ -87,16 +88,16 @@ def response(
     console.show(response_table(rows), wide=wide)
     for note in notes:
         console.say(f"note: {note}")
-    robot_name = robot or logs[0].robot
-    if robot_name in ("", "unknown"):
-        robot_name = "ROBOT"
-    logs_stated = " ".join(str(path) for path in paths)
+    robot_words = robot or (logs[0].robot if logs[0].robot in ROBOT_NAMES else "ROBOT")
+    words = ["pronk", "match", *map(str, paths), "--robot", robot_words]
+    # Without gains in the log, those of the robot's file are the first guess.
+    if any(log.stiffness is None for log in logs):
+        words += ["--drive-gains", "default"]
+    command = shlex.join(words) + reading.words()
     return console.Outcome(
         figures={"responses": rows, "written": written},
         wrote=written,
-        following=[
-            f"pronk match {logs_stated} --robot {robot_name}{reading.words()} --out gains.yaml"
-        ],
+        following=[f"{command} --out gains.yaml"],
     )
 
 

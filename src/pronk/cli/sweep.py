@@ -141,7 +141,7 @@ def sweep(
     return console.Outcome(
         figures=figures,
         following=[
-            f"pronk response {out}",
+            f"pronk response {out} --robot {robot}",
             f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
         ],
     )

@@ -28,6 +28,7 @@ from pronk.identify.match.gains import (
     MatchedGains,
     require_matched,
 )
+from pronk.identify.match.match import file_of_robot
 from pronk.identify.match.measured import DB, rms
 from pronk.identify.match.nominal_gains import Pair
 from pronk.identify.simulators.linear import LinearJoint, linearize
@@ -237,7 +238,13 @@ def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile)
                 damping_range=damping_range,
             )
     simulator = replace(begin.info, decimation=begin.robot(robot).decimation)
-    return MatchedGains(robot=robot.name, simulator=simulator, joints=joints, groups=groups)
+    return MatchedGains(
+        robot=robot.name,
+        simulator=simulator,
+        joints=joints,
+        groups=groups,
+        robot_path=file_of_robot(robot),
+    )
 
 
 def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> LinearJoint:
