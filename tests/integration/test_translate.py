@@ -126,7 +126,11 @@ def test_a_match_for_the_framework_agrees_or_the_translation_says_why_not(
     joint = arm.joints[seed % len(arm.joints)]
     pairs = {other.name: (other.stiffness, other.damping) for other in arm.joints}
     log = chirp_log(
-        profile("mjlab").robot(arm), joint.name, pairs[joint.name], (0.12, 0.06), noise_rad=1e-6
+        profile("mjlab").robot(arm),
+        joint.name,
+        pairs[joint.name],
+        (0.12, 0.06),
+        noise_rad=1e-6,
     )
     first = stated_gains(arm, {joint.name: pairs[joint.name]}, profile("mjlab"))
     gains, changes = translate(first, arm, profile("mjlab-builtin"))
@@ -156,6 +160,20 @@ def test_the_friction_of_held_joints_does_not_move_a_translation(tmp_path: Path)
         )
         stiffnesses.append(gains.joints[excited.name].stiffness.value)
     np.testing.assert_allclose(stiffnesses, stiffnesses[0], rtol=1e-6)
+
+
+def test_gains_that_no_response_tells_apart_are_named_and_stay_finite(
+    pendulum: RobotSpec,
+) -> None:
+    """Undamped, or so stiff that the joint follows every command: flagged, with finite gains."""
+    for pair in ((17.0, 0.0), (1e6, 4e5)):
+        first = stated_gains(pendulum, {"swing": pair}, profile("isaaclab-newton"))
+        gains, changes = translate(first, pendulum, profile("isaaclab-implicit"))
+        joint = gains.joints["swing"]
+        assert pair[0] / 101.0 < joint.stiffness.value < 101.0 * pair[0]
+        assert 0.0 <= joint.damping.value < 101.0 * max(pair[1], pair[0])
+        assert changes["swing"].scales[0] > 0.0
+        assert any(flag.startswith((NOT_ALIKE, NOT_UNIQUE)) for flag in joint.flags)
 
 
 def test_what_another_framework_cannot_give_is_refused(pendulum: RobotSpec) -> None:

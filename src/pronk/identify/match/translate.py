@@ -41,6 +41,13 @@ LOW_HZ = 1.0
 """Lowest frequency compared [Hz]: below it a joint follows its command in every drive law."""
 DELAY_SCALE_S = 0.01
 """Unit of the delay in the search with phase [s]."""
+SEEN_DB = 0.02
+"""Difference of magnitudes that a good match leaves between drive laws [dB], root mean square."""
+UNSEEN_SHARE_MAX = 0.02
+"""`JointTranslation.unseen_share` above which the joint is flagged."""
+MOST_CHANGE = 100.0
+"""Largest factor between translated gains and those before; drive laws that are stable differ by
+less, and where a joint follows every command the response tells no gains apart."""
 LEAST_DAMPING_S = 1e-6
 """Least damping in the search, over the stiffness [s]: no joint responds otherwise at 0."""
 POINTS = 60
@@ -49,7 +56,7 @@ NOT_ALIKE_DB = 0.5
 """Error above which the joints are not alike [dB]: what a match of a good log stays below."""
 NOT_ALIKE = "not alike"
 """Beginning of the flag of a joint that the other framework cannot give."""
-CRITERIA_SPREAD_MAX = 0.02
+CRITERIA_SPREAD_MAX = 0.01
 """Relative difference of gains by magnitude alone and by magnitude and phase from which on the
 joint is flagged: a match, which weighs phase and frequencies by its log, ends between them."""
 NOT_UNIQUE = "gains depend on what is compared"
@@ -76,6 +83,13 @@ class JointTranslation:
     with_phase: Pair
     """Stiffness and damping with which magnitude and phase together are most alike, whatever the
     delay. Laws that can be alike give the same gains as `after`."""
+    unseen_share: float = 0.0
+    """Relative change of the gains, in the direction seen least, that changes the magnitude by
+    `SEEN_DB`."""
+    at_bound: bool = False
+    """Whether a gain ran to `MOST_CHANGE` times what it was."""
+    stuck: Pair | None = None
+    """Gains where dry friction holds the other joints of the chain; None if they have none."""
 
     @property
     def scales(self) -> Pair:
@@ -88,6 +102,15 @@ class JointTranslation:
         """Largest relative difference between `after` and `with_phase`."""
         stiffness_spread = abs(self.with_phase[0] / self.after[0] - 1.0)
         damping_difference = abs(self.with_phase[1] - self.after[1])
+        return max(stiffness_spread, damping_difference / max(self.after[1], 1e-300))
+
+    @property
+    def stuck_spread(self) -> float:
+        """Largest relative difference between `after` and `stuck`."""
+        if self.stuck is None:
+            return 0.0
+        stiffness_spread = abs(self.stuck[0] / self.after[0] - 1.0)
+        damping_difference = abs(self.stuck[1] - self.after[1])
         return max(stiffness_spread, damping_difference / max(self.after[1], 1e-300))
 
 
@@ -127,6 +150,14 @@ def translate(
             (joint.stiffness.value, joint.damping.value),
             joint.delay_s.value,
         )
+        chain = robot.joint(name).chain
+        if any(robot.joint(other).drive.frictionloss > 0.0 for other in chain if other != name):
+            stuck = translated(
+                _linear_joint(source, name, joint, others_stick=True),
+                _linear_joint(target, name, joint, others_stick=True),
+                (joint.stiffness.value, joint.damping.value),
+            )
+            translation = replace(translation, stuck=stuck.after)
         if not keeps_friction:
             joint = replace(joint, frictionloss=ZERO, stribeck=ZERO)
         elif math.isnan(joint.frictionloss.value):
@@ -176,7 +207,12 @@ def translated(
 
     # Damping 0 has no logarithm.
     start = np.log([gains[0], max(gains[1], LEAST_DAMPING_S * gains[0])])
-    solution = least_squares(error_db, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
+    most = np.log(MOST_CHANGE)
+    lowest = np.array([start[0] - most, np.log(0.5 * LEAST_DAMPING_S) + start[0] - most])
+    highest = start + most
+    solution = least_squares(
+        error_db, start, bounds=(lowest, highest), x_scale=0.1, xtol=1e-10, ftol=1e-12
+    )
     stiffness = float(np.exp(solution.x[0]))
     damping = float(np.exp(solution.x[1]))
     if damping < LEAST_DAMPING_S * stiffness:
@@ -204,7 +240,21 @@ def translated(
         lead_s=lead_s,
         rest_s=min(delay_s + lead_s, 0.0),
         with_phase=(float(with_phase[0]), float(with_phase[1])),
+        unseen_share=_unseen_share(np.asarray(solution.jac)),
+        at_bound=bool(
+            abs(solution.x[0] - start[0]) > 0.95 * most or highest[1] - solution.x[1] < 0.1
+        ),
     )
+
+
+def _unseen_share(jacobian: Array) -> float:
+    """Return the relative change of gains, seen least, that changes the magnitude by `SEEN_DB`.
+
+    Args:
+        jacobian: Of the magnitudes [dB] by the logarithms of both gains, shape (f, 2).
+    """
+    slopes = np.linalg.svd(jacobian, compute_uv=False) / math.sqrt(len(jacobian))
+    return float(SEEN_DB / max(slopes[-1], 1e-12))
 
 
 def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile) -> MatchedGains:
@@ -247,7 +297,9 @@ def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile)
     )
 
 
-def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> LinearJoint:
+def _linear_joint(
+    robot: RobotSpec, name: str, gains: JointGains, *, others_stick: bool = False
+) -> LinearJoint:
     """Linearize a joint about the default pose, with its matched armature and no dry friction."""
     original = robot.joint(robot.joint(name).original[0])
     rotor_inertia = gains.armature.value / original.drive.gear_ratio**2
@@ -264,7 +316,7 @@ def _linear_joint(robot: RobotSpec, name: str, gains: JointGains) -> LinearJoint
     pose = np.array([robot.joint(joint).default_position for joint in original.chain])
     with JointTestRig(changed, original.name, threads=1) as rig:
         order = [original.chain.index(joint) for joint in rig.joints]
-        return linearize(rig, pose[order], 2.0 * np.pi * hz)
+        return linearize(rig, pose[order], 2.0 * np.pi * hz, others_stick=others_stick)
 
 
 def _translated_joint(joint: JointGains, translation: JointTranslation, begin: str) -> JointGains:
@@ -276,10 +328,27 @@ def _translated_joint(joint: JointGains, translation: JointTranslation, begin: s
     flags = [flag for flag in joint.flags if not flag.startswith((NOT_ALIKE, NOT_UNIQUE))]
     if translation.after_db > NOT_ALIKE_DB:
         flags.append(f"{NOT_ALIKE}: {translation.after_db:.2f} dB from {begin}")
+    elif translation.at_bound:
+        flags.append(
+            f"{NOT_ALIKE}: gains of any size give the response in {begin}, since the joint follows "
+            "its command at every frequency compared; keep the gains as they are, or take a wider "
+            "band"
+        )
+    elif translation.stuck_spread > CRITERIA_SPREAD_MAX and translation.stuck is not None:
+        flags.append(
+            f"{NOT_UNIQUE}: {translation.after[0]:.4g} N m/rad and {translation.after[1]:.4g} "
+            f"N m s/rad where the other joints of its chain move, {translation.stuck[0]:.4g} and "
+            f"{translation.stuck[1]:.4g} where dry friction holds them"
+        )
     elif translation.after[1] == 0.0:
         flags.append(
             f"{NOT_ALIKE}: the drive law damps the joint as much as that of {begin} or more, so "
             "that the damping is 0"
+        )
+    elif translation.unseen_share > UNSEEN_SHARE_MAX:
+        flags.append(
+            f"{NOT_UNIQUE}: gains that differ by {100.0 * translation.unseen_share:.0f} % respond "
+            f"alike within {SEEN_DB:g} dB in this band; a match of logs may end at any of them"
         )
     elif translation.criteria_spread > CRITERIA_SPREAD_MAX:
         stiffness_with_phase, damping_with_phase = translation.with_phase

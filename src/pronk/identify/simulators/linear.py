@@ -30,6 +30,9 @@ from pronk.robots.drive_law import DriveLaw
 _PERTURBATION = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
 
+_STUCK_INERTIA = 1e5
+"""Inertia of a joint that sticks over the largest one of the chain."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LinearJoint:
@@ -85,13 +88,16 @@ class LinearJoint:
         return np.asarray(closed / hold)
 
 
-def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
+def linearize(
+    rig: JointTestRig, pose: Array, omega: Array, *, others_stick: bool = False
+) -> LinearJoint:
     """Linearize the joint of a rig.
 
     Args:
         rig: The rig.
         pose: Pose of its chain [rad], shape (n,).
         omega: Frequencies [rad/s], shape (f,).
+        others_stick: Whether dry friction holds the other joints of the chain where they are.
     """
     # The excited joint takes a torque in place of its drive. No joint has dry friction: MuJoCo's
     # friction is a stiff damper where a joint sticks and a constant where it slips, so that a held
@@ -111,6 +117,9 @@ def linearize(rig: JointTestRig, pose: Array, omega: Array) -> LinearJoint:
         | mujoco.mjtDisableBit.mjDSBL_LIMIT
         | mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
+    if others_stick:
+        others = np.arange(model.nv) != rig.index
+        model.dof_armature[others] += _STUCK_INERTIA * float(model.dof_M0.max())
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     data.ctrl[:] = rig.control(pose)
