@@ -54,7 +54,8 @@ def test_every_command_of_the_documentation_exists() -> None:
 def test_the_page_of_commands_lists_those_of_the_help() -> None:
     table = (DOCS / "commands.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `pronk ([a-z]+)", table, flags=re.MULTILINE)
-    assert listed == list(COMMANDS)
+    # A command with several forms has a row each.
+    assert list(dict.fromkeys(listed)) == list(COMMANDS)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
