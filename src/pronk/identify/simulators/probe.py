@@ -79,6 +79,8 @@ _STALE_STEPS = (1, 2, 3, 4)
 """Ages of the position in the torque that are tried [steps]."""
 _MOST_SECONDS = 12.0
 """Time of the processor after which no further law is tried [s]."""
+_SHARE_OF_TIME = 0.4
+"""Share of the time that is left in which laws are tried with one share of the gains."""
 _HIGHEST_STEP = 3.0
 """Highest step of the command with which a limit of the torque is looked for [rad]."""
 _CLIPPED_SLOPE = 0.3
@@ -293,7 +295,10 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
                 # Friction holds the joint against smaller gains.
                 break
             raise
-        runs = bench.chirps(share, hold, phase, deadline)
+        # Other shares of the gains need time as well.
+        now = time.process_time()
+        share_deadline = now + _SHARE_OF_TIME * max(deadline - now, 0.0)
+        runs = bench.chirps(share, hold, phase, share_deadline)
         if runs.motion < 1e-3 * bench.amplitude:
             # Friction, or a defect, holds the joint.
             break
@@ -315,7 +320,7 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
                 # Gravity moves a joint far whose gains act per degree; of a limit of the torque
                 # smaller gains stay clear.
                 larger_share = share * 180.0 / math.pi
-                if clip is None and bench.stable(larger_share):
+                if bench.stable(larger_share):
                     more_shares.append(larger_share)
                 more_shares += [share / 8.0, share / 64.0]
         elif share * scale < 0.2:
@@ -355,6 +360,9 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
         residual=answer.fit.residual,
         alike=answer.alike,
     )
+    if answer.fit.law.drive.kind == "implicit" and scale > 1.5:
+        # Within the iterations of a step much larger gains meet other limits of an engine too.
+        clip = None
     if clip is not None:
         limit = clip.height
         if clip.of_torque:
