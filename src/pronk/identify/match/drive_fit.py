@@ -179,6 +179,11 @@ def nominal_drives(
     return drives
 
 
+LEAST_AMPLITUDE_RAD = 1e-3
+"""Motion by which the torques of a joint are sized at least, so that one that stands still has
+bounds above zero: twice the step of an encoder of 14 bits [rad]."""
+
+
 def search_ranges(replay: Replay, nominal: DriveValues) -> dict[str, dict[str, SearchRange]]:
     """Return where the parameters of each joint are searched, by the size of the joint.
 
@@ -189,7 +194,7 @@ def search_ranges(replay: Replay, nominal: DriveValues) -> dict[str, dict[str, S
     """
     ranges: dict[str, dict[str, SearchRange]] = {}
     for joint in replay.joints:
-        amplitude = 0.0
+        amplitude = LEAST_AMPLITUDE_RAD
         for recording in replay.recordings:
             if recording.joint != joint:
                 continue
