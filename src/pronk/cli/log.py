@@ -34,13 +34,12 @@ def log(
     Columns, units, rate and joints are told by names and values. Where two readings are plausible
     both are named, and an option decides.
 
+    The action foxglove writes an MCAP file that Foxglove shows in 3D: links, shapes, joint states
+    with units, on the wall clock.
+
     Example:
         pronk log inspect chirp.csv --robot robot.yaml --unit deg --yes
-
-    The action foxglove writes an MCAP file that Foxglove shows in 3D: links, shapes, joint states
-    with units, on the wall clock. For example:
-
-    pronk log foxglove chirp.csv --robot robot.yaml --out chirp.3d.mcap
+        pronk log foxglove chirp.csv --robot robot.yaml --out chirp.3d.mcap
 
     Args:
         action: inspect: guess, show, and with --yes write chirp.log.yaml beside chirp.csv for every

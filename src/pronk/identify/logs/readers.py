@@ -40,7 +40,7 @@ from pronk.robots.robot import RobotSpec
 
 GROUP = "pronk.readers"
 """Entry points of readers from other packages; each is a `Reader`."""
-_ARTEFACT_ENDINGS = (".response.npz", ".prediction.npz", "/match.npz")
+_ARTEFACT_ENDINGS = (".response.npz", ".prediction.npz", "/match.npz", ".3d.mcap")
 """Ends of the paths of what pronk writes beside logs."""
 _WORTH_PROCESSES = 4
 """Fewest logs for which starting processes pays."""

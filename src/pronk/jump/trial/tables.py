@@ -171,9 +171,9 @@ def landings(trial: TrialResults) -> Table:
             Column(heading="standing"),
             Column(heading="jumped"),
             Column(heading="landed"),
-            Column(heading="success [%] (95 %)"),
+            Column(heading="success [%]"),
             Column(heading="fell"),
-            Column(heading="high flights"),
+            Column(heading="high flights", is_detail=True),
         ),
         rows=tuple(rows),
         notes=(
