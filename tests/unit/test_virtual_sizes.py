@@ -123,3 +123,27 @@ def test_a_belt_that_holds_no_link_is_refused(tmp_path: Path) -> None:
     soft = replace(params, joints={**params.joints, JOINT: joint})
     with pytest.raises(RobotError, match="belt_stiffness"):
         VirtualRobot(robot, soft)
+
+
+def test_a_light_link_on_a_motor_of_a_large_joint_is_stable_at_the_bus_voltage(
+    tmp_path: Path,
+) -> None:
+    """A URDF states torque and speed of a large motor at a link of grams."""
+    light = Size(mass=0.01, length=0.05, stiffness=0.05, damping=0.0006, effort_limit=50.0, links=2)
+    robot = sized_robot(light, tmp_path)
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, no_load_speed=0.5)))
+    robot = replace(robot, joints=tuple(joints))
+    machine = VirtualRobot(robot, load_sim_params(None, robot))
+    machine.connect()
+    hold = hold_of(robot)
+    target = np.array(hold.position) + 0.3  # approached far faster than at 0.5 rad/s
+    machine.send(replace(hold, position=target))
+    fall = machine.wait(0.5)
+    rest = machine.wait(1.5)[-50:]
+    speeds = np.array([state.velocity for state in fall])
+    assert np.abs(speeds).max() < 20.0
+    positions = np.array([state.position for state in rest])
+    assert np.abs(positions.mean(axis=0) - target).max() < 0.25
+    assert np.std(positions, axis=0).max() < 5e-3

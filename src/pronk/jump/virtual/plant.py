@@ -13,7 +13,12 @@ current tau / K0 through R against the back-EMF is
     V = R tau / K0 + K qdot,    torque = K (V - K qdot) / R = torque_scale tau,
 
 so the controller gains are R stiffness / K0 and R damping / K0 - K, and the clip of V at the bus
-gives the torque-speed line of the true motor. Friction is LuGre with a Stribeck peak:
+gives the torque-speed line of the true motor. At that clip the back-EMF is a damping of K^2 / R,
+explicit and late by the lag of the drive, which the step cannot follow on a rotor that is light
+for its motor (a URDF states torque and speed of a large motor at a link of grams). There the line
+is made as flat as the step needs: same torque at standstill, higher speed without load. Below the
+clip nothing changes, and the plan of a sweep keeps every joint below the line that its file states.
+Friction is LuGre with a Stribeck peak:
 dz/dt = v - sigma0 |v| z / g(v), g = F_C + (F_S - F_C) exp(-(v/v_S)^2), torque sigma0 z +
 sigma1 dz/dt, outside the limits of the motor.
 
@@ -48,6 +53,8 @@ _STABLE = 1.0
 # Largest damping of a drive times the step over the inertia of its rotor, for the second-order
 # correction of the inertia to suffice.
 _DAMPED = 0.5
+# Share of the largest back-EMF damping at which a step is stable that is simulated at most.
+_BACK_EMF = 0.25
 # Lowest frequency at which rotor and link may swing on their belt [Hz].
 _SOFTEST_HZ = 1.0
 # The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass and inertia as
@@ -168,7 +175,9 @@ class Plant:
         self.encoder_offset = np.zeros(count)
         """Reading of each encoder minus the true angle [rad]."""
         for k, (drive, joint_params) in enumerate(zip(drives, params, strict=True)):
-            believed, resistance = drive.motor
+            believed, resistance = _motor(
+                drive, joint_params, sim_params.machine.drive_lag_s, timestep_s
+            )
             self._believed[k] = believed
             self.constant[k] = joint_params.torque_scale * believed
             self.resistance[k] = resistance
@@ -363,6 +372,26 @@ def _compiled_model(
     return model
 
 
+def _motor(
+    drive: Drive, params: JointParams, lag_s: float, timestep_s: float
+) -> tuple[float, float]:
+    """Return constant [V s/rad] and resistance [ohm] with which the step is stable at the clip.
+
+    The current follows the voltage over the lag t, in each step h by 1 - a, a = t / (t + h). With
+    the back-EMF damping d on the rotor's inertia I, the two states are stable below
+    h d / I = 2 (1 + a) / (1 - a). Where d is larger than a share of that, constant and resistance
+    are both divided by what it is larger, which leaves the torque at standstill as it is.
+    """
+    constant, resistance = drive.motor
+    rotor_inertia = params.rotor_inertia * drive.gear_ratio**2
+    largest_damping = 2.0 * (2.0 * lag_s / timestep_s + 1.0) * rotor_inertia / timestep_s
+    back_emf_damping = (params.torque_scale * constant) ** 2 / resistance
+    excess = back_emf_damping / (_BACK_EMF * largest_damping)
+    if excess <= 1.0:
+        return constant, resistance
+    return constant / excess, resistance / excess
+
+
 def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: float) -> None:
     """Give a joint its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
     link = spec.joint(name)
@@ -403,7 +432,7 @@ def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: f
     )
     belt.wrap_joint(f"{name}/rotor", 1.0)
     belt.wrap_joint(name, -1.0)
-    believed, resistance = drive.motor
+    believed, resistance = _motor(drive, params, lag_s, spec.option.timestep)
     # MuJoCo integrates the current exactly over a step h with time constant t, and applies it in
     # that very step: late by h / (exp(h / t) - 1) at low frequency. Solved for t.
     lag = spec.option.timestep / math.log1p(spec.option.timestep / lag_s)
