@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from pronk.errors import RobotError
 from pronk.jump.virtual.plant import Plant
+from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params
 from pronk.robots import load_robot
+from sized_joint import SIZES, sized_robot
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
 ROBOT = load_robot("mini_cheetah")
@@ -135,3 +138,17 @@ def test_trunk_attitude_and_ground_may_be_left_out() -> None:
     sim_params = parse_sim_params(body | {"trunk": {"mass_offset": 1}}, "my.yaml")
     assert sim_params.trunk.mass_offset == 1.0
     assert sim_params.attitude.noise == 0.0
+
+
+def test_the_measured_speed_of_a_slow_joint_resolves_its_limit(tmp_path: Path) -> None:
+    """A sweep ends where a measured speed exceeds the no-load speed, noise included."""
+    robot = sized_robot(SIZES["knee without armature"], tmp_path)
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, no_load_speed=1.0)))
+    robot = replace(robot, joints=tuple(joints))
+    machine = VirtualRobot(robot, load_sim_params(None, robot))
+    machine.connect()
+    speeds = np.array([state.velocity for state in machine.wait(1.0)])
+    assert np.std(speeds, axis=0).max() < 0.01
+    assert np.abs(speeds).max() < 0.05

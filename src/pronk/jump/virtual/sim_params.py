@@ -296,6 +296,11 @@ _PRESLIDING_RAD = 1e-3
 _FRICTION_RAD = 0.005
 """Angle at which the spring of the drive has the dry friction of a joint, at most, where the
 robot's file has no friction [rad]."""
+_SPEED_NOISE = 0.004
+"""Noise of the speed over the lowest no-load speed, at most: a sweep ends where a measured speed
+exceeds it, and a plan may use all of it."""
+_SPEED_QUANTUM = 0.01
+"""Quantum of the speed over the no-load speed of a joint, at most."""
 _CLAMP_HZ = (30.0, 300.0)
 """Frequencies between which a link swings in the fixture that clamps it [Hz]."""
 
@@ -304,14 +309,21 @@ def default_sim_params(robot: RobotSpec) -> SimParams:
     """Derive the hidden parameters of a robot that has no file of its own, for the bench.
 
     Tolerances are of the size that the virtual Mini Cheetah has. Timing and noise are those of the
-    shipped file, the encoders as fine at the joint as its hips'. What depends on the size of a
-    link (belt, rotor, friction, fixture) is derived from it and from the gains of its drive.
+    shipped file, the encoders as fine at the joint as its hips'. Slow joints have finer encoders
+    and less noise. What depends on the size of a link (belt, rotor, friction, fixture) is derived
+    from it and from the gains of its drive.
     """
     shipped = load_sim_params(SHIPPED)
     drives = [joint.drive for joint in robot.joints]
     smallest_gear_ratio = min(drive.gear_ratio for drive in drives)
     smallest_effort_limit = min(drive.effort_limit for drive in drives)
-    extra_bits = max(0, math.ceil(math.log2(6.0 / smallest_gear_ratio)))
+    slowest = min(drive.no_load_speed for drive in drives)
+    window_s = shipped.machine.velocity_window_s
+    encoder_bits = 14 + max(0, math.ceil(math.log2(6.0 / smallest_gear_ratio)))
+    for drive in drives:
+        # Counts of a turn of the motor, whose speed is measured in counts in the window.
+        quantum = _SPEED_QUANTUM * drive.no_load_speed * window_s * drive.gear_ratio
+        encoder_bits = max(encoder_bits, math.ceil(math.log2(2.0 * math.pi / quantum)))
     links = {}
     joints = {}
     lag_s = shipped.machine.drive_lag_s
@@ -328,7 +340,8 @@ def default_sim_params(robot: RobotSpec) -> SimParams:
         drive_lag_s=lag_s,
         bus_voltage=max(drive.bus_voltage for drive in drives),
         bus_resistance=0.0,
-        encoder_bits=min(24, 14 + extra_bits),
+        encoder_bits=min(24, encoder_bits),
+        velocity_noise=min(shipped.machine.velocity_noise, _SPEED_NOISE * slowest),
         torque_noise=min(shipped.machine.torque_noise, 0.003 * smallest_effort_limit),
     )
     return SimParams(
