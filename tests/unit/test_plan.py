@@ -15,6 +15,7 @@ from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp, Signal
 from pronk.identify.excitation.worst_case import Forecast, Uncertainty, forecast
 from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
 from sized_joint import JOINT, SIZES, Size, sized_robot
 
 ROBOT = load_robot("mini_cheetah")
@@ -245,3 +246,44 @@ def test_the_fall_into_the_pose_is_no_part_of_a_forecast(tmp_path: Path) -> None
     (row,) = plan.rows()
     assert float(row["highest_rad"]) < -0.05  # it hangs below its command
     assert float(row["speed_rad_s"]) < 0.1
+
+
+def with_range(robot: RobotSpec, name: str, low: float, high: float) -> RobotSpec:
+    """Return the robot with another range of a joint."""
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, range=(low, high)) if joint.name == name else joint)
+    return replace(robot, joints=tuple(joints))
+
+
+def test_an_amplitude_that_a_narrow_range_allows_is_found(tmp_path: Path) -> None:
+    robot = with_range(sized_robot(SIZES["servo"], tmp_path), JOINT, 0.29, 0.31)
+    plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.25,), repeats=1)
+    fitting = plan.fitting_amplitude(JOINT)
+    assert 1e-3 < fitting < 0.01
+    make_plan(robot, [JOINT], SHORT, amplitudes=(fitting,), repeats=1).check()
+
+
+def test_amplitudes_that_no_encoder_resolves_are_refused(tmp_path: Path) -> None:
+    robot = sized_robot(SIZES["finger of 5 g"], tmp_path)
+    with pytest.raises(PlanError, match="encoder"):
+        make_plan(robot, [JOINT], SHORT, amplitudes=(1e-5,), repeats=1)
+    (least,) = make_plan(robot, [JOINT], SHORT, amplitudes=(1e-4,), repeats=1).forecasts
+    narrow = with_range(robot, JOINT, least.lowest + 3e-5, least.highest - 3e-5)
+    plan = make_plan(narrow, [JOINT], SHORT, amplitudes=(0.05,), repeats=1)
+    assert 0.0 < plan.fitting_amplitude(JOINT) < 1e-4
+    with pytest.raises(PlanError, match="no encoder resolves"):
+        plan.check()
+
+
+def test_where_a_held_joint_rests_is_no_effect_of_the_excitation(tmp_path: Path) -> None:
+    robot = sized_robot(SIZES["knee without armature"], tmp_path)
+    quiet = make_plan(robot, [JOINT], SHORT, amplitudes=(1e-4,), repeats=1)
+    (held,) = [worst for worst in quiet.forecasts if worst.joint != JOINT]
+    # Its weight takes it half a milliradian beyond its stop.
+    at_stop = with_range(robot, held.joint, held.lowest + 5e-4, 2.5)
+    make_plan(at_stop, [JOINT], SHORT, amplitudes=(1e-4,), repeats=1).check()
+    # What the excitation does to it counts as before.
+    loud = make_plan(at_stop, [JOINT], SHORT, amplitudes=(0.25,), repeats=1)
+    with pytest.raises(PlanError, match=f"{held.joint} could reach"):
+        loud.check()

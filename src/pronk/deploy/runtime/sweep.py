@@ -186,7 +186,7 @@ class SweepController:
         self.task = task
         self.plan = task.plan
         self.machine = machine
-        self.limits = _widened(limits, state.position)
+        self.limits = _widened(limits, state.position, Limits.of(task.plan.robot).joints.speed)
         """Limits that apply at this tick: widened to where the joints are at first until they are
         at the pose."""
         self.progress = 0.0
@@ -418,13 +418,23 @@ class SweepController:
         yield from self._rest(segment=number)
 
 
-def _widened(limits: Limits, position: Array) -> Limits:
-    """Return limits whose ranges hold measured joint positions [rad], and a little more."""
+def _widened(limits: Limits, position: Array, speed: Array) -> Limits:
+    """Return limits for the way to the pose.
+
+    A joint that hangs below its command starts with a step when it is told to stay where it is,
+    which the worst case of the plan does not have.
+
+    Args:
+        limits: Limits of the excitations.
+        position: Measured joint positions, which the ranges hold, and a little more [rad].
+        speed: Largest measured speed of the robot at all times [rad/s], (joints,).
+    """
     low = limits.joints.low
     high = limits.joints.high
     joints = replace(
         limits.joints,
         low=np.where(position < low, position - _SAG, low),
         high=np.where(position > high, position + _SAG, high),
+        speed=speed,
     )
     return replace(limits, joints=joints)

@@ -25,6 +25,12 @@ _CLOSE = 1.04
 """Ratio of an amplitude that is too large to one that fits at which the search for it ends."""
 _MOST_FORECASTS = 25
 """Forecasts of the search for an amplitude, at most."""
+_NEAR_FORECASTS = 3
+"""Forecasts that are tried in a row a tenth below an amplitude that is too large; then the search
+goes halfway to one that fits."""
+RESOLVED_RAD = 1e-4
+"""Smallest amplitude of a sweep: about one count of an encoder of 16 bits at the joint, 2 pi / 2^16
+[rad]. What moves less, no encoder of a robot's joint measures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +146,12 @@ class SweepPlan:
                 continue
             loudest = self._loudest(worst.excited)
             fitting_rad = self.fitting_amplitude(worst.excited)
-            if fitting_rad > 0.0:
+            if 0.0 < fitting_rad < RESOLVED_RAD:
+                way_out = (
+                    f"only amplitudes below {RESOLVED_RAD:g} rad would fit, which no encoder "
+                    "resolves, so choose other joints, another pose or other gains"
+                )
+            elif fitting_rad > 0.0:
                 way_out = f"an amplitude of {fitting_rad:.3g} rad fits"
             else:
                 way_out = "no amplitude fits, so choose other joints or another pose"
@@ -171,6 +182,7 @@ class SweepPlan:
         too_large = 1.0
         # Motion grows about as the amplitude does.
         share = 0.98 / max(_linear_share(worst) for worst in forecasts)
+        too_large_in_a_row = 0
         for _ in range(_MOST_FORECASTS):
             if not fitting < share < too_large:
                 share = (fitting * too_large) ** 0.5
@@ -178,7 +190,11 @@ class SweepPlan:
             if _exceeds(forecasts):
                 too_large = share
                 share = 0.9 * share
+                too_large_in_a_row += 1
+                if too_large_in_a_row > _NEAR_FORECASTS:
+                    share = (fitting * too_large) ** 0.5
             else:
+                too_large_in_a_row = 0
                 fitting = share
                 share = share / max(_linear_share(worst) for worst in forecasts)
                 share = min(max(share, _CLOSE * fitting), 0.5 * (fitting + too_large))
@@ -311,6 +327,11 @@ def make_plan(
             f"a plan of {len(names)} joints, {len(amplitudes)} amplitudes and {repeats} repeats "
             "excites nothing; expected at least one of each, and one number of repeats for all or "
             "one an amplitude."
+        )
+    if 0.0 < max(amplitudes) < RESOLVED_RAD:
+        raise PlanError(
+            f"an amplitude of {max(amplitudes):g} rad is less than an encoder resolves; expected "
+            f"at least {RESOLVED_RAD:g} rad."
         )
     if not (np.isfinite(settle_s) and settle_s >= 0.0):
         raise PlanError(f"settle_s is {settle_s}; expected 0 s or more, for instance 0.5.")

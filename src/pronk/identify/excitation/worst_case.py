@@ -43,6 +43,10 @@ NEIGHBOUR = 0.05
 What an abrupt torque of the excited joint does to a stiff neighbour lasts microseconds, less than
 the lag of any drive."""
 
+REST_RAD = 1e-3
+"""Angle by which a joint that is only held may move on from a place at its stop to which it sags
+without excitation: a stop of MuJoCo gives way by about that much [rad]."""
+
 SETTLE_S = 0.5
 """Rest before the excitation, in which the leg sags into its pose [s]."""
 
@@ -83,7 +87,8 @@ class Forecast:
     highest: float
     """Highest position [rad]."""
     range: tuple[float, float]
-    """Lower and upper mechanical limit [rad]."""
+    """Lower and upper mechanical limit [rad]; of a joint that is only held, a little beyond where
+    it goes without excitation, if that is further."""
     speed: float
     """Greatest speed [rad/s]."""
     no_load_speed: float
@@ -122,11 +127,20 @@ class Forecast:
                 f"is {self.effort_limit:.1f} N m)"
             )
 
+    def leaves_range(self) -> bool:
+        """Tell whether the joint could leave its range."""
+        return self.lowest < self.range[0] or self.highest > self.range[1]
+
     def mirrored(self, robot: RobotSpec, joint: str) -> Forecast:
         """Return the forecast of a joint that mirrors this one."""
         mirrored = robot.joint(joint)
-        sign = mirrored.original[1] * robot.joint(self.joint).original[1]
+        simulated = robot.joint(self.joint)
+        sign = mirrored.original[1] * simulated.original[1]
         ends = (sign * self.lowest, sign * self.highest)
+        below = simulated.range[0] - self.range[0]
+        above = self.range[1] - simulated.range[1]
+        if sign < 0.0:
+            below, above = above, below
         nominal = self.nominal
         if nominal is not None:
             nominal = nominal.mirrored(robot, joint)
@@ -135,7 +149,7 @@ class Forecast:
             joint=joint,
             lowest=min(ends),
             highest=max(ends),
-            range=mirrored.range,
+            range=(mirrored.range[0] - below, mirrored.range[1] + above),
             nominal=nominal,
         )
 
@@ -364,6 +378,12 @@ def forecast(
     for chain in corner_forecasts:
         for column, corner in enumerate(chain):
             worst[column] = _widened(worst[column], corner)
+    if any(corner.joint != joint and corner.leaves_range() for corner in worst):
+        # What a joint does in its pose is no effect of the excitation.
+        still = replace(bench, offsets=np.zeros_like(offsets)).simulate(corners, timestep_s)
+        for column, held in enumerate(worst):
+            if still is not None and held.joint != joint:
+                worst[column] = _at_rest(held, [chain[column] for chain in still])
     forecasts = []
     for widest, as_it_is in zip(worst, nominal, strict=True):
         forecasts.append(replace(widest, nominal=as_it_is))
@@ -383,6 +403,22 @@ def _widened(worst: Forecast, corner: Forecast) -> Forecast:
         electrical_power=max(worst.electrical_power, corner.electrical_power),
         bus_current=max(worst.bus_current, corner.bus_current),
     )
+
+
+def _at_rest(worst: Forecast, still: Sequence[Forecast]) -> Forecast:
+    """Return a held joint's forecast whose range holds what it does without excitation.
+
+    Args:
+        worst: The forecast.
+        still: Forecasts of that joint in every corner, of commands that stay at the pose.
+    """
+    low, high = worst.range
+    for corner in still:
+        if corner.lowest < low + REST_RAD:
+            low = min(low, corner.lowest - REST_RAD)
+        if corner.highest > high - REST_RAD:
+            high = max(high, corner.highest + REST_RAD)
+    return replace(worst, range=(low, high))
 
 
 def _power(drive: Drive, torque: Array, speed: Array) -> Array:
