@@ -116,11 +116,11 @@ def test_a_joint_that_gives_way_to_its_target_is_found() -> None:
 
     def pushed(t: float) -> np.ndarray:
         # Slower than what makes a joint that stands still a seized one.
-        return knee(POSE, POSE[KNEE] - far * min(1.0, t / 0.6))
+        return knee(POSE, POSE[KNEE] - far * min(1.0, t / 0.9))
 
-    reason, when = found(standing, pushed, 1.0)
+    reason, when = found(standing, pushed, 1.3)
     assert reason is Reason.TRACKING
-    pushed_since = 0.6 / 1.2
+    pushed_since = 0.9 / 1.2
     assert abs(when - pushed_since - LIMITS.response.pushed_s) < 0.02
 
     def following(t: float) -> np.ndarray:

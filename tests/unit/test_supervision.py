@@ -13,6 +13,7 @@ from pronk.deploy.bench.faults import NO_VOLTAGE, SENSOR_FAULTS, SWAPPED, spoile
 from pronk.deploy.runtime.limits import Limits
 from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.deploy.runtime.safety import SafetyFilter
+from pronk.deploy.runtime.supervision import SensorHistory
 from pronk.robots.machine import Command, State
 from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
@@ -94,6 +95,65 @@ def test_a_moving_robot_is_believed_with_lost_states_bursts_and_slow_ones() -> N
         map(slow, moving(2.0)),
     ):
         assert judged(states)[0] is Reason.NONE
+
+
+def striding(seconds: float) -> Iterator[State]:
+    """A joint that moves by 0.36 rad in 24 ms, between two rests and in one stride, every 0.3 s."""
+    largest = 2400.0
+    for state in moving(seconds):
+        phase = math.fmod(state.time, 0.3)
+        half = 0.012
+        speed = largest * max(0.0, half - abs(phase - half))
+        if phase < half:
+            travelled = 0.5 * largest * phase**2
+        else:
+            travelled = largest * half**2 - 0.5 * largest * max(0.0, 2.0 * half - phase) ** 2
+        stride = math.floor(state.time / 0.3)
+        position = state.position.copy()
+        velocity = state.velocity.copy()
+        position[2] += travelled + largest * half**2 * stride
+        velocity[2] += speed
+        yield replace(state, position=position, velocity=velocity)
+
+
+def without_strides(states: Iterator[State]) -> Iterator[State]:
+    """The states between strides alone: 24 ms in a row are lost."""
+    for state in states:
+        if not 1e-4 < math.fmod(state.time, 0.3) < 0.024 - 1e-4:
+            yield state
+
+
+@pytest.mark.parametrize("is_lossy", [False, True])
+def test_what_a_joint_does_while_states_are_lost_is_no_contradiction(is_lossy: bool) -> None:
+    states = striding(1.0)
+    largest = 0.0
+    history = SensorHistory(12)
+    for state in without_strides(states) if is_lossy else states:
+        history.observe(state)
+        largest = max(largest, float(history.encoder.max()))
+    assert largest < 0.03
+
+
+def test_a_jump_of_an_encoder_after_lost_states_is_found() -> None:
+    def jumping() -> Iterator[State]:
+        for state in moving(1.0):
+            position = state.position.copy()
+            position[2] += 1.0 if state.time > BEGINS else 0.0
+            if not BEGINS - 0.01 < state.time < BEGINS + 0.014:
+                yield replace(state, position=position)
+
+    reason, when = judged(jumping())
+    assert reason is Reason.ENCODER
+    assert when - BEGINS <= 0.016
+
+
+def test_equal_speeds_across_lost_states_do_not_make_a_joint_constant() -> None:
+    history = SensorHistory(12)
+    position = POSE.copy()
+    for k in (0, 1, 2, 25, 26):
+        position = position + 0.1
+        history.observe(still(time=k * DT, sequence=k, position=position, velocity=np.ones(12)))
+    assert history.constant_s.max() < LIMITS.sensors.repeat_s
 
 
 SLOW = "encoder-drifts-with-velocity"

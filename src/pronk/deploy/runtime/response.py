@@ -154,9 +154,9 @@ def pushed_in_vain(history: ResponseHistory, limits: Limits) -> str:
     """Find a joint that does not go where it is pushed.
 
     Rule: the commanded torque has been beyond `Limits.push` in one direction for more than
-    `pushed_s`, 0.3 s, in which the joint did not move that way by `BlockedLimits.motion`, 0.05
+    `pushed_s`, 0.35 s, in which the joint did not move that way by `BlockedLimits.motion`, 0.05
     rad, from where it was farthest off. `push` is 0.45 of the effort limit, and no less than what a
-    leg needs that carries half of the weight at the length of a shank. A landing takes 0.154 s at
+    leg needs that carries half of the weight at the length of a shank. A landing takes 0.25 s at
     most.
     """
     i = int(np.argmax(history.pushed_s))
