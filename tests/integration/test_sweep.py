@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pronk.deploy.runtime.safety import SafetyFilter
-from pronk.deploy.runtime.sweep import SweepTask
+from pronk.deploy.runtime.sweep import SweepController, SweepTask
 from pronk.deploy.runtime.sweep_recorder import record_sweep
 from pronk.errors import HardwareError, PlanError
 from pronk.identify.excitation.plan import SweepPlan, make_plan
@@ -263,3 +263,20 @@ def test_a_task_that_cannot_be_carried_out_moves_nothing(tmp_path: Path) -> None
     assert arm.calls == []
     assert kept.read_bytes() == b"a day's work"
     assert list(tmp_path.iterdir()) == [kept]
+
+
+def test_the_speed_limit_of_excitations_begins_at_the_pose() -> None:
+    """A joint that hangs below its command steps when it is told to stay where it is."""
+    plan = plan_of("FR_knee")
+    task = SweepTask(plan=plan, out_dir=Path("unused"))
+    machine = VirtualRobot(plan.robot, load_sim_params(None, plan.robot), legs=("FR",))
+    machine.connect()
+    strict = task.limits("measured")
+    records: list[Any] = []
+    state = machine.wait(0.01)[-1]
+    controller = SweepController(
+        task, machine, strict, records.append, state=state, start=0.01, real_time=False
+    )
+    no_load = np.array([joint.drive.no_load_speed for joint in plan.robot.joints])
+    np.testing.assert_allclose(strict.joints.speed, no_load)
+    np.testing.assert_allclose(controller.limits.joints.speed, 1.2 * no_load)
