@@ -209,6 +209,7 @@ def drives_table(result: MatchResult) -> Table:
     of the simulator.
     """
     rows: list[tuple[Cell, ...]] = []
+    unidentified: list[str] = []
     has_torque = False
     has_physical = False
     has_equivalent = False
@@ -219,28 +220,30 @@ def drives_table(result: MatchResult) -> Table:
                 continue
             has_equivalent = True
             label = f"{name} [{parameter.unit}]"
-            equivalent = f"{fit.values[name]:.4g}"
+            equivalent = f"{fit.values[name]:.3g}"
             physical = joint.gains.physical.get(name)
             if physical is None:
                 low, high = fit.total95.get(name, fit.ci95[name])
-                interval = f"{low:.4g} to {high:.4g} (equivalent)"
+                interval = f"{low:.3g} to {high:.3g} (equivalent)"
                 rows.append((joint_name, label, None, interval, equivalent, "position"))
                 continue
             has_physical = True
             low, high = physical.total95
-            value = f"{physical.value:.4g}"
-            interval = f"{low:.4g} to {high:.4g}"
+            value = f"{physical.value:.3g}"
+            interval = f"{low:.3g} to {high:.3g}"
             rows.append((joint_name, label, value, interval, equivalent, "position"))
         for term, by_torque in joint.gains.torque.items():
             has_torque = True
             label = f"{term} [{UNITS[term]}]"
             if by_torque.identified:
                 low, high = by_torque.ci95
-                value = f"{by_torque.value:.4g}"
-                rows.append((joint_name, label, value, f"{low:.4g} to {high:.4g}", None, "torque"))
+                value = f"{by_torque.value:.3g}"
+                rows.append((joint_name, label, value, f"{low:.3g} to {high:.3g}", None, "torque"))
             else:
-                reason = f"not identified by torque: {by_torque.reason}"
-                rows.append((joint_name, label, None, None, None, reason))
+                rows.append((joint_name, label, None, "not identified", None, "torque"))
+                unidentified.append(
+                    f"{joint_name}, {term}: not identified by torque: {by_torque.reason}"
+                )
     columns = (
         Column(heading="joint"),
         Column(heading="parameter"),
@@ -249,7 +252,7 @@ def drives_table(result: MatchResult) -> Table:
         Column(heading="equivalent"),
         Column(heading="by"),
     )
-    notes = []
+    notes = unidentified
     simulator = result.simulator
     if has_equivalent:
         notes.append(
