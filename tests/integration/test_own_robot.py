@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 import pronk.robots
 from command_line import accepted, refused
+from pronk.identify.logs.options import ReadOptions
+from pronk.identify.logs.readers import read_log
 from pronk.identify.match.gains import load_gains
+from pronk.identify.match.match import match
 from pronk.robots import load_robot
 
 PENDULUM = """
@@ -105,3 +109,34 @@ def test_installed_robot_is_found_by_its_entry_point(
     (info / "entry_points.txt").write_text("[pronk.robots]\nmy_pendulum = my_robots:pendulum\n")
     monkeypatch.syspath_prepend(str(package))
     assert load_robot("my_pendulum").joint_names == ("swing",)
+
+
+def test_gains_of_held_joints_are_those_that_were_on_the_drives(tmp_path: Path) -> None:
+    example = Path(__file__).resolve().parents[2] / "examples" / "csv_to_isaaclab"
+    shutil.copytree(example, tmp_path / "leg")
+    text = (tmp_path / "leg" / "robot.yaml").read_text(encoding="utf-8")
+    soft = text.replace(
+        "knee: {drive: motor, stiffness: 25.0, damping: 0.6",
+        "knee: {drive: motor, servo: none, stiffness: 3.0, damping: 0.1",
+    )
+    (tmp_path / "leg" / "soft.yaml").write_text(soft, encoding="utf-8")
+    columns = {"time": "t_ms"}
+    for joint in ("hip", "knee"):
+        columns[f"command.{joint}"] = f"{joint}_des"
+        columns[f"position.{joint}"] = f"{joint}_act"
+    options = ReadOptions(unit="deg", time_unit="ms", columns=columns)
+    gains = {"hip": (30.0, 0.8), "knee": (25.0, 0.6)}
+    stiffness = {}
+    flags = {}
+    for name, drive_gains in (("robot", gains), ("soft", gains), ("assumed", "default")):
+        file = "robot" if name == "robot" else "soft"
+        robot = load_robot(tmp_path / "leg" / f"{file}.yaml")
+        log = read_log(tmp_path / "leg" / "chirp.csv", robot=robot, options=options)
+        result = match([log], robot, drive_gains=drive_gains)
+        stiffness[name] = result.gains.joints["hip"].stiffness.value
+        flags[name] = " ".join(result.flags.get("hip", ()))
+    # The gains that are stated count, whatever the file assumes of the knee.
+    assert stiffness["soft"] == pytest.approx(stiffness["robot"], rel=1e-6)
+    assert "held joints" not in flags["robot"] + flags["soft"]
+    assert stiffness["assumed"] != pytest.approx(stiffness["robot"], rel=0.02)
+    assert flags["assumed"].startswith("held joints: the gains of knee")

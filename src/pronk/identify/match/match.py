@@ -43,7 +43,12 @@ from pronk.identify.match.measured import (
     rms,
     simulated_response,
 )
-from pronk.identify.match.nominal_gains import DriveGains, with_drive_gains
+from pronk.identify.match.nominal_gains import (
+    DriveGains,
+    assumed_held_gains,
+    robot_as_recorded,
+    with_drive_gains,
+)
 from pronk.identify.match.parameters import (
     DRIVE_MODE,
     FREE,
@@ -146,9 +151,11 @@ def match(
         >>> result.gains.joints["FR_knee"].stiffness
     """
     settings = settings or MatchSettings()
+    robot = robot_as_recorded(robot, drive_gains)
     simulation = find_simulation(simulator, robot)
     check_choices(method, mode, settings, simulation)
     parameters = fitted_parameters(mode, settings, simulation)
+    recorded_logs = logs
     logs = with_drive_gains([unwrapped(log) for log in logs], robot, drive_gains)
     torque_fits = fit_torque_drives(logs, robot) if mode == "drive" else {}
     excited_logs = [log for log in logs if log.excited_joints]
@@ -172,6 +179,7 @@ def match(
             excitations = excitations_of(joint_logs, name)
             excitation_flags[name] = (
                 *check_armature(robot.joint(name), parameters, excitations),
+                *assumed_held_gains(robot, name, recorded_logs),
                 *check_excitations(excitations, robot),
             )
             try:

@@ -51,6 +51,65 @@ def gains_by_joint(robot: RobotSpec, drive_gains: DriveGains) -> dict[str, Pair]
     return by_joint
 
 
+def robot_as_recorded(robot: RobotSpec, drive_gains: DriveGains | None) -> RobotSpec:
+    """Give the joints of a robot the gains that were on their drives during the recordings.
+
+    The joints that hold their place while another one is excited are simulated with them.
+
+    Args:
+        robot: The robot, whose file has the gains of the other joints.
+        drive_gains: Gains that are stated for the recordings.
+    """
+    if drive_gains is None or drive_gains == "default":
+        return robot
+    stated = gains_by_joint(robot, drive_gains)
+    joints = []
+    for joint in robot.joints:
+        if joint.name in stated:
+            stiffness, damping = stated[joint.name]
+            joints.append(replace(joint, stiffness=stiffness, damping=damping, servo="position"))
+        else:
+            joints.append(joint)
+    return replace(robot, joints=tuple(joints))
+
+
+def assumed_held_gains(
+    robot: RobotSpec, joint_name: str, logs: Sequence[JointLog]
+) -> tuple[str, ...]:
+    """Warn of joints that hold their place with assumed gains while another one is excited.
+
+    `pronk robot new` assumes gains where a model has no position servo, and says so by `servo` in
+    the robot's file. A soft neighbour moves along and changes the matched gains.
+
+    Args:
+        robot: The robot with the gains that are stated for the recordings.
+        joint_name: The excited joint.
+        logs: The logs as they were read.
+
+    Returns:
+        One flag, or none.
+    """
+    logged: set[str] = set()
+    for log in logs:
+        if log.stiffness is not None:
+            logged |= set(log.joints)
+    joint = robot.joint(joint_name)
+    assumed = []
+    for name in joint.chain:
+        is_held = name != joint_name and name not in joint.clamped
+        if is_held and name not in logged and robot.joint(name).servo != "position":
+            assumed.append(name)
+    if not assumed:
+        return ()
+    names = ", ".join(assumed)
+    return (
+        f"held joints: the gains of {names} are assumed (`servo` in the robot's file), and these "
+        f"joints hold their place while {joint_name} is excited, so that its gains depend on them; "
+        f"give --drive-gains {assumed[0]}=STIFFNESS,DAMPING, or set them in the robot's file and "
+        "remove `servo`",
+    )
+
+
 def with_drive_gains(
     logs: Sequence[JointLog], robot: RobotSpec, drive_gains: DriveGains | None = None
 ) -> list[JointLog]:
