@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from command_line import accepted, invoke, refused
@@ -14,6 +15,7 @@ from hopper import ROBOT, write_hopper
 from pronk.cli import main as cli
 from pronk.cli.demo import find_policies
 from pronk.errors import ArtefactError, PronkError
+from pronk.identify.match.gains import load_gains
 from pronk.version import VERSION
 
 KNEE = ("mini_cheetah", "--joints", "FR_knee", "--amplitude", "0.25")
@@ -176,7 +178,10 @@ def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
     assert "FR_knee" in refused(*common, "--mode", "drive", *fits)
     assert not out.exists()
     printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay", "--wide")
-    assert "held" in printed
+    assert "damping" in printed
+    stiffness = load_gains(out).joints["FR_knee"].stiffness
+    assert stiffness.value == 17.0
+    assert not np.isfinite(stiffness.total95).any()
 
 
 def test_the_demo_takes_the_matched_policy_first_and_refuses_another_robots(tmp_path):

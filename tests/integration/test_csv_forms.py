@@ -273,9 +273,11 @@ def test_columns_on_the_command_line_are_repeated_or_have_commas(tmp_path: Path)
     path.write_text(body(header=("t", "u, set", "q")).replace("u, set", '"u, set"'))
     words = ["response", path, "--unit", "rad", "--no-plots", "--out", tmp_path / "out"]
     repeated = ["--columns", "time=t", "--columns", "command.knee=u, set"]
-    first = accepted(*words, *repeated, "--columns", "position.knee=q")
-    assert accepted(*words, "--columns", "time=t,command.knee=u, set,position.knee=q") == first
-    assert accepted(*words, "--columns", "0,1,2", "--joint-order", "knee") == first
+    first = accepted(*words, *repeated, "--columns", "position.knee=q").split("next:")[0]
+    with_commas = accepted(*words, "--columns", "time=t,command.knee=u, set,position.knee=q")
+    assert with_commas.split("next:")[0] == first
+    by_number = accepted(*words, "--columns", "0,1,2", "--joint-order", "knee")
+    assert by_number.split("next:")[0] == first
     assert "knee" in first
     sentence = refused(*words, "--columns", "time=T,command.knee=U,position.knee=q")
     assert "'T'" in sentence

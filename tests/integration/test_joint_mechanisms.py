@@ -72,7 +72,8 @@ def test_their_true_gains_are_in_the_total_interval(
         inside += low <= stiffness <= high
         low, high = gains.damping.total95
         inside += low <= damping <= high
-        assert high < 1.5 * low
+        # An interval says something: motion that is not explained widens a few of them.
+        assert high < 2.5 * low
     assert inside >= 0.9 * 2 * len(honest)
 
 

@@ -37,8 +37,8 @@ def test_match_and_predict_keep_the_options_of_reading(tmp_path: Path) -> None:
     match_words = following(said, "match")
     gains = tmp_path / "gains.yaml"
     match_words[match_words.index("--out") + 1] = str(gains)
-    said = accepted(*match_words, "--drive-gains", "FR_knee=17,0.4")
+    said = accepted(*match_words)
     predict_words = following(said, "predict")
-    assert "FR_knee=17,0.4" in predict_words
+    assert "default" in predict_words
     predict_words[predict_words.index("FRESH_LOG")] = str(tmp_path / "fresh log.csv")
     assert "FR_knee" in accepted(*predict_words)

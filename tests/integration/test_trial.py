@@ -250,7 +250,7 @@ def test_the_command_writes_tables_page_and_figures(hopper: Path, tmp_path: Path
     assert body["virtual"] is True
     assert [cell["case"] for cell in body["cells"]] == ["side -1"]
     assert load_results(out).sim_params["file"] == "shipped with pronk"
-    assert "Table III" in (out / "report.html").read_text(encoding="utf-8")
+    assert "Jumps beside those of the paper" in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / "videos").exists()
 
 

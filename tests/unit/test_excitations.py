@@ -115,7 +115,7 @@ def test_joints_at_once_move_together_and_repeat() -> None:
         assert len(group_repeats(log.excitations(name))) == 1
 
 
-SHORT = CHIRP[: round(4.0 * RATE)].copy()
+SHORT = CHIRP[: round(2.0 * RATE)].copy()
 SHORT[-round(0.5 * RATE) :] = 0.0
 STEPS = np.repeat([0.0, 0.1, 0.0, -0.1, 0.0], 500)
 

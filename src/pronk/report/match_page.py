@@ -23,6 +23,8 @@ from pronk.tables import Cell, Column, Table
 
 _GAINS_SCHEMA = "schema: pronk/gains/"
 """Text near the beginning of every gains file."""
+HEADER_CHARACTERS = 4000
+"""Characters in which the schema of a gains file stands, below its header for people."""
 JOINT = Column(heading="joint")
 FILES = {"mjlab": "py", "mjcf": "xml"}
 """Ending of what an export writes."""
@@ -89,7 +91,7 @@ def find_gains(folder: Path) -> Path:
         return usual
     candidates = []
     for path in folder.glob("*.yaml"):
-        if _GAINS_SCHEMA in path.read_text("utf-8", "replace")[:200]:
+        if _GAINS_SCHEMA in path.read_text("utf-8", "replace")[:HEADER_CHARACTERS]:
             candidates.append(path)
     if len(candidates) == 1:
         return candidates[0]

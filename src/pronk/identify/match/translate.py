@@ -134,7 +134,10 @@ def translate(
             framework, or the robot cannot be commanded at the profile's step.
     """
     if gains.robot != robot.name:
-        raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+        raise PronkError(
+            f"the gains are those of {gains.robot}, not of {robot.name}; give the robot that they "
+            "were matched for (--robot)."
+        )
     require_matched(gains, allow_unmatched)
     begin = profile_held(gains)
     source = begin.robot(robot)

@@ -92,7 +92,10 @@ def exported_actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group"
         PronkError: The gains are of another robot, or hold no group.
     """
     if gains.robot != robot.name:
-        raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+        raise PronkError(
+            f"the gains are those of {gains.robot}, not of {robot.name}; give the robot that they "
+            "were matched for (--robot)."
+        )
     if not gains.groups:
         raise PronkError(
             f"the gains of {gains.robot} hold no joint group; match some joints first."
