@@ -25,6 +25,10 @@ _GAINS_SCHEMA = "schema: pronk/gains/"
 """Text near the beginning of every gains file."""
 HEADER_CHARACTERS = 4000
 """Characters in which the schema of a gains file stands, below its header for people."""
+ISAAC_LAB = "isaaclab-implicit"
+"""Profile of Isaac Lab's default actuator, and its export."""
+GAINS = "GAINS.yaml"
+"""What stands for the gains file in the command lines of a page."""
 JOINT = Column(heading="joint")
 FILES = {"mjlab": "py", "mjcf": "xml"}
 """Ending of what an export writes."""
@@ -163,7 +167,7 @@ def _content(
         "excitation": _excitation_table(compared),
         "amplitudes": _amplitude_table(compared),
         "logs": _logs_table(result),
-        "usage": _usage(result, gains_path),
+        "usage": _usage(result),
     }
 
 
@@ -187,15 +191,19 @@ def _gains_table(result: MatchResult) -> Table:
     return Table(title=table.title, columns=columns, rows=tuple(rows), notes=(note,))
 
 
-def _usage(result: MatchResult, gains_path: Path) -> list[str]:
-    """Return command lines that use the gains; each runs as it stands in the folder of the page."""
+def _usage(result: MatchResult) -> list[str]:
+    """Return command lines that use the gains; each runs in the folder of the page.
+
+    `GAINS` stands for the path of the gains file from there.
+    """
+    if result.simulator.profile == ISAAC_LAB:
+        return [f"pronk export {GAINS} --to {ISAAC_LAB} --out actuators.py"]
     framework = "mjlab" if result.simulator.law == "explicit" else "mjcf"
-    lines = [f"pronk export {gains_path.name} --to {framework} --out actuators.{FILES[framework]}"]
+    lines = [f"pronk export {GAINS} --to {framework} --out actuators.{FILES[framework]}"]
     if framework != "mjcf":
-        lines.append(f"pronk export {gains_path.name} --to mjcf --out robot.{FILES['mjcf']}")
-    translated = "pronk translate {0} --to isaaclab-implicit --out isaaclab.yaml"
-    lines.append(translated.format(gains_path.name))
-    lines.append("pronk export isaaclab.yaml --to isaaclab-implicit --out isaaclab.py")
+        lines.append(f"pronk export {GAINS} --to mjcf --out robot.{FILES['mjcf']}")
+    lines.append(f"pronk translate {GAINS} --to {ISAAC_LAB} --out isaaclab.yaml")
+    lines.append(f"pronk export isaaclab.yaml --to {ISAAC_LAB} --out isaaclab.py")
     return lines
 
 
