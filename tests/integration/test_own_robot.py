@@ -65,7 +65,7 @@ def test_sweep_match_predict_export(model: str, joint: str, tmp_path: Path) -> N
     accepted("robot", "new", model_of(model, tmp_path))
     accepted("robot", "check", robot)
     accepted("sweep", robot, "--out", logs, *sweep)
-    accepted("match", logs, "--robot", robot, "--out", gains, "--method", "paper")
+    accepted("match", logs, "--robot", robot, "--out", gains)
     accepted("predict", logs, "--robot", robot, "--gains", gains)
     accepted("export", gains, "--robot", robot, "--to", "mjcf", "--out", matched)
     # The virtual robot gives a tenth more torque than its drive computes.

@@ -19,6 +19,7 @@ from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import msgspec
+import numpy as np
 import orjson
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -45,6 +46,13 @@ _MESSAGE = struct.Struct("<HIQQ")
 """Head of a message: channel, sequence number, log time and publish time [ns]; its data follow."""
 _MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
+
+
+def _as_list(value: object) -> object:
+    """Return an array that orjson does not take, as one that is not contiguous, as a list."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be written to a log")
 
 
 class McapWriter:
@@ -75,7 +83,7 @@ class McapWriter:
     def put(self, topic: str, time: float, body: Mapping[str, Any]) -> None:
         """Write a message; `time` is its log time [s]. NaN and infinity become null."""
         stamp = max(0, round(time * 1e9))
-        data = orjson.dumps(body, option=orjson.OPT_SERIALIZE_NUMPY)
+        data = orjson.dumps(body, default=_as_list, option=orjson.OPT_SERIALIZE_NUMPY)
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
     def flush(self) -> None:
