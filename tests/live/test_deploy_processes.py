@@ -251,7 +251,7 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
     height = seen.position[:, 2]
     standing = run_log.ticks.begun[run_log.ticks.mode == Mode.POLICY] - run_log.ticks.begun[0]
     upright = height[np.searchsorted(seen.time, standing[-1])]
-    assert height[-1] < 0.15 < 0.25 < upright < 0.33
+    assert height[-1] < 0.15 < 0.22 < upright < 0.33
     assert json.loads(figures.read_text())["faults"] == []
 
 
