@@ -12,16 +12,7 @@ from pathlib import Path
 
 OUT = Path(__file__).resolve().parents[1] / "examples" / "notebooks"
 
-LOG_TO_GAINS = [
-    """# From a log to gains
-
-A CSV file of two joints, degrees and milliseconds, becomes gains for Isaac Lab. The log is of a simulated leg whose
-drives differ from what `robot.yaml` states; see `examples/csv_to_isaaclab/record.py`.""",
-    """
-from pathlib import Path
-
-import pronk
-
+READ_OPTIONS = """\
 folder = Path("../csv_to_isaaclab")
 robot = pronk.load_robot(folder / "robot.yaml")
 columns = {
@@ -32,6 +23,20 @@ columns = {
     "position.knee": "knee_act",
 }
 options = pronk.ReadOptions(unit="deg", time_unit="ms", columns=columns)
+"""
+"""Lines that both notebooks read the logs of the leg with."""
+
+LOG_TO_GAINS = [
+    """# From a log to gains
+
+A CSV file of two joints, degrees and milliseconds, becomes gains for Isaac Lab. The log is of a simulated leg whose
+drives differ from what `robot.yaml` states; see `examples/csv_to_isaaclab/record.py`.""",
+    """
+from pathlib import Path
+
+import pronk
+
+READ_OPTIONS_HERE
 log = pronk.read_log(folder / "chirp.csv", robot=robot, options=options)
 print(log.joints, f"{log.rate_hz:.0f} Hz, {len(log.time)} samples")
 """,
@@ -92,16 +97,7 @@ The same leg as in the other notebook, matched for two actuators, then replayed 
     """
 from pathlib import Path
 
-folder = Path("../csv_to_isaaclab")
-robot = pronk.load_robot(folder / "robot.yaml")
-columns = {
-    "time": "t_ms",
-    "command.hip": "hip_des",
-    "position.hip": "hip_act",
-    "command.knee": "knee_des",
-    "position.knee": "knee_act",
-}
-options = pronk.ReadOptions(unit="deg", time_unit="ms", columns=columns)
+READ_OPTIONS_HERE
 chirp = pronk.read_log(folder / "chirp.csv", robot=robot, options=options)
 fresh = pronk.read_log(folder / "fresh.csv", robot=robot, options=options)
 drive_gains = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
@@ -121,7 +117,7 @@ def notebook(cells: list[str]) -> str:
     """Return a notebook as JSON; a cell that begins with a line break or a name is code."""
     written = []
     for number, text in enumerate(cells):
-        source = text.strip("\n")
+        source = text.strip("\n").replace("READ_OPTIONS_HERE\n", READ_OPTIONS)
         is_code = text.startswith("\n") or source.startswith("result.")
         cell: dict[str, object] = {
             "cell_type": "code" if is_code else "markdown",

@@ -8,60 +8,51 @@ developers. Clamp the servo, keep clear of the link, and begin with a small ampl
 
 from __future__ import annotations
 
-import argparse
 import math
-import time
-from pathlib import Path
 
-from chirp import command_at, write_csv
+from chirp import record_servo, servo_options
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler, PortHandler
 
 TORQUE_ENABLE, GOAL_POSITION, PRESENT_POSITION = 64, 116, 132  # control table of the X series
-COUNTS = 4096
-"""Counts of a turn."""
+RADIANS = 2.0 * math.pi / 4096
+"""Angle of one count [rad]."""
+
+
+class Dynamixel:
+    """A servo of the X series."""
+
+    def __init__(self, port: PortHandler, number: int) -> None:
+        self.port = port
+        self.number = number
+        self.bus = PacketHandler(2.0)
+
+    def enable(self, torque: bool) -> None:
+        """Switch the torque on or off."""
+        self.bus.write1ByteTxRx(self.port, self.number, TORQUE_ENABLE, int(torque))
+
+    def position(self) -> float:
+        """Return the measured position [rad]."""
+        counts, result, _ = self.bus.read4ByteTxRx(self.port, self.number, PRESENT_POSITION)
+        if result != COMM_SUCCESS:
+            raise SystemExit(self.bus.getTxRxResult(result))
+        if counts >= 2**31:  # The register is a signed number of 32 bits.
+            counts -= 2**32
+        return float(counts * RADIANS)
+
+    def send(self, command_rad: float) -> float:
+        """Send a position; return the one that was sent [rad]."""
+        counts = round(command_rad / RADIANS)
+        self.bus.write4ByteTxOnly(self.port, self.number, GOAL_POSITION, counts % 2**32)
+        return counts * RADIANS
 
 
 def main() -> None:
     """Record."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("port")
-    parser.add_argument("--id", type=int, required=True)
-    parser.add_argument("--joint", required=True)
-    parser.add_argument("--amplitudes", type=float, nargs="+", default=[0.1, 0.2, 0.2])
-    parser.add_argument("--high-hz", type=float, default=6.0)
-    parser.add_argument("--rate-hz", type=float, default=200.0)
-    parser.add_argument("--baud", type=int, default=1_000_000)
-    parser.add_argument("--out", type=Path, default=Path("chirp.csv"))
-    options = parser.parse_args()
-
+    options = servo_options(__doc__, high_hz=6.0)
     port = PortHandler(options.port)
     if not (port.openPort() and port.setBaudRate(options.baud)):
         raise SystemExit(f"{options.port} cannot be opened")
-    servo = PacketHandler(2.0)
-
-    def position() -> float:
-        counts, result, _ = servo.read4ByteTxRx(port, options.id, PRESENT_POSITION)
-        if result != COMM_SUCCESS:
-            raise SystemExit(servo.getTxRxResult(result))
-        return (counts - COUNTS * (counts > 2**31)) * 2.0 * math.pi / COUNTS
-
-    servo.write1ByteTxRx(port, options.id, TORQUE_ENABLE, 1)
-    pose = position()
-    rows: list[tuple[float, float, float]] = []
-    begin = time.perf_counter()
-    try:
-        while True:
-            now = time.perf_counter() - begin
-            relative = command_at(now, options.amplitudes, options.high_hz)
-            if relative is None:
-                break
-            command = round((pose + relative) * COUNTS / (2.0 * math.pi))
-            servo.write4ByteTxOnly(port, options.id, GOAL_POSITION, command % 2**32)
-            rows.append((now, command * 2.0 * math.pi / COUNTS, position()))
-            time.sleep(max(0.0, len(rows) / options.rate_hz - (time.perf_counter() - begin)))
-    finally:
-        servo.write1ByteTxRx(port, options.id, TORQUE_ENABLE, 0)
-        write_csv(options.out, options.joint, rows)
+    record_servo(Dynamixel(port, options.id), options)
 
 
 if __name__ == "__main__":

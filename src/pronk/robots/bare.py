@@ -56,14 +56,6 @@ DECIMATIONS = (4, 5, 10, 20, 40)
 """Physics steps of a command at 50 Hz: steps of 5, 4, 2, 1 and 0.5 ms."""
 COMMAND_HZ = 50.0
 """Rate of the commands [Hz]."""
-JOINT_KINDS = {
-    mujoco.mjtJoint.mjJNT_FREE: "free",
-    mujoco.mjtJoint.mjJNT_BALL: "ball",
-    mujoco.mjtJoint.mjJNT_SLIDE: "slide",
-    mujoco.mjtJoint.mjJNT_HINGE: "hinge",
-}
-"""Names of the kinds of joints."""
-
 Mark = Literal["read", "derived", "CHECK"]
 
 
