@@ -179,7 +179,7 @@ def test_progress_rises_to_almost_all() -> None:
 def test_what_cannot_be_fitted_is_refused() -> None:
     log = commands(5.0, 0.2, 3.0, 0.2)
     # Five seconds in which no joint moves: whatever is named, nothing is fitted.
-    with pytest.raises(PronkError):
+    with pytest.raises(IdentifiabilityError, match="do not identify"):
         match([log], ARM, drive_gains="default")
     with pytest.raises(PronkError, match="stiffness, damping"):
         fit(commands(20.0, 0.2, 3.0, 0.2), ("kd",))
