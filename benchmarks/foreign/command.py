@@ -39,7 +39,7 @@ from benchmarks.runner import Row, finish, in_parallel, rows_in
 from pronk.cli import console
 from pronk.errors import PronkError
 
-What = Literal["robots", "honest", "faults", "translate", "pack"]
+Measurement = Literal["robots", "honest", "faults", "translate", "pack"]
 COUNTS = {"robots": 40, "honest": 200, "faults": 200, "translate": 30, "pack": 40}
 """Robots or logs, where --count is left out."""
 ROBOTS = 40
@@ -47,7 +47,7 @@ ROBOTS = 40
 
 
 def foreign(
-    what: tyro.conf.Positional[What],
+    measurement: tyro.conf.Positional[Measurement],
     seed: int = 41,
     count: int | None = None,
     packages: Path | None = None,
@@ -58,7 +58,7 @@ def foreign(
     """Take public robots to an export; match and translate gains of their joints.
 
     Args:
-        what: robots, honest, faults, translate, or pack.
+        measurement: robots, honest, faults, translate, or pack.
         seed: Of the draw.
         count: Robots or logs; 40, 200 and 30 if left out.
         packages: Folder in which the packages are installed or unpacked, or a packed one; that of
@@ -67,15 +67,15 @@ def foreign(
         jobs: Processes.
         numbers: Only these robots or logs of the draw, counted from 0; repeat it.
     """
-    wanted = COUNTS[what] if count is None else count
-    robots_wanted = wanted if what in ("robots", "translate", "pack") else ROBOTS
+    wanted = COUNTS[measurement] if count is None else count
+    robots_wanted = wanted if measurement in ("robots", "translate", "pack") else ROBOTS
     folder, drawn = drawn_robots(packages, seed, robots_wanted)
-    if what == "pack":
+    if measurement == "pack":
         pack(folder, drawn, out)
         console.say(f"packed {len(drawn)} robots into {out}")
         return console.Outcome(figures={"robots": len(drawn), "seed": seed}, wrote=[out])
     out.mkdir(parents=True, exist_ok=True)
-    rows_file = out / f"{what}.jsonl"
+    rows_file = out / f"{measurement}.jsonl"
     done = {row["number"]: row for row in rows_in(rows_file) if row["seed"] == seed}
     todo = []
     for number in numbers or range(wanted):
@@ -84,7 +84,12 @@ def foreign(
         if number not in done:
             todo.append(number)
     work = partial(
-        _trial, what=what, seed=seed, folder=folder, drawn=drawn, scratch=(out / "walk").resolve()
+        _trial,
+        measurement=measurement,
+        seed=seed,
+        folder=folder,
+        drawn=drawn,
+        scratch=(out / "walk").resolve(),
     )
     with console.progress() as report:
         for finished, row in enumerate(in_parallel(work, todo, jobs)):
@@ -92,37 +97,37 @@ def foreign(
             done[row["number"]] = row
             with rows_file.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
-            report(what, (finished + 1) / len(todo))
+            report(measurement, (finished + 1) / len(todo))
     chosen = numbers or range(wanted)
     rows: list[Row] = [done[number] for number in chosen]
-    figures = {"what": what, "seed": seed, "rows": rows}
-    (out / f"{what}.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    figures = {"what": measurement, "seed": seed, "rows": rows}
+    (out / f"{measurement}.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
     tables = {
         "robots": robots_tables,
         "honest": honest_table,
         "faults": faults_table,
         "translate": translate_tables,
-    }[what](rows, seed)
+    }[measurement](rows, seed)
     return finish(figures, *tables)
 
 
 def _trial(
     number: int,
     *,
-    what: str,
+    measurement: str,
     seed: int,
     folder: Path,
     drawn: Sequence[tuple[Candidate, str]],
     scratch: Path,
 ) -> dict[str, Any]:
     """Do one robot or log."""
-    if what == "robots":
+    if measurement == "robots":
         candidate, joint = drawn[number]
         try:
             row = walk(folder, candidate, joint, scratch / str(number))
         finally:
             shutil.rmtree(scratch / str(number), ignore_errors=True)
         return row | {"number": number}
-    if what == "translate":
+    if measurement == "translate":
         return translation_trial(seed, number, folder, drawn, scratch / f"translate{number}")
-    return log_trial(what, seed, number, folder, list(drawn))
+    return log_trial(measurement, seed, number, folder, list(drawn))

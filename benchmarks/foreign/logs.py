@@ -139,6 +139,15 @@ class LogCase:
 # ---- the joint ----
 
 
+def delayed_commands(drive: Drive, signal: Signal) -> list[float]:
+    """Return the commands that a drive has at steps of `STEP_S`, late by its delay [rad]."""
+    duration_s = len(signal.offsets) / signal.rate_hz
+    instants = np.arange(round(duration_s / STEP_S)) * STEP_S - drive.delay_s
+    index = np.clip(np.floor(instants * signal.rate_hz + 1e-9), 0, len(signal.offsets) - 1)
+    commands: list[float] = signal.offsets[index.astype(int)].tolist()
+    return commands
+
+
 def rigid_motion(joint: RigidJoint, drive: Drive, signal: Signal) -> tuple[Array, Array, Array]:
     """Integrate a joint with a rigid gear.
 
@@ -146,14 +155,10 @@ def rigid_motion(joint: RigidJoint, drive: Drive, signal: Signal) -> tuple[Array
         Position [rad], velocity [rad/s] and torque of the drive [N m] at steps of `STEP_S`.
     """
     step = STEP_S
-    duration_s = len(signal.offsets) / signal.rate_hz
-    count = round(duration_s / step)
-    instants = np.arange(count) * step - drive.delay_s
-    index = np.clip(np.floor(instants * signal.rate_hz + 1e-9), 0, len(signal.offsets) - 1)
-    commands = signal.offsets[index.astype(int)].tolist()
-    position = np.empty(count)
-    velocity = np.empty(count)
-    torque = np.empty(count)
+    commands = delayed_commands(drive, signal)
+    position = np.empty(len(commands))
+    velocity = np.empty(len(commands))
+    torque = np.empty(len(commands))
     stiffness = drive.stiffness
     inertia = joint.inertia
     gravity_cos = -joint.gravity_torque * math.cos(joint.gravity_phase)
@@ -182,9 +187,9 @@ def rigid_motion(joint: RigidJoint, drive: Drive, signal: Signal) -> tuple[Array
             summed += step * error
             spring_torque += stiffness * drive.integral * summed
         damping = drive.damping
-        asked = spring_torque - damping * v
-        if asked > limit or asked < -limit:
-            spring_torque = limit if asked > 0.0 else -limit
+        demanded = spring_torque - damping * v
+        if demanded > limit or demanded < -limit:
+            spring_torque = limit if demanded > 0.0 else -limit
             damping = 0.0
         gravity = gravity_cos * cos(middle) + gravity_sin * sin(middle)
         friction = drive.coulomb
@@ -226,14 +231,10 @@ def geared_motion(joint: RigidJoint, drive: Drive, signal: Signal) -> tuple[Arra
     """
     step = FINE_STEP_S
     skip = round(STEP_S / step)
-    duration_s = len(signal.offsets) / signal.rate_hz
-    count = round(duration_s / STEP_S)
-    instants = np.arange(count) * STEP_S - drive.delay_s
-    index = np.clip(np.floor(instants * signal.rate_hz + 1e-9), 0, len(signal.offsets) - 1)
-    commands = signal.offsets[index.astype(int)].tolist()
-    position = np.empty(count)
-    velocity = np.empty(count)
-    torque = np.empty(count)
+    commands = delayed_commands(drive, signal)
+    position = np.empty(len(commands))
+    velocity = np.empty(len(commands))
+    torque = np.empty(len(commands))
     motor_inertia = joint.armature
     link_inertia = joint.link_inertia
     half_play = 0.5 * drive.play

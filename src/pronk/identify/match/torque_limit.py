@@ -60,9 +60,9 @@ encoder, twice differentiated, is larger than the motion."""
 class LimitedDrive:
     """What a joint's motion and the stated gains say of its torque."""
 
-    given: float
+    delivered: float
     """Torque that the drive gave for nine tenths of the time or more [N m]."""
-    asked: Array
+    demanded: Array
     """Size of the torque that the gains of the drive ask for [N m], shape (n,)."""
 
 
@@ -79,8 +79,8 @@ def drive_torques(
     name = excitations[0].joint
     inertia, pull = bench_inertia(robot, robot.joint(name).original[0])
     top_hz = SMOOTH_PERIODS * robot.joint(name).band_hz[1]
-    given = []
-    asked = []
+    delivered = []
+    demanded = []
     for excitation in excitations:
         time = excitation.time
         grid = np.linspace(float(time[0]), float(time[-1]), len(time))
@@ -94,12 +94,13 @@ def drive_torques(
         speed = np.fft.irfft(1j * omega * spectrum, len(position))
         acceleration = np.fft.irfft(-(omega**2) * spectrum, len(position))
         about_mean = position - position.mean()
-        given.append(np.abs(inertia * acceleration + pull * about_mean))
+        delivered.append(np.abs(inertia * acceleration + pull * about_mean))
         command = np.interp(grid - values["delay"], time, excitation.command)
         error = command - position
-        asked.append(np.abs(values["stiffness"] * error - values["damping"] * speed))
+        demanded.append(np.abs(values["stiffness"] * error - values["damping"] * speed))
     return LimitedDrive(
-        given=float(np.quantile(np.concatenate(given), 0.9)), asked=np.concatenate(asked)
+        delivered=float(np.quantile(np.concatenate(delivered), 0.9)),
+        demanded=np.concatenate(demanded),
     )
 
 
@@ -126,7 +127,7 @@ def effort_limit_reached(
     delay_s = max(fit.values.get("delay", 0.0), 0.0)
     torques = drive_torques(excitations, robot, {**fit.values, "delay": delay_s})
     limit = robot.joint(fit.joint).drive.effort_limit
-    flag = effort_limit_flag(torques.asked, limit, fit.values["stiffness"], amplitude)
+    flag = effort_limit_flag(torques.demanded, limit, fit.values["stiffness"], amplitude)
     return (flag,) if flag else ()
 
 
@@ -157,15 +158,15 @@ def fit_torque_limit(
         return plain
     delay_s = max(plain.values["delay"], 0.0)
     torques = drive_torques(excitations, robot, {**nominal, "delay": delay_s})
-    asks_more = float(np.quantile(torques.asked, 0.95)) > ASKED * torques.given
+    asks_more = float(np.quantile(torques.demanded, 0.95)) > ASKED * torques.delivered
     file_limit = nominal["effort_limit"]
-    asks_limit = float(np.mean(torques.asked > file_limit)) > AT_LIMIT
+    asks_limit = float(np.mean(torques.demanded > file_limit)) > AT_LIMIT
     if not asks_more and not asks_limit:
         return plain
 
     start = dict(nominal)
-    start["frictionloss"] = min(plain.values["frictionloss"], 0.1 * torques.given)
-    start["effort_limit"] = _best_limit(replay, joint, start, torques.given, delay_s)
+    start["frictionloss"] = min(plain.values["frictionloss"], 0.1 * torques.delivered)
+    start["effort_limit"] = _best_limit(replay, joint, start, torques.delivered, delay_s)
     limited = fit_drives(replay, parameters=(*parameters, "effort_limit"), nominal={joint: start})[
         joint
     ]
@@ -174,7 +175,7 @@ def fit_torque_limit(
         return plain
     limit = limited.values["effort_limit"]
     torques = drive_torques(excitations, robot, limited.values)
-    share = float(np.mean(torques.asked > limit))
+    share = float(np.mean(torques.demanded > limit))
     held_out = {**plain.held_out, "matched": error}
     other_flags = []
     for flag in limited.flags:
@@ -182,7 +183,7 @@ def fit_torque_limit(
             other_flags.append(flag)
     if share < AT_LIMIT or limited.sd["effort_limit"] > KNOWN:
         flag = (
-            f"effort limit: the drive gave up to {torques.asked.max():.3g} N m, more than the "
+            f"effort limit: the drive gave up to {torques.demanded.max():.3g} N m, more than the "
             f"{file_limit:g} N m of the robot's file, which was left out of the fit; correct "
             "effort_limit there"
         )
@@ -191,7 +192,7 @@ def fit_torque_limit(
         flag = (
             f"effort limit: for {100.0 * share:.0f} % of the excitation the torque is at its "
             f"limit. The acceleration never exceeds what {limit:.3g} N m give, where the gains ask "
-            f"for up to {torques.asked.max():.3g} N m. The fit took this limit in place of "
+            f"for up to {torques.demanded.max():.3g} N m. The fit took this limit in place of "
             f"the {file_limit:g} N m of the robot's file; correct effort_limit there, and excite "
             f"the joint with {fitting:.2g} rad or less"
         )
@@ -199,15 +200,15 @@ def fit_torque_limit(
 
 
 def _best_limit(
-    replay: JointReplay, joint: str, start: Mapping[str, float], given: float, delay_s: float
+    replay: JointReplay, joint: str, start: Mapping[str, float], delivered: float, delay_s: float
 ) -> float:
     """Return the limit with which the stated gains come nearest to the motion [N m]."""
     limits = []
     sets = []
     for factor in LIMIT_FACTORS:
         for delay in (0.0, 0.006, 0.012, delay_s):
-            limits.append(factor * given)
-            sets.append({joint: {**start, "effort_limit": factor * given, "delay": delay}})
+            limits.append(factor * delivered)
+            sets.append({joint: {**start, "effort_limit": factor * delivered, "delay": delay}})
     errors = []
     for positions in replay.positions(sets):
         squares = 0.0
