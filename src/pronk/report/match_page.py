@@ -27,11 +27,7 @@ HEADER_CHARACTERS = 4000
 """Characters in which the schema of a gains file stands, below its header for people."""
 ISAAC_LAB = "isaaclab-implicit"
 """Profile of Isaac Lab's default actuator, and its export."""
-GAINS = "GAINS.yaml"
-"""What stands for the gains file in the command lines of a page."""
 JOINT = Column(heading="joint")
-FILES = {"mjlab": "py", "mjcf": "xml"}
-"""Ending of what an export writes."""
 
 
 def match_part(path: Path) -> Part:
@@ -167,7 +163,8 @@ def _content(
         "excitation": _excitation_table(compared),
         "amplitudes": _amplitude_table(compared),
         "logs": _logs_table(result),
-        "usage": _usage(result),
+        "exports": _exports(result),
+        "translated": result.simulator.profile != ISAAC_LAB,
     }
 
 
@@ -191,20 +188,13 @@ def _gains_table(result: MatchResult) -> Table:
     return Table(title=table.title, columns=columns, rows=tuple(rows), notes=(note,))
 
 
-def _usage(result: MatchResult) -> list[str]:
-    """Return command lines that use the gains; each runs in the folder of the page.
-
-    `GAINS` stands for the path of the gains file from there.
-    """
+def _exports(result: MatchResult) -> list[tuple[str, str]]:
+    """Return the exports that take these gains as they are, each with the name of its file."""
     if result.simulator.profile == ISAAC_LAB:
-        return [f"pronk export {GAINS} --to {ISAAC_LAB} --out actuators.py"]
-    framework = "mjlab" if result.simulator.law == "explicit" else "mjcf"
-    lines = [f"pronk export {GAINS} --to {framework} --out actuators.{FILES[framework]}"]
-    if framework != "mjcf":
-        lines.append(f"pronk export {GAINS} --to mjcf --out robot.{FILES['mjcf']}")
-    lines.append(f"pronk translate {GAINS} --to {ISAAC_LAB} --out isaaclab.yaml")
-    lines.append(f"pronk export isaaclab.yaml --to {ISAAC_LAB} --out isaaclab.py")
-    return lines
+        return [(ISAAC_LAB, "actuators.py")]
+    if result.simulator.law == "explicit":
+        return [("mjlab", "actuators.py"), ("mjcf", "robot.xml")]
+    return [("mjcf", "robot.xml")]
 
 
 def _robot_joints(result: MatchResult) -> dict[str, Joint]:
