@@ -77,8 +77,10 @@ def test_a_frozen_unit_is_found_whatever_the_robots_clock_says(link: str) -> Non
     patient = {"ages": replace(PATIENT, hold_s=1.0), "action_valid_s": 0.3}
     patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
     faults = ("imu-repeats@fast", "imu-repeats@jumps")
+    # An attitude that repeats falls behind a gyro that repeats a speed: `ATTITUDE` may be first.
+    expected = ("REPEATED", "ATTITUDE", "ROBOT_CLOCK", "NO_STATE")
     for strike in measure("mini_cheetah", POLICY, link, faults, **patient):
-        assert strike.reason in ("REPEATED", "ROBOT_CLOCK", "NO_STATE"), strike
+        assert strike.reason in expected, strike
         assert strike.time_s <= 2.0, strike
 
 
