@@ -443,7 +443,7 @@ def struck(policy: Path, seed: int, job: tuple[str, str, int]) -> list[Row]:
     The job is a fault, the robot's own clock from its begin on, and the number of the run.
     """
     fault, clock, k = job
-    begins = 0.0 if fault in SWAPPED else 7.0 + 0.137 * k
+    begins = 0.0 if fault in SWAPPED else 8.2 + 0.137 * k
     number = k
     while True:
         number += 1

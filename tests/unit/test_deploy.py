@@ -306,6 +306,28 @@ def test_swapped_encoders_are_found_before_the_robot_rises(swapped: str) -> None
         assert run.mode is Mode.STAND
 
 
+def test_the_trunk_is_still_when_the_policy_may_begin() -> None:
+    robot = connected(base="ground", capture_rate_hz=None)
+    run = Run(check_s=0.15, damp_s=0.5, fold_s=0.5)
+    run.machine.preflighted((), 0.0)
+    run.machine.request(OperatorRequest.STAND)
+    heights = []
+    while run.t < 12.0 and run.mode is not Mode.POLICY:
+        state = robot.wait(run.t + 0.002)[-1]
+        heights.append(float(robot.snapshot().position[0, 2]))
+        if run.mode is Mode.STAND:
+            run.machine.request(OperatorRequest.WALK)
+        command = run.tick(0.002, q=state.position).command
+        if command is None:
+            robot.damp()
+        else:
+            robot.send(command)
+    assert run.mode is Mode.POLICY, run.machine.notice
+    last = np.array(heights[-100:])
+    assert np.ptp(last) < 0.003
+    assert last[-1] > 0.22
+
+
 def test_nothing_is_sent_before_and_without_the_checks() -> None:
     run = Run()
     for mode in (Mode.IDLE, Mode.PREFLIGHT, Mode.IDLE):

@@ -29,6 +29,9 @@ class RunTiming:
     check_s: float = 0.15
     """Time of each half swing of a leg in the folded pose before the first rise, and of each small
     motion in the default pose after it; 0 for no check [s]."""
+    rest_s: float = 1.2
+    """Time in the default pose after the small motions, until the trunk is still: the Mini Cheetah
+    on the virtual ground moves by up to 2.5 cm in the first second, by 1.5 mm afterwards [s]."""
     rise_s: float = 1.5
     """Time from the folded pose to the default pose [s]."""
     ramp_s: float = 0.5
@@ -46,6 +49,7 @@ class RunTiming:
             "damp_s": self.damp_s,
             "fold_s": self.fold_s,
             "check_s": self.check_s,
+            "rest_s": self.rest_s,
             "rise_s": self.rise_s,
             "ramp_s": self.ramp_s,
             "blend_s": self.blend_s,
@@ -140,7 +144,7 @@ def stand_up(
         swing: Whether each leg's last joint swings by `SWING` in the folded pose, one leg after
             another.
         nods: Poses of small motions after the default pose, the last of them the default pose
-            again, `RunTiming.check_s` apart [rad], each (joints,).
+            again, `RunTiming.check_s` apart [rad], each (joints,); `RunTiming.rest_s` follows.
     """
     default = np.array([joint.default_position for joint in robot.joints])
     folded = folded_pose(robot)
@@ -157,4 +161,7 @@ def stand_up(
     for pose in nods:
         poses.append(pose)
         seconds.append(timing.check_s)
+    if nods:
+        poses.append(default)
+        seconds.append(timing.rest_s)
     return PosePath(began=began, poses=tuple(poses), seconds=tuple(seconds), ramp_s=timing.ramp_s)

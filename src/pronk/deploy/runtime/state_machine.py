@@ -292,10 +292,10 @@ class StateMachine:
     ) -> bool:
         """Note a tick of the small motions; after them, whether sensors contradict them."""
         assert self._nod_check is not None
-        nods_s = len(self._nods) * self.timing.check_s
-        if t < path.began + sum(path.seconds) - nods_s:
+        nods_end = path.began + sum(path.seconds) - self.timing.rest_s
+        if t < nods_end - len(self._nods) * self.timing.check_s:
             return False
-        if not path.done(t):
+        if t < nods_end:
             state = safety.sensors.newest if safety.limits.trunk_is_free else None
             self._nod_check.observe(t, path.target(t), position, state)
             return False
