@@ -112,3 +112,24 @@ def rows_in(out: Path | None) -> list[Row]:
     if out is None or not out.exists():
         return []
     return [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+
+
+def write_section(page: Path, name: str, text: str) -> None:
+    """Replace what a page has between `<!-- NAME -->` and `<!-- end of NAME -->`.
+
+    Args:
+        page: A page of docs, whose other text is written by hand.
+        name: Name of the section.
+        text: Markdown of the section.
+
+    Raises:
+        PronkError: The page has no such section.
+    """
+    begin = f"<!-- {name} -->\n"
+    end = f"<!-- end of {name} -->"
+    written = page.read_text(encoding="utf-8")
+    if begin not in written or end not in written:
+        raise PronkError(f"{page} has no section {begin.strip()} ... {end}; it is not changed.")
+    before, _, rest = written.partition(begin)
+    _, _, after = rest.partition(end)
+    page.write_text(f"{before}{begin}\n{text.strip()}\n\n{end}{after}", encoding="utf-8")

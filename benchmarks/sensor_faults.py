@@ -1,7 +1,7 @@
 """`python -m benchmarks sensor-faults`: from a fault to damping on the wire.
 
 `tests.deploy_strikes` moves a virtual robot over LCM and DDS in real time and strikes it with
-faults. `--docs` writes the table of faults in docs.
+faults. `--docs` writes the section of a page, such as docs/evidence/faults.md.
 
 With `--minutes` the robot walks without a fault instead: what damps it, the memory and the handles
 of each process, and the lateness of the servo. Its link may then also be `sim`.
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.runner import Progress, Row, finish, rows_in, rows_of
+from benchmarks.runner import Progress, Row, finish, rows_in, rows_of, write_section
 from pronk.cli import console
 from pronk.deploy.bench.faults import SENSOR_FAULTS, SWAPPED
 from pronk.deploy.runtime.modes import Mode
@@ -204,13 +204,40 @@ def _cell(times_ms: list[float], count: int) -> str:
     return ", ".join(words)
 
 
-def faults_page(rows: list[Row], command: str) -> str:
-    """The page of the table of faults in docs."""
+def struck_names(clocks: str) -> list[str]:
+    """Names of the faults that are measured: each of a sensor with each of the robot's clocks.
+
+    Args:
+        clocks: Of `CLOCKS`, separated by commas. `right` stands without a name: `imu-repeats`, and
+            `imu-repeats@stuck`.
+    """
+    names: list[str] = []
+    for clock in clocks.split(","):
+        if clock == "right":
+            names += FAULTS
+            continue
+        for fault in SENSOR_FAULTS:
+            if fault not in SWAPPED:
+                names.append(f"{fault}@{clock}")
+    return names
+
+
+def faults_section(rows: list[Row], command: str) -> str:
+    """Write the table of faults, and the list of those that are found late or not at all.
+
+    Args:
+        rows: Of `rows_of_faults`.
+        command: Command line that measured them.
+    """
     groups = sorted({(row["robot"], row["link"]) for row in rows}, reverse=True)
+    names: list[str] = []
+    for row in rows:
+        if row["fault"] not in names:
+            names.append(row["fault"])
     headings = [f"{robot}, {link}" for robot, link in groups]
     table = [["fault", *headings, "reasons"], ["---"] * (len(headings) + 2)]
     missed = []
-    for fault in FAULTS:
+    for fault in names:
         cells = []
         reasons: set[str] = set()
         for robot, link in groups:
@@ -237,82 +264,13 @@ def faults_page(rows: list[Row], command: str) -> str:
     lines = "\n".join("| " + " | ".join(row) + " |" for row in table)
     bar = f"{1e3 * BAR_S:.0f} ms"
     failures = "".join(f"- {line}\n" for line in missed) or f"All within {bar}.\n"
-    return f"""# Faults and damping
-
-Written by `{command}`; do not edit.
-
-From the begin of a fault to the first command that damps, at the virtual robot and on its clock, in
-ms: median (worst). All over loopback, in real time. The Mini Cheetah walks with the shipped policy.
-For the Go2, of which no policy was trained, a linear one squats, sways and pitches on four feet, at
-the stiffness of Unitree's stand example (60 N m/rad).
-The joint of the faults of one encoder is a hip roll, which moves and is loaded least. The time of
-swapped legs and joints is that from the request to stand; the robot has not risen. `refused` is of
-the pre-flight, after which nothing is sent. A stopped or killed servo is followed by the standby
-process. What it takes to find a fault is in [hardware.md](hardware.md).
+    return f"""Measured by `{command}`.
 
 {lines}
 
-## Longer than {bar}, or not found
+Longer than {bar}, or not found:
 
-{failures}
-## What the limits rest on
-
-On the virtual clock, without a fault: 3.0 h in 124 flights of ten parameter sets, a third of them
-with 30 % of the states lost, with 2,538 jumps (`python -m benchmarks supervision
-policies/matched/policy.onnx --hours 10 --sets 10 --seed 41`, stopped after 3.0 h). They gave one
-false alarm, `ENCODER`: 24 ms of states were lost while a foot landed, and the knee moved by 0.18
-rad beyond what the speeds before and after told. Since then positions and attitudes that follow
-lost states count less by what the largest acceleration allows, and `TRACKING` waits for 0.35 s,
-not 0.3. The ten hours are to be flown after this change; nothing here is from them.
-
-| quantity | largest of the 3.0 h | limit | limit / largest |
-| --- | --- | --- | --- |
-| attitude less gyro [rad] | 0.036 | 0.06 | 1.7 |
-| mean force off the vertical [rad] | 0.243 | 0.5 | 2.1 |
-| position less velocity, 60 ms [rad] | 0.110, and the alarm; 0.008 since | 0.18 | 23 |
-| position less velocity, half a second [rad] | 0.0141 | 0.035 | 2.5 |
-| least path of the attitude, share of the gyro's | 0.85 | 0.25 | 3.4 |
-| moved while constant [rad] | 0.0029 | 0.005 | 1.7 |
-| limited by torque without moving [s] | 0.142 | 0.2 | 1.4 |
-| limited by torque [s] | 0.180 | 0.3 | 1.7 |
-| least bus voltage of 80 ms [V] | 18.2 | 13.2 | 1.4 |
-| trunk lower than 0.169 m [s] | 0.01 | 0.06 | 6 |
-| pushed without following [s] | 0.25 | 0.35 | 1.4 |
-| least motion of a joint whose target moves far [rad] | 0.033 | 0.01 | 3.3 |
-
-"Since" is of 80 s of two lossless flights, judged again with 30 % of the states lost and with gaps
-of 24 and 48 ms: without the change such gaps give up to 0.54 rad, 0.12 rad for the attitude, and
-0.045 rad for motion of a constant joint; with it 0.008, 0.029 and 0.0032 rad. 57 of the 124
-flights ended by tilt or the speed of a joint. One ended by `COLLAPSED`: its trunk had leant by
-0.73 rad and was truly at 0.11 m, so that the robot was down. With n = 3 (seed 41, in process,
-walking) after the change: an encoder that drifts by 0.5 rad/s 90 to 96 ms, a seized knee 400 to
-406 ms, a free knee 430 to 528 ms, a free front hip pitch 0.49 to 1.17 s, a free front hip roll
-1.10 to 1.21 s (0.8 to 1.1 s with 0.3 s); `encoder-jumps` 1 ms, `encoder-zero` 6 ms,
-`encoder-constant` 41 ms, `attitude-stuck` 47 ms and `gyro-zero` 41 ms at most.
-The flight of the false alarm, flown again to 24 s, has 0.006 rad at most and no alarm.
-
-## What cannot be seen
-
-- A constant encoder of a joint whose load does not change while no other joint moves: the robot
-  stands still. It is found once the others have moved by 0.05 rad in sum.
-- An encoder at zero whose joint rests at zero, until its velocity says that it moved by 0.005 rad.
-- A stuck attitude of a trunk that hardly turns, until the gyro says that it turned by 0.03 rad.
-- Hip roll and hip pitch of one leg swapped with each other: a knee swings before the robot rises.
-- Swapped encoders in a sweep, before their joint is excited.
-- A motor without torque or a seized joint, before a target needs it. Walking at 1 m/s on the
-  virtual clock, three runs each: a free knee 0.4 to 0.65 s, a free hip pitch 0.5 to 1.6 s, a free
-  front hip roll 1.1 to 1.2 s, a free hind hip roll not in 4 s; a seized knee 0.40 s; a seized hip
-  pitch or roll not in 4 s, and the robot walks on.
-- An encoder that drifts together with its velocity: a knee or hip roll at 0.5 rad/s is beyond its
-  range after 1.8 to 2.1 s. If the position alone drifts it is found after 0.08 to 0.10 s; a drift
-  below 0.07 rad/s is not.
-- A low bus voltage over LCM, whose messages carry none: the trunk is down after 0.5 to 0.8 s. Where
-  the voltage is carried it is found after 0.08 s.
-- An inertial unit turned about the vertical by less than about 50 degrees. Larger turns and
-  mirrored signs are found by small motions before the first step, if the feet are on the ground.
-- Signs of the hip rolls that are mirrored in commands and measurements alike.
-- The height of the trunk of a robot whose legs do not end in spheres, or that has no folded pose.
-"""
+{failures}"""
 
 
 def sensor_faults(
@@ -320,6 +278,7 @@ def sensor_faults(
     runs: int = 10,
     robots: str = "mini_cheetah,go2",
     links: str = "lcm,dds",
+    clocks: str = "right",
     minutes: float = 0.0,
     seed: int = 0,
     jobs: int = 1,
@@ -332,18 +291,22 @@ def sensor_faults(
         policy: policy.onnx of the Mini Cheetah that walks.
         runs: With each fault, robot and link.
         robots: mini_cheetah, go2, separated by commas.
-        links: lcm, dds, separated by commas; sim too with `--minutes`.
+        links: lcm, lcm-wtw (which carries the robot's own clock), dds, separated by commas; sim too
+            with `--minutes`.
+        clocks: The robot's own clock from the begin of a fault of a sensor on, of right, stuck,
+            fast, jumps, separated by commas.
         minutes: Of walking without a fault over each link, in place of the faults.
         seed: Of the commands of that walk.
         jobs: Runs at a time, each of which takes two cores; more than 1 without real-time priority.
         out: File of rows in JSON, written as they come; faults go on from those that are there.
-        docs: Page to write.
+        docs: Page whose section of these faults is written.
     """
     if minutes > 0.0:
         with console.progress() as report:
             walks = [endure(policy, link, minutes, seed, report, out) for link in links.split(",")]
         return _endured(walks)
     rows = rows_in(out)
+    names = struck_names(clocks)
     done = {(row["robot"], row["link"], row["run"], row["fault"]) for row in rows}
     work = []
     count = len(rows)
@@ -351,7 +314,7 @@ def sensor_faults(
         for robot in robots.split(","):
             for link in links.split(","):
                 waiting = []
-                for fault in FAULTS:
+                for fault in names:
                     if (robot, link, run, fault) not in done:
                         waiting.append(fault)
                 if waiting:
@@ -371,9 +334,9 @@ def sensor_faults(
         for row in rows_of(work, jobs, out):
             rows.append(row)
             report("faults", len(rows) / count)
-    command = f"python -m benchmarks sensor-faults POLICY --runs {runs} --docs {docs}"
-    text = faults_page(rows, command)
+    options = f"--runs {runs} --robots {robots} --links {links} --clocks {clocks}"
+    text = faults_section(rows, f"python -m benchmarks sensor-faults POLICY {options}")
     if docs is not None:
-        docs.write_text(text, encoding="utf-8")
+        write_section(docs, "faults over LCM and DDS", text)
     console.say(text)
     return console.Outcome(figures={"rows": rows}, wrote=[] if docs is None else [docs])

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.runner import Row, finish, rows_in, rows_of
+from benchmarks.runner import Row, finish, rows_in, rows_of, write_section
 from pronk.cli import console
 from pronk.deploy.bench.faults import CLOCKS, SENSOR_FAULTS, SWAPPED, spoiled
 from pronk.deploy.runtime.limits import Limits
@@ -504,6 +504,7 @@ def supervision(
     seed: int = 0,
     jobs: int = 1,
     out: Path | None = None,
+    docs: Path | None = None,
 ) -> console.Outcome:
     """False alarms of the supervision of sensors, and the time in which it finds faults.
 
@@ -516,6 +517,7 @@ def supervision(
         seed: Of noise, commands and losses.
         jobs: Processes.
         out: File of rows in JSON, written as they come; a run goes on from those that are there.
+        docs: Page whose sections of the rows that are there are written.
     """
     load_policy(policy)
     rows: list[Row] = []
@@ -529,7 +531,31 @@ def supervision(
             else:
                 flown_s = sum(flight.get("seconds", 0.0) for flight in rows)
                 report("walking and jumping", min(flown_s / (3600.0 * hours), 1.0))
+    tables = []
+    command = f"python -m benchmarks supervision POLICY --seed {seed} --sets {sets}"
     flights = [row for row in rows if "flight" in row]
+    if flights:
+        table = table_of_flights(flights, sets)
+        tables.append(table)
+        if docs is not None:
+            write_section(docs, "flights", f"Measured by `{command}`.\n\n{as_markdown(table)}")
+    strikes = [row for row in rows if "fault" in row]
+    if strikes:
+        table = table_of_faults(strikes, clocks.split(","))
+        tables.append(table)
+        if docs is not None:
+            text = f"Measured by `{command} --runs {runs}`.\n\n{as_markdown(table)}"
+            write_section(docs, "faults by the robot's clock", text)
+    return finish({"rows": rows}, *tables)
+
+
+def table_of_flights(flights: list[Row], sets: int) -> Table:
+    """Make the table of the largest quantities of flights without a fault.
+
+    Args:
+        flights: Rows of `quiet`.
+        sets: Number of parameter sets.
+    """
     largest_rows: list[tuple[Cell, ...]] = []
     for name, (limit, _) in QUANTITIES.items():
         values = [row["largest"][name] for row in flights if name in row["largest"]]
@@ -545,7 +571,7 @@ def supervision(
         f"{sum(bool(row['alarm']) for row in flights)} false alarms"
     )
     end_counts = ", ".join(f"{name} {number}" for name, number in ends.items())
-    largest_table = Table(
+    return Table(
         title=title,
         columns=(
             Column(heading="quantity"),
@@ -555,9 +581,18 @@ def supervision(
         rows=tuple(largest_rows),
         notes=(f"Ends of the flights: {end_counts}.",),
     )
+
+
+def table_of_faults(strikes: list[Row], clocks: list[str]) -> Table:
+    """Make the table of times from a fault to damping.
+
+    Args:
+        strikes: Rows of `struck`.
+        clocks: Names of the robot's clocks that are shown.
+    """
     fault_rows: list[tuple[Cell, ...]] = []
-    for name, clock in product(FAULTS, clocks.split(",")):
-        of_fault = [row for row in rows if (row.get("fault"), row.get("clock")) == (name, clock)]
+    for name, clock in product(FAULTS, clocks):
+        of_fault = [row for row in strikes if (row["fault"], row["clock"]) == (name, clock)]
         if not of_fault:
             continue
         times = 1e3 * np.array([row["time_s"] for row in of_fault])
@@ -573,9 +608,19 @@ def supervision(
         found = f"{len(of_fault) - missed}/{len(of_fault)}"
         fault_rows.append((name, clock, median, worst, found, texts))
     headings = ("fault", "robot's clock", "median", "worst", "found", "reasons")
-    fault_table = Table(
+    return Table(
         title="From a fault to damping [ms]",
         columns=tuple(Column(heading=heading) for heading in headings),
         rows=tuple(fault_rows),
     )
-    return finish({"rows": rows}, largest_table, fault_table)
+
+
+def as_markdown(table: Table) -> str:
+    """Write a table with its title and notes in Markdown."""
+    lines = [table.title, "", "| " + " | ".join(column.title for column in table.columns) + " |"]
+    lines.append("| " + " | ".join("---" for _ in table.columns) + " |")
+    for cells in table.text_rows():
+        lines.append("| " + " | ".join(cells) + " |")
+    for note in table.notes:
+        lines += ["", note]
+    return "\n".join(lines)

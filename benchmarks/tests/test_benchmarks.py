@@ -71,12 +71,22 @@ def test_the_page_of_faults_names_what_is_late_or_not_found() -> None:
     common = {"robot": "go2", "link": "dds", "run": 0, "reason": "ENCODER"}
     times = {"gyro-zero": (0.04, 0.05), "encoder-zero": (0.04, 0.3), "encoder-jumps": (math.nan,)}
     rows = [{**common, "fault": k, "time_s": t} for k, each in times.items() for t in each]
-    text = sensor_faults.faults_page(rows, "command")
+    text = sensor_faults.faults_section(rows, "command")
     assert "`gyro-zero` | 45 (50), n = 2 |" in text
-    late = text.split("## Longer")[1]
+    late = text.split("Longer than")[1]
     assert "`encoder-zero` (go2, dds): 1 of 2 later, 0 not found" in late
     assert "`encoder-jumps` (go2, dds): 0 of 1 later, 1 not found" in late
     assert "`gyro-zero` (" not in late
+
+
+def test_a_section_of_a_page_is_replaced_and_the_rest_is_kept(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# A\n\n<!-- b -->\n\nold\n\n<!-- end of b -->\n\nby hand\n", encoding="utf-8")
+    runner.write_section(page, "b", "new")
+    runner.write_section(page, "b", "newer")
+    assert page.read_text() == "# A\n\n<!-- b -->\n\nnewer\n\n<!-- end of b -->\n\nby hand\n"
+    with pytest.raises(PronkError, match="no section"):
+        runner.write_section(page, "c", "new")
 
 
 def ignore(_stage: str, _share: float) -> None: ...
