@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from pronk.identify.simulators.actuator_network import SampleGains
 from pronk.report import style
 from pronk.report.style import key
 
@@ -61,6 +62,18 @@ STUDY = {
 }
 """Landed jumps of 100 by robot, gains (`ARMS`) and training seed (11, 12, 13), measured at commit
 989edfb; docs/results.md says how."""
+
+GO1_NETWORK = SampleGains(
+    ages=(0, 1, 2),
+    error_gains=(-0.121, 18.929, 0.142),
+    velocity_gains=(0.9036, -0.0085, -0.0078),
+)
+"""The actuator network of a Go1 of walk-these-ways (unitree_go1.pt, MIT) near rest, as `pronk probe
+unitree_go1.pt --history 0.02 --step 0.005 --json` gives it."""
+GO1_DRIVE = (20.0, 0.5)
+"""Stiffness [N m/rad] and damping [N m s/rad] on the drives that it was trained on."""
+GO1_INERTIA = 0.02
+"""Inertia of a joint of the figure of networks, rotor included [kg m^2]."""
 
 
 def continuous(stiffness: float, damping: float, inertia: float = INERTIA) -> Response:
@@ -244,6 +257,40 @@ def delays() -> Figure:
     return figure
 
 
+def actuator_network() -> Figure:
+    """Draw the damping of an actuator network by the time between its samples, and the joint."""
+    stiffness, damping = GO1_DRIVE
+    with style.drawing(1, 2, height=3.6) as (figure, axes):
+        by_step, gain = axes[0]
+        steps_ms = np.linspace(0.5, 25.0, 50)
+        dampings = []
+        for step_ms in steps_ms:
+            dampings.append(GO1_NETWORK.at_step(step_ms / 1000.0).damping)
+        by_step.plot(steps_ms, dampings, color=style.MEASURED, linewidth=1.5)
+        drive = continuous(stiffness, damping, GO1_INERTIA)
+        gain.plot(HZ, decibels(drive), color=style.MEASURED_WIDE, linewidth=3.0)
+        keys = [key("the drive, 20 N m/rad and 0.5 N m s/rad", color=style.MEASURED_WIDE)]
+        for step_ms, role, colour in (
+            (20.0, "as trained", style.MATCHED),
+            (5.0, "as used", style.NAIVE),
+        ):
+            step_s = step_ms / 1000.0
+            by_step.plot([step_ms], [GO1_NETWORK.at_step(step_s).damping], color=colour, marker="o")
+            response = GO1_NETWORK.response(HZ, GO1_INERTIA, step_s)
+            gain.plot(HZ, decibels(response), color=colour, linewidth=1.5)
+            keys.append(key(f"the network at {step_ms:g} ms, {role}", color=colour))
+        by_step.set_ylim(0.0, 1.0)
+        by_step.set_title("Damping of the network near rest")
+        by_step.set_xlabel("time between two samples [ms]")
+        by_step.set_ylabel("damping [N m s/rad]")
+        gain.set_title("A joint of 0.02 kg m²")
+        gain.set_ylabel("gain [dB]")
+        gain.set_xlabel("frequency [Hz]")
+        style.frequency_axis(gain, HZ[0], HZ[-1])
+        style.legend(figure, keys, columns=3)
+    return figure
+
+
 def study() -> Figure:
     """Draw landed jumps by the gains that a policy was trained with, on two robots."""
     colours = (style.NAIVE, style.PAPER, style.MATCHED, style.ZERO_ARMATURE)
@@ -267,6 +314,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "dry-friction.svg": dry_friction,
     "delay.svg": delays,
     "study.svg": study,
+    "actuator-network.svg": actuator_network,
 }
 """How each file is drawn."""
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")

@@ -47,7 +47,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "pronk.cli.translate:translate_gains",
         "Translate gains for a framework of another drive law.",
     ),
-    "probe": ("pronk.cli.probe:probe", "Name what a simulator makes of a joint's settings."),
+    "probe": ("pronk.cli.probe:probe", "Name what a simulator or a network makes of a joint."),
     "train": ("pronk.cli.train:train_command", "Train a policy that walks and jumps."),
     "evaluate": (
         "pronk.cli.evaluate:evaluate_command",
