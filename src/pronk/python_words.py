@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 _OPTION = re.compile(
     r"(?<![\w-])--(?P<name>[a-z][a-z-]*)"
     r"(?: (?P<word>rad|deg|s|ms|us|ns|default)\b"
-    r"| (?P<key>[A-Za-z_.]+)=(?P<value>[A-Za-z_]+(?:,[A-Z]+)*))?"
+    r"| (?P<key>[\w./]+)=(?P<value>[A-Za-z_]\w*(?:,[A-Z]+)*))?"
 )
 """An option, with a value of a few words or of the form NAME=VALUE behind it."""
 _OTHER_NAMES = {
@@ -44,6 +44,8 @@ def _parameter(option: re.Match[str]) -> str:
         value = option["value"]
         if "," in value:
             value = f"({value.replace(',', ', ')})"
+        elif not value.isupper():  # A name, not a word that stands for a number.
+            value = f'"{value}"'
         return f'{name}={{"{option["key"]}": {value}}}'
     return name
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 Cell = str | int | float | tuple[float, float] | None
@@ -57,6 +58,8 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     notes: tuple[str, ...] = ()
     """Sentences below the table."""
+    is_detail: bool = False
+    """True for a table that a terminal shows with --wide alone."""
 
     def __post_init__(self) -> None:
         """Refuse rows that do not have one cell for each column."""
@@ -70,10 +73,14 @@ class Table:
     def without_details(self) -> Table:
         """Return the table without the columns that are details."""
         kept = [index for index, column in enumerate(self.columns) if not column.is_detail]
+        return self.with_columns(kept)
+
+    def with_columns(self, indices: Sequence[int]) -> Table:
+        """Return the table with these of its columns alone, in this order."""
         rows = []
         for row in self.rows:
-            rows.append(tuple(row[index] for index in kept))
-        columns = tuple(self.columns[index] for index in kept)
+            rows.append(tuple(row[index] for index in indices))
+        columns = tuple(self.columns[index] for index in indices)
         return replace(self, columns=columns, rows=tuple(rows))
 
     def text_rows(self) -> list[list[str]]:

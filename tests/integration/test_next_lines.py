@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from chirp_logs import chirp_log
 from command_line import accepted
+from log_files import write_mcap
+from pronk.identify.match.gains import load_gains
 from pronk.robots import load_robot
 
 
@@ -42,3 +46,29 @@ def test_match_and_predict_keep_the_options_of_reading(tmp_path: Path) -> None:
     assert "default" in predict_words
     predict_words[predict_words.index("FRESH_LOG")] = str(tmp_path / "fresh log.csv")
     assert "FR_knee" in accepted(*predict_words)
+
+
+@pytest.mark.parametrize("framework", ["isaaclab-implicit", "drake"])
+def test_a_match_for_a_framework_goes_on_with_its_gains(framework: str, tmp_path: Path) -> None:
+    robot = load_robot("mini_cheetah")
+    log = chirp_log(robot, "FR_knee", (22.0, 0.55), (0.2,), repeats=2, noise_rad=1e-4)
+    path = tmp_path / "knee.mcap"
+    write_mcap(path, log)
+    out = tmp_path / "out" / "gains.yaml"
+    said = accepted("match", path, "--robot", "mini_cheetah", "--for", framework, "--out", out)
+    headline = said.splitlines()[0]
+    matched = load_gains(tmp_path / "out" / framework / "gains.yaml").joints["FR_knee"]
+    assert headline.startswith(framework)
+    assert f"{matched.quality.error_db:.2f} dB" in headline
+    assert f"{matched.quality.nominal_error_db:.2f} dB" in headline
+    assert f"{framework}/match.html" in said.partition("open ")[2].split()[0]
+    gains_file = str(tmp_path / "out" / framework / "gains.yaml")
+    assert gains_file in following(said, "predict")
+    export_words = following(said, "export")
+    assert gains_file in export_words
+    file = tmp_path / export_words[-1]
+    accepted(*export_words[:-1], file)
+    if file.suffix != ".py":  # An MJCF of a motor has these gains in units of its voltage.
+        return
+    numbers = [float(number) for number in re.findall(r"\d+\.?\d*", file.read_text())]
+    assert pytest.approx(matched.stiffness.value, rel=2e-3) in numbers

@@ -28,7 +28,7 @@ from rich.text import Text
 from pronk.errors import HardwareError
 from pronk.exit_status import ExitStatus
 from pronk.files import write_text
-from pronk.tables import Table
+from pronk.tables import Column, Table
 
 _PIPED_WIDTH = 200
 """Characters of a line where standard output is not a terminal."""
@@ -36,6 +36,8 @@ _LONG_TEXT = 24
 """Characters of a cell from which on a column of text is set to the left and may be folded."""
 _HEADING_WIDTH = 10
 """Characters of a line of a heading at least."""
+_BETWEEN_COLUMNS = 2
+"""Characters between two columns."""
 _POLL_S = 0.2
 """Time between two looks at standard input while a person works at the rig [s]."""
 
@@ -54,13 +56,22 @@ def err() -> Console:
 
 
 def say(text: str) -> None:
-    """Print one line to standard output."""
+    """Print a sentence to standard output; a terminal gets it in lines that fit."""
+    console = PipeConsole(highlight=False, soft_wrap=True)
+    for line in _fitting_lines(text, console):
+        console.print(line, markup=False)
+
+
+def say_verbatim(text: str) -> None:
+    """Print a line that is copied, such as a command, to standard output in one piece."""
     PipeConsole(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
 def note(text: str, style: str | None = None) -> None:
-    """Print one line to standard error."""
-    err().print(text, markup=False, style=style)
+    """Print a sentence to standard error; a terminal gets it in lines that fit."""
+    console = err()
+    for line in _fitting_lines(text, console):
+        console.print(line, markup=False, style=style)
 
 
 def warn(text: str) -> None:
@@ -70,7 +81,7 @@ def warn(text: str) -> None:
 
 def following(*commands: str) -> None:
     """Print what to do next."""
-    say("\n  ".join(("next:", *commands)))
+    say_verbatim("\n  ".join(("next:", *commands)))
 
 
 JsonFile = Annotated[
@@ -97,11 +108,11 @@ class Outcome:
     def end(self, json_file: Path | None) -> int:
         """Print what was written and what to do next, write the figures; return the exit status."""
         for path in self.wrote:
-            say(f"wrote {path}")
+            say_verbatim(f"wrote {path}")
         if json_file is not None:
             encoded = msgspec.json.encode(dict(self.figures), enc_hook=_json_value)
             write_text(json_file, json.dumps(msgspec.json.decode(encoded), indent=2) + "\n")
-            say(f"wrote {json_file}")
+            say_verbatim(f"wrote {json_file}")
         if self.following:
             following(*self.following)
         return self.status
@@ -113,22 +124,86 @@ def _json_value(value: Any) -> Any:
 
 
 def show(table: Table, *, wide: bool = False) -> None:
-    """Print a table and its notes; what does not fit is folded, and nothing is cut.
+    """Print a table and its notes so that nothing is cut, whatever the width of the terminal.
 
-    A stream that is not a terminal gets the width that the table needs, unless the variable COLUMNS
-    says how wide it is.
+    Columns that do not fit beside the others stand below them, with the first column again. A
+    stream that is not a terminal has lines of 200 characters, unless the variable COLUMNS says how
+    long they are.
 
     Args:
         table: The table.
         wide: True to print the columns that are details as well.
     """
     if not wide:
+        if table.is_detail:
+            return
         table = table.without_details()
+    console = PipeConsole(highlight=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = PipeConsole(highlight=False, width=_PIPED_WIDTH)
+    console.print(Text(table.title, style="bold"))
+    for number, block in enumerate(column_blocks(table, console.width)):
+        if number > 0:
+            console.print()
+        console.print(_rich_table(block))
+    for sentence in table.notes:
+        for line in _fitting_lines(sentence, console, indent=2):
+            say(line)
+
+
+def column_blocks(table: Table, width: int) -> list[Table]:
+    """Return a table as one or more that are no wider than a terminal.
+
+    Each begins with the first column of the table. A single column that is wider by itself is
+    folded when it is printed.
+
+    Args:
+        table: The table.
+        width: Characters of a line.
+    """
+    text_rows = table.text_rows()
+    widths = []
+    for index, column in enumerate(table.columns):
+        cells = [text_row[index] for text_row in text_rows]
+        widths.append(_least_width(column, cells, is_name=index == 0))
+    blocks: list[list[int]] = []
+    used = width + 1
+    for index in range(1, len(table.columns)):
+        if used + _BETWEEN_COLUMNS + widths[index] > width:
+            blocks.append([0])
+            used = widths[0]
+        blocks[-1].append(index)
+        used += _BETWEEN_COLUMNS + widths[index]
+    if len(blocks) < 2:
+        return [table]
+    return [table.with_columns(block) for block in blocks]
+
+
+def _least_width(column: Column, cells: Sequence[str], *, is_name: bool) -> int:
+    """Return how many characters a column needs; a name or a long text may be folded at spaces."""
+    longest = max(map(len, cells), default=0)
+    heading = textwrap.wrap(column.heading, max(longest, _HEADING_WIDTH), break_long_words=False)
+    heading_width = max(map(len, heading), default=0)
+    if column.unit:
+        heading_width = max(heading_width, len(f"[{column.unit}]"))
+    if not is_name and longest <= _LONG_TEXT:
+        return max(heading_width, longest)
+    return max(heading_width, _longest_word(cells), min(longest, _LONG_TEXT))
+
+
+def _longest_word(cells: Sequence[str]) -> int:
+    """Return the characters of the longest word in some cells."""
+    longest = 0
+    for cell in cells:
+        for word in cell.split():
+            longest = max(longest, len(word))
+    return longest
+
+
+def _rich_table(table: Table) -> RichTable:
+    """Return a table as it is printed below its title."""
     rich_table = RichTable(
-        title=Text(table.title),
-        title_style="bold",
         header_style="bold",
-        title_justify="left",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
         pad_edge=False,
@@ -137,9 +212,12 @@ def show(table: Table, *, wide: bool = False) -> None:
     text_rows = table.text_rows()
     for index, column in enumerate(table.columns):
         is_name = index == 0
-        longest = max((len(text_row[index]) for text_row in text_rows), default=0)
+        cells = [text_row[index] for text_row in text_rows]
+        longest = max(map(len, cells), default=0)
         is_long = longest > _LONG_TEXT
-        heading = textwrap.fill(column.heading, max(longest, _HEADING_WIDTH))
+        heading = textwrap.fill(
+            column.heading, max(longest, _HEADING_WIDTH), break_long_words=False
+        )
         if column.unit:
             heading += f"\n[{column.unit}]"
         rich_table.add_column(
@@ -147,15 +225,32 @@ def show(table: Table, *, wide: bool = False) -> None:
             justify="left" if is_name or is_long else "right",
             overflow="fold",
             no_wrap=not (is_name or is_long),
+            min_width=_longest_word([*cells, *heading.split()]),
         )
     for text_row in text_rows:
         rich_table.add_row(*map(Text, text_row))
-    console = PipeConsole(highlight=False)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console = PipeConsole(highlight=False, width=_PIPED_WIDTH)
-    console.print(rich_table)
-    for sentence in table.notes:
-        say(f"  {sentence}")
+    return rich_table
+
+
+def _fitting_lines(text: str, console: Console, indent: int = 0) -> list[str]:
+    """Return a sentence as lines that fit a terminal; as one line where there is none.
+
+    Words are not broken, so that a path can be copied.
+    """
+    space = indent * " "
+    if not console.is_terminal:
+        return [f"{space}{text}"]
+    lines = []
+    for line in text.split("\n"):
+        lines += textwrap.wrap(
+            line,
+            console.width,
+            initial_indent=space,
+            subsequent_indent=space,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ) or [""]
+    return lines
 
 
 class Reporter(Progress):

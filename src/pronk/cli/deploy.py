@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,20 +24,51 @@ if TYPE_CHECKING:
     from pronk.policy.script import Script
 
 
+@dataclass(frozen=True, kw_only=True)
+class SteeringOptions:
+    """Who steers, and for how long."""
+
+    script: str | None = None
+    """Run this unattended: paper, or a command such as 1,0,0. A keyboard steers if left out."""
+    walk_only: bool = False
+    """With --script: walk without jumps."""
+    gamepad: Path | None = None
+    """Steer with this gamepad, such as /dev/input/js0; with the keyboard if left out."""
+    seconds: float | None = None
+    """Sit down after this time with the policy in charge, in s; at the end of the script, or when
+    told to, if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordOptions:
+    """What is recorded."""
+
+    log: Path | None = None
+    """Log of everything, .mcap, for `pronk report`; none if left out."""
+    capture: Path | None = None
+    """What cameras around the virtual robot would measure, .npz (--link sim); none if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakeoverOptions:
+    """When the policy takes over, and when it is stopped."""
+
+    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = RunTiming.blend_s
+    """Time in which the policy takes over, in s; 0 as in training."""
+    tilt: float | None = None
+    """Largest tilt of the trunk, in rad; that of the robot's file if left out."""
+    ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False
+    """Start the policy even if the measured latency exceeds its training range."""
+
+
 def deploy_command(
     policy: tyro.conf.Positional[Path],
     robot: str | None = None,
-    machine: LinkOptions = LinkOptions(),  # noqa: B008
     base: Base | None = None,
-    script: str | None = None,
-    walk_only: bool = False,
-    gamepad: Path | None = None,
-    log: Path | None = None,
-    capture: Path | None = None,
-    seconds: float | None = None,
-    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = RunTiming.blend_s,
-    tilt: float | None = None,
-    ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
+    steering: SteeringOptions = SteeringOptions(),
+    record: RecordOptions = RecordOptions(),
+    takeover: TakeoverOptions = TakeoverOptions(),
+    machine: LinkOptions = LinkOptions(),  # noqa: B008
 ) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
 
@@ -46,17 +78,11 @@ def deploy_command(
     Args:
         policy: policy.onnx, as `pronk train` writes it.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
-        machine: The machine.
         base: What holds the virtual robot; the ground if left out.
-        script: Run this unattended: paper, or a command such as 1,0,0.
-        walk_only: A script without jumps.
-        gamepad: Gamepad, such as /dev/input/js0; a keyboard if left out.
-        log: Log of everything, MCAP.
-        capture: What cameras around the virtual robot would measure, .npz (--link sim).
-        seconds: Sit down after this time with the policy in charge.
-        blend: Time in which the policy takes over, in s; 0 as in training.
-        tilt: Largest tilt of the trunk, in rad; that of the robot's file if left out.
-        ignore_latency: Start the policy even if the measured latency exceeds its training range.
+        steering: Who steers, and for how long.
+        record: What is recorded.
+        takeover: When the policy takes over, and when it is stopped.
+        machine: The machine.
     """
     from pronk.deploy.links.address import SIM
     from pronk.deploy.runtime.plan import Link, RunPlan
@@ -72,6 +98,9 @@ def deploy_command(
     from pronk.files import require_place
     from pronk.policy.runtime import load_policy
 
+    log = record.log
+    capture = record.capture
+    seconds = steering.seconds
     contract = load_policy(policy).contract
     address = machine.address(base)
     if capture is not None and (address.scheme != SIM or address.interface == "bench"):
@@ -86,12 +115,14 @@ def deploy_command(
         policy=policy,
         log=log,
         trajectory=capture,
-        tilt=tilt,
-        timing=RunTiming(blend_s=blend),
-        ignore_latency=ignore_latency,
+        tilt=takeover.tilt,
+        timing=RunTiming(blend_s=takeover.blend),
+        ignore_latency=takeover.ignore_latency,
         real_time=machine.real_time,
     )
-    scripts = None if script is None else _scripts(script, contract, walk_only)
+    scripts = None
+    if steering.script is not None:
+        scripts = _scripts(steering.script, contract, steering.walk_only)
     if not (address.local or machine.yes):
         console.confirm(contract.robot, str(address))
     operator: Operator
@@ -101,8 +132,8 @@ def deploy_command(
         greeting = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
         if seconds is None or seconds > scripted.seconds:
             seconds = scripted.seconds
-    elif gamepad is not None:
-        operator = Gamepad(gamepad, contract.command_ranges)
+    elif steering.gamepad is not None:
+        operator = Gamepad(steering.gamepad, contract.command_ranges)
         greeting = PAD_HELP
     else:
         operator = Keyboard(contract.command_ranges)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,37 +14,56 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What the robots do."""
+
+    what: Literal["all", "walk", "jump"] = "all"
+    """walk: velocities. jump: the paper's jumps. all: both."""
+    robots: int = 1000
+    """Robots for each command."""
+    seed: int = 0
+    """Seed of all draws."""
+    before: Path | None = None
+    """Evaluation of the policy before the jump phases, to compare the walk; none if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSimOptions:
+    """What is simulated."""
+
+    like: Annotated[Path | None, tyro.conf.arg(name="ranges-from")] = None
+    """With naive gains: the gains.yaml whose ranges and delay are used; the paper's ranges and no
+    delay if left out."""
+    randomization: Literal["full", "noise", "none"] = "full"
+    """full: as in training. noise: one nominal robot many times, with noise, timing and delay as in
+    training. none: the nominal robot, undisturbed."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: a GPU if there is one. On the CPU take a few robots."""
+    allow_unmatched: bool = False
+    """Also take a gains.yaml with joints that are no match."""
+
+
 def evaluate_command(
     policy: tyro.conf.Positional[Path],
     gains: str,
     out: Annotated[Path, tyro.conf.arg(aliases=("--json",))] = Path("evaluation.json"),
-    like: Annotated[Path | None, tyro.conf.arg(name="ranges-from")] = None,
-    what: Literal["all", "walk", "jump"] = "all",
-    robots: int = 1000,
-    randomization: Literal["full", "noise", "none"] = "full",
-    before: Path | None = None,
-    seed: int = 0,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-    allow_unmatched: bool = False,
+    wide: bool = False,
+    evaluated: EvaluationOptions = EvaluationOptions(),
+    simulated: TrainingSimOptions = TrainingSimOptions(),
 ) -> None:
     """Walk and jump with many robots at once; errors, heights, falls, acceptance criteria.
 
     Example:
-        pronk evaluate runs/matched --gains gains.yaml
+        pronk evaluate runs/matched --gains gains.yaml --robots 1000 --out evaluation.json
 
     Args:
         policy: policy.onnx, a checkpoint, or the folder of a run (its last checkpoint).
         gains: Gains of the simulated drives: gains.yaml, or naive.
         out: The evaluation, as JSON.
-        like: With naive gains: the gains.yaml whose ranges and delay are used.
-        what: walk: velocities. jump: the paper's jumps. all: both.
-        robots: Robots for each command.
-        randomization: full: as in training. noise: one nominal robot many times, with noise, timing
-            and delay as in training. none: the nominal robot, undisturbed.
-        before: Evaluation of the policy before the jump phases, to compare the walk.
-        seed: Seed of all draws.
-        device: auto: a GPU if there is one. On the CPU take a few robots.
-        allow_unmatched: Also take a gains.yaml with joints that are no match.
+        wide: Print every column: mean velocity, and how and when the robots flew, as well.
+        evaluated: What the robots do.
+        simulated: What is simulated.
     """
     from pronk.jump.train.devices import find_devices, require_extra
     from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, EvaluationPlan
@@ -51,7 +71,7 @@ def evaluate_command(
     require_extra()
     if out.suffix != ".json":
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
-    simulation_device = "cuda:0" if find_devices(device) else "cpu"
+    simulation_device = "cuda:0" if find_devices(simulated.device) else "cpu"
 
     from pronk.jump.train.gains import training_gains
     from pronk.jump.train.tasks import load_task
@@ -62,19 +82,23 @@ def evaluate_command(
         save_evaluation,
     )
 
-    errors_before = {} if before is None else load_speed_errors(before)
+    errors_before = {}
+    if evaluated.before is not None:
+        errors_before = load_speed_errors(evaluated.before)
     evaluated_policy = load_evaluated_policy(policy, simulation_device)
     robot = load_task(evaluated_policy.robot).robot
     plan = EvaluationPlan(
         robot=robot,
-        robots=robots,
-        seed=seed,
-        walks=() if what == "jump" else WALKS,
-        jumps=() if what == "walk" else JUMPS,
+        robots=evaluated.robots,
+        seed=evaluated.seed,
+        walks=() if evaluated.what == "jump" else WALKS,
+        jumps=() if evaluated.what == "walk" else JUMPS,
     )
     if plan.jumps and not evaluated_policy.jump:
         raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
-    simulated_gains = training_gains(gains, robot, like=like, allow_unmatched=allow_unmatched)
+    simulated_gains = training_gains(
+        gains, robot, like=simulated.like, allow_unmatched=simulated.allow_unmatched
+    )
     if not evaluated_policy.knows(simulated_gains):
         console.warn(
             f"{policy} was not trained with these gains; it is evaluated with "
@@ -87,11 +111,11 @@ def evaluate_command(
             simulated_gains,
             plan,
             device=simulation_device,
-            randomization=randomization,
+            randomization=simulated.randomization,
             before=errors_before,
             progress=report,
         )
     save_evaluation(out, evaluation)
     for table in evaluation_tables(evaluation):
-        console.show(table)
+        console.show(table, wide=wide)
     console.say(f"wrote {out}")

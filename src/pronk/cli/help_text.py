@@ -6,7 +6,7 @@ import argparse
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 WIDTH = 80
@@ -34,13 +34,20 @@ def without_examples(docstring: str) -> str:
     return _EXAMPLE.sub("\n", f"{inspect.cleandoc(docstring)}\n")
 
 
-def help_text(parser: argparse.ArgumentParser, program: str, examples: Sequence[str]) -> str:
+def help_text(
+    parser: argparse.ArgumentParser,
+    program: str,
+    examples: Sequence[str],
+    required_options: Set[str] = frozenset(),
+) -> str:
     """Return the help of a command.
 
     Args:
         parser: The parser that tyro makes of the command.
         program: The words before the options, as in `pronk match`.
         examples: Complete command lines.
+        required_options: Options that a command cannot run without, as `--to`, beside those that
+            the parser marks.
     """
     required: list[argparse.Action] = []
     groups: list[tuple[str, list[argparse.Action]]] = []
@@ -49,12 +56,15 @@ def help_text(parser: argparse.ArgumentParser, program: str, examples: Sequence[
         for action in group._group_actions:
             if "--help" in action.option_strings:
                 continue
-            if _is_required(action):
+            if _is_required(action, required_options):
                 required.append(action)
             else:
                 optional.append(action)
         title = (group.description or "Options").strip().rstrip(".")
-        groups.append((title, optional))
+        if groups and groups[-1][0] == title:
+            groups[-1][1].extend(optional)
+        else:
+            groups.append((title, optional))
 
     needed = " ".join(_typed(action) for action in required)
     usage = f"usage: {program} {needed}".rstrip() + " [OPTIONS]"
@@ -91,10 +101,12 @@ def _command_lines(command: str) -> list[str]:
     return [f"{line} \\" for line in lines[:-1]] + lines[-1:]
 
 
-def _is_required(action: argparse.Action) -> bool:
-    """Return whether a command cannot run without an option."""
-    is_list = "[PATH [PATH ...]]" in _metavar(action)
-    return (is_list and not action.option_strings) or "(required)" in (action.help or "")
+def _is_required(action: argparse.Action, required_options: Set[str]) -> bool:
+    """Return whether a command cannot run without an option; tyro lets a repeatable one be."""
+    if "(required)" in (action.help or ""):
+        return True
+    is_list = "[PATH [PATH ...]]" in _metavar(action) and not action.option_strings
+    return is_list or not required_options.isdisjoint(action.option_strings)
 
 
 def _metavar(action: argparse.Action) -> str:
@@ -123,7 +135,8 @@ def _typed(action: argparse.Action) -> str:
     if not action.option_strings:
         return value
     if value:
-        return f"{action.option_strings[0]} {value}"
+        # tyro puts other names of an option first.
+        return f"{', '.join(reversed(action.option_strings))} {value}"
     names = list(action.option_strings)
     if len(names) == 1 and "True" in _metavar(action):  # tyro: --x {None,True,False}
         names.append(names[0].replace("--", "--no-", 1))
@@ -143,7 +156,7 @@ def _option_lines(action: argparse.Action) -> list[str]:
     text = " ".join(_MARK.sub("", text).split())
     if default == "True":
         text += " It is on by default."
-    elif default not in ("", "None", "False") and not re.search(r"if\s+left\s+out", text):
+    elif default not in ("", "''", "None", "False") and not re.search(r"if\s+left\s+out", text):
         text += f" Default: {' '.join(default.split())}."
     if is_repeatable and "repeat" not in text:
         text += " It may be repeated."

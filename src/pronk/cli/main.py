@@ -243,7 +243,12 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> d
             # tyro has no other public way to the texts of a command line's options.
             warnings.simplefilter("ignore", DeprecationWarning)
             parser: Any = tyro.extras.get_parser(collect, config=config)
-        print(help_text.help_text(parser, program, help_text.examples_of(command)))  # noqa: T201
+        required_options = set()
+        for parameter in parameters:
+            if parameter.default is inspect.Parameter.empty:
+                required_options.add(f"--{parameter.name.replace('_', '-')}")
+        examples = help_text.examples_of(command)
+        print(help_text.help_text(parser, program, examples, required_options))  # noqa: T201
         raise SystemExit(0)
     words = _with_explicit_values(arguments, annotations)
     messages = io.StringIO()

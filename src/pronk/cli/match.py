@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,6 +19,7 @@ from pronk.exit_status import ExitStatus
 if TYPE_CHECKING:
     from pronk.identify.match.result import MatchResult
     from pronk.robots.robot import RobotSpec
+    from pronk.tables import Table
 
 Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
@@ -147,19 +148,30 @@ def match_command(
     result = results[simulator]
     members = joints_of_groups(robot_spec, result)
     figures = summary(result)
-    print_summary(result)
-    has_responses = has_compared_responses(result)
-    if mode == "drive":
-        console.show(tables.drives_table(result))
-    if mode == "gains" or has_responses:
-        if wide:
-            console.show(tables.gains_table(result), wide=True)
-        else:
-            console.show(tables.gains_summary_table(result))
-        console.show(tables.ranges_table(result, members))
-    positions = tables.positions_table(result)
-    if positions.rows:
-        console.show(positions)
+    # Where frameworks are named, their gains are wanted, and those of the simulator are an extra.
+    named_first = [*frameworks, simulator]
+    for name in named_first:
+        print_summary(results[name], name if frameworks else "")
+    for note in result.notes:
+        console.say(f"note: {note}")
+    for name in frameworks or (simulator,):
+        shown = results[name]
+        suffix = f" for {name}" if frameworks else ""
+        shown_tables: list[Table] = []
+        if mode == "drive":
+            shown_tables.append(tables.drives_table(shown))
+        if mode == "gains" or has_compared_responses(shown):
+            if wide:
+                shown_tables.append(tables.gains_table(shown))
+            else:
+                shown_tables.append(tables.gains_summary_table(shown))
+            shown_tables.append(tables.ranges_table(shown, members))
+        positions = tables.positions_table(shown)
+        if positions.rows:
+            shown_tables.append(positions)
+        for table in shown_tables:
+            console.show(replace(table, title=f"{table.title}{suffix}"), wide=wide)
+    if tables.positions_table(result).rows:
         figures["mode"] = mode
         figures["held"] = {}
         figures["rmse"] = {}
@@ -175,11 +187,14 @@ def match_command(
         headings = [column.heading for column in comparison.columns]
         figures["frameworks"] = [dict(zip(headings, row, strict=True)) for row in comparison.rows]
     stated_gains = "".join(f" --drive-gains {shlex.quote(entry)}" for entry in drive_gains)
+    used_name = named_first[0]
+    used_path = out.parent / used_name / out.name if frameworks else out
     return console.Outcome(
         figures=figures,
         wrote=written,
-        pages_of=result_paths,
-        following=next_commands(result, out, f"{stated_gains}{reading.words()}"),
+        # The page that is named first is that of the gains that are wanted.
+        pages_of=[*result_paths[1:], result_paths[0]],
+        following=next_commands(results[used_name], used_path, f"{stated_gains}{reading.words()}"),
         status=match_status(results.values()),
     )
 
@@ -209,10 +224,28 @@ def next_commands(result: MatchResult, out: Path, options: str = "") -> list[str
     if by_torque_alone(result):
         robot = result.robot_path or result.robot
         return [f"pronk sweep {robot} --out LOGS, for torque tells no gains: match that sweep"]
-    return [
-        f"pronk predict FRESH_LOG --gains {out}{options}",
-        f"pronk export {out} --to mjlab --out actuators.py",
-    ]
+    gains_file = shlex.quote(str(out))
+    commands = [f"pronk predict FRESH_LOG --gains {gains_file}{options}"]
+    target = export_target(result)
+    if target is not None:
+        file = "robot.xml" if target == "mjcf" else "actuators.py"
+        commands.append(f"pronk export {gains_file} --to {target} --out {file}")
+    return commands
+
+
+def export_target(result: MatchResult) -> str | None:
+    """Return the export that takes the gains of a match as they are; None if there is none."""
+    from pronk.identify.match.export.targets import TARGETS
+    from pronk.identify.simulators.profiles import profile, profile_of
+
+    try:
+        held = profile_of(result.simulator)
+    except PronkError:  # A simulator of which pronk does not know the law.
+        return None
+    for name, target in TARGETS.items():
+        if target.profile and profile(target.profile) == held:
+            return name
+    return "mjcf"
 
 
 def by_torque_alone(result: MatchResult) -> bool:
@@ -239,30 +272,34 @@ def has_compared_responses(result: MatchResult) -> bool:
     return any(joint.responses is not None for joint in result.joints.values())
 
 
-def print_summary(result: MatchResult) -> None:
-    """Print how many joints were matched, the errors, and every flag."""
+def print_summary(result: MatchResult, framework: str = "") -> None:
+    """Print how many joints were matched, the errors, and every flag.
+
+    Args:
+        result: The match.
+        framework: What it was matched for, where there are several.
+    """
     from pronk.identify.match.result import NO_MATCH
 
+    begin = f"{framework}: " if framework else ""
     matched = len(result.matched_joints)
     count = len(result.joints)
     if has_compared_responses(result):
         console.say(
-            f"{matched} of {count} joints matched. Gain error in the compared band, RMS over the "
-            f"joints: {result.nominal_error_db:.2f} dB with the nominal gains of the real drive, "
-            f"{result.error_db:.2f} dB with the matched gains."
+            f"{begin}{matched} of {count} joints matched. Gain error in the compared band, RMS "
+            f"over the joints: {result.nominal_error_db:.2f} dB with the nominal gains of the real "
+            f"drive, {result.error_db:.2f} dB with the matched gains."
         )
     elif any(joint.gains.torque for joint in result.joints.values()):
-        console.say(f"Drives of {count} joints fitted by torque.")
+        console.say(f"{begin}Drives of {count} joints fitted by torque.")
     else:
-        console.say(f"{matched} of {count} joints matched.")
+        console.say(f"{begin}{matched} of {count} joints matched.")
     for name, reasons in result.gains.unmatched.items():
-        console.say(f"{name} is no match: {'; '.join(reasons)}")
+        console.say(f"{begin}{name} is no match: {'; '.join(reasons)}")
     for name, flags in result.flags.items():
         warnings = [flag for flag in flags if not flag.startswith(NO_MATCH)]
         if warnings:
-            console.say(f"{name}: {'; '.join(warnings)}")
-    for note in result.notes:
-        console.say(f"note: {note}")
+            console.say(f"{begin}{name}: {'; '.join(warnings)}")
 
 
 def summary(result: MatchResult) -> dict[str, Any]:

@@ -33,7 +33,8 @@ class Reading:
     """CSV: OURS=THEIRS, as in position.FR_knee=q3; a name or a number from 0; with commas between
     several, or repeat it. Three columns without names are time, command, position of one joint."""
     joint_names: tuple[str, ...] = ()
-    """THEIRS=OURS for joints of other names; with commas between several, or repeat it."""
+    """THEIRS=OURS for joints of other names, as in motor_3=FR_knee,motor_4=FL_knee; with commas
+    between several, or repeat it."""
     joint_order: str | None = None
     """NAME,NAME,... of columns or messages without joint names; default for the robot's order."""
     drop_duplicates: bool = False

@@ -40,8 +40,9 @@ def predict_logs(
         paths: Logs, or folders of logs.
         gains: gains.yaml of `pronk match`.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
-        out: Folder for replays and figures; beside the gains.
-        drive_gains: As of `pronk match`.
+        out: Folder for replays and figures; beside the gains if left out.
+        drive_gains: Gains on the real drives if the logs do not have them: JOINT=STIFFNESS,DAMPING
+            or GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         allow_unmatched: Also replay joints whose gains are no match.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
@@ -31,49 +32,83 @@ _SERVERS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class WireOptions:
+    """The wire, on which nothing leaves this computer."""
+
+    link: Literal["lcm", "dds"] = "lcm"
+    """The messages of a Mini Cheetah, or of a Unitree robot."""
+    layout: Layout = "cheetah"
+    """Messages on LCM: Cheetah-Software's, or walk-these-ways'."""
+    port: int | None = None
+    """UDP port on this computer (LCM); 7768 if left out."""
+    domain: int | None = None
+    """Domain on this computer (DDS); 77 if left out, never 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandInOptions:
+    """The virtual robot."""
+
+    base: Base = "bench"
+    """bench: the trunk is fixed; ground: it stands and moves freely."""
+    sim_params: Path | None = None
+    """Parameters of the virtual robot, instead of the shipped ones."""
+    seed: int = 0
+    """Seed of all noise and all faults."""
+    mode: str = ""
+    """The robot's own controller that holds the joints at first; released if left out. LCM:
+    stand_up, balance_stand, locomotion, recovery_stand; DDS: normal, ai, advanced, mcf."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultOptions:
+    """What goes wrong."""
+
+    faults: str = ""
+    """Faults with commas between them, as in loss=0.3,delay=5ms,after=2s; none if left out. Of
+    messages: loss, duplicate, reorder, nan and flip as a share of them, delay and jitter as a time;
+    of one direction with state. or command. before it. Of the machine: freeze=3s:0.5s,
+    clock=5s:0.2s, rival=4s, sensor=9s:gyro-zero."""
+    silence: Literal["hold", "zero", "damp"] = "hold"
+    """What the drives do when commands stop."""
+    silence_after: float = 0.1
+    """Time without a command after which they do it, in s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServingOptions:
+    """How long it runs, and what is kept."""
+
+    duration: float | None = None
+    """End after this time, in s; at Ctrl-C if left out."""
+    capture: Path | None = None
+    """Write what a motion-capture rig would measure to this .npz (--base ground); nothing if left
+    out."""
+    realtime: bool = False
+    """Request real-time scheduling."""
+
+
 def simulate(
     robot: tyro.conf.Positional[str] = "mini_cheetah",
-    link: Literal["lcm", "dds"] = "lcm",
-    layout: Layout = "cheetah",
-    base: Base = "bench",
-    sim_params: Path | None = None,
-    seed: int = 0,
-    port: int | None = None,
-    domain: int | None = None,
-    faults: str = "",
-    silence: Literal["hold", "zero", "damp"] = "hold",
-    silence_after: float = 0.1,
-    mode: str = "",
-    duration: float | None = None,
-    capture: Path | None = None,
-    realtime: bool = False,
+    wire_options: WireOptions = WireOptions(),
+    stand_in: StandInOptions = StandInOptions(),
+    fault: FaultOptions = FaultOptions(),
+    serving: ServingOptions = ServingOptions(),
 ) -> console.Outcome:
     """Run the virtual robot in real time, behind the messages of a real one.
 
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
 
     Example:
-        pronk simulate mini_cheetah --link lcm
+        pronk simulate mini_cheetah --link lcm --base bench --duration 60
 
     Args:
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
-        link: The wire.
-        layout: Messages on LCM: Cheetah-Software's, or walk-these-ways'.
-        base: bench: the trunk is fixed; ground: it stands and moves freely.
-        sim_params: Parameters of the virtual robot, instead of the shipped ones.
-        seed: Of all noise and all faults.
-        port: UDP port on this computer (LCM); 7768 if left out.
-        domain: Domain on this computer (DDS); 77 if left out, never 0.
-        faults: What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0.01,
-            flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s,
-            sensor=9s:gyro-zero'.
-        silence: What the drives do when commands stop.
-        silence_after: Time without a command after which they do it, in s.
-        mode: The robot's own controller that holds the joints at first; released if left out. LCM:
-            stand_up, balance_stand, locomotion, recovery_stand; DDS: normal, ai, advanced, mcf.
-        duration: End after this time, in s; Ctrl-C ends it too.
-        capture: Write what a motion-capture rig would measure to this .npz (--base ground).
-        realtime: Request real-time scheduling.
+        wire_options: The wire.
+        stand_in: The virtual robot.
+        fault: What goes wrong.
+        serving: How long it runs, and what is kept.
     """
     from pronk.deploy.bench.faults import parse_faults
     from pronk.deploy.bench.server import RobotServer, Watchdog
@@ -85,6 +120,11 @@ def simulate(
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
 
+    link = wire_options.link
+    base = stand_in.base
+    seed = stand_in.seed
+    capture = serving.capture
+    duration = serving.duration
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
     if duration is not None and not duration > 0.0:
@@ -92,23 +132,25 @@ def simulate(
     if capture is not None:
         require_place(capture)
     robot_spec = load_robot(robot)
-    link_faults = parse_faults(faults)
-    watchdog = Watchdog(silence=silence, silence_after=silence_after)
-    lcm_layout = layout if link == "lcm" else None
-    address = Address.parse(link, layout=lcm_layout, port=port, domain=domain)
+    link_faults = parse_faults(fault.faults)
+    watchdog = Watchdog(silence=fault.silence, silence_after=fault.silence_after)
+    lcm_layout = wire_options.layout if link == "lcm" else None
+    address = Address.parse(
+        link, layout=lcm_layout, port=wire_options.port, domain=wire_options.domain
+    )
     machine = VirtualRobot(
         robot_spec,
-        load_sim_params(sim_params, robot_spec),
+        load_sim_params(stand_in.sim_params, robot_spec),
         seed=seed,
         base=base,
         capture_rate_hz=None if capture is None else _CAPTURE_RATE_HZ,
     )
-    if realtime:
+    if serving.realtime:
         # Before the wire is open, so that its threads are scheduled alike.
         for line in enter(RealTimeSettings(priority=_PRIORITY, lock=False)):
             console.say(line)
     transport_class: Any = resolve_name(_SERVERS[link])
-    wire: ServerTransport = transport_class(robot_spec, mode=mode, **address.options)
+    wire: ServerTransport = transport_class(robot_spec, mode=stand_in.mode, **address.options)
     try:
         machine.connect()
         server = RobotServer(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,17 +30,28 @@ AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExcitationOptions:
+    """What is excited, and how."""
+
+    joints: tuple[str, ...] = ()
+    """Joints to excite; with commas between several, or repeat it. All if left out."""
+    signal: SignalName = "chirp"
+    """Excitation signal."""
+    amplitude: tuple[float, ...] = ()
+    """Peak of the command in rad; repeat it for several. 0.25 and 0.125 if left out."""
+    repeats: int = 3
+    """Times each amplitude is repeated."""
+
+
 def sweep(
     robot: tyro.conf.Positional[str],
     out: Path = Path("logs"),
-    machine: LinkOptions = LinkOptions(),  # noqa: B008
-    joints: tuple[str, ...] = (),
-    signal: SignalName = "chirp",
-    amplitude: tuple[float, ...] = (),
-    repeats: int = 3,
     plan_only: bool = False,
     overwrite: bool = False,
     wide: bool = False,
+    excitation: ExcitationOptions = ExcitationOptions(),
+    machine: LinkOptions = LinkOptions(),  # noqa: B008
 ) -> console.Outcome:
     """Excite every joint: plan, check against the limits, excite, record.
 
@@ -49,14 +61,11 @@ def sweep(
     Args:
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: Folder for the logs, one MCAP file per joint.
-        machine: The machine.
-        joints: Joints to excite; repeat it. All if left out.
-        signal: Excitation signal.
-        amplitude: Peak of the command in rad; repeat it for several.
-        repeats: Times each amplitude is repeated.
         plan_only: Show what it would do to the robot and leave.
         overwrite: Replace logs that exist.
         wide: Print every column of the plan: limits of the positions, power and current as well.
+        excitation: What is excited, and how.
+        machine: The machine.
     """
     from pronk.deploy.bench.virtual_sweep import sweep_virtual
     from pronk.deploy.links.address import SIM
@@ -74,16 +83,16 @@ def sweep(
             "--interface and --disable-onboard-controller; give --seed and --sim-params."
         )
     names: list[str] = []
-    for entry in joints:
+    for entry in excitation.joints:
         names += [name for name in entry.split(",") if name]
     with console.progress() as report:
         report("forecast", 0.0)
         plan = make_plan(
             spec,
             names or None,
-            _signal(signal),
-            amplitudes=amplitude or AMPLITUDES,
-            repeats=repeats,
+            _signal(excitation.signal),
+            amplitudes=excitation.amplitude or AMPLITUDES,
+            repeats=excitation.repeats,
         )
         report("forecast", 1.0)
     console.show(plan_table(plan), wide=wide)

@@ -66,6 +66,10 @@ def translate_gains(
     from pronk.identify.match.translate import translate
     from pronk.identify.simulators.profiles import profile
 
+    if not to:
+        raise PronkError(
+            "no framework; give --to NAME, one that `pronk profiles` lists, or --to all."
+        )
     if gains is None:
         first, robot_spec = _stated_gains(robot, begin, drive_gains)
     else:

@@ -72,6 +72,9 @@ class OutputOptions:
     """Keep the capture of every jump (4 MB each), not of the first of each command."""
     overwrite: bool = False
     """Replace the trial in that folder; with conditions, run finished ones again."""
+    wide: bool = False
+    """Print every table and column: all figures of a jump, loads of the drives, scatter with each
+    command as well."""
     definitions: bool = False
     """Also print the equation of every figure."""
 
@@ -150,7 +153,7 @@ def _trial_of_jumps(
     jump_tables = tables.trial_tables(results)
     for table in jump_tables:
         if output.definitions or table.title != tables.DEFINITIONS:
-            console.show(table)
+            console.show(table, wide=output.wide)
     timing = results.timing
     console.say(
         f"{len(results.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
@@ -190,7 +193,7 @@ def _trial_of_jumps(
         page = write_trial_page(output.out)
         report("report", 1.0)
     for table in study_tables:
-        console.show(table)
+        console.show(table, wide=output.wide)
     wrote.append(page)
     return console.Outcome(
         figures={
@@ -234,7 +237,7 @@ def _trial_of_conditions(
         )
     figure = style.save_figure(draw_conditions(results), output.out / "conditions.svg")
     table = tables.condition_table(results)
-    console.show(table)
+    console.show(table, wide=output.wide)
     console.say(
         f"{len(results.cells)} cells of policy and condition in {results.seconds:.0f} s, "
         f"{results.kept} of which were there already"

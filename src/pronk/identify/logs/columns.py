@@ -172,11 +172,16 @@ def _joint_names(
         unknown = [name for name in new_names if name not in names]
         if unknown:
             raise LogError(
-                f"{source}: --joint-names renames {', '.join(unknown)}; the joints are "
-                f"{', '.join(names)}."
+                f"{source}: --joint-names renames {', '.join(unknown)}; the joints of the log are "
+                f"{', '.join(names)}. The log's name stands first, as in --joint-names "
+                f"{names[0]}={next(iter(new_names.values()))}."
             )
         names = tuple(new_names.get(name, name) for name in names)
-    check_names(names, f"{source} (--joint-names THEIRS=OURS renames joints)", LogError)
+    check_names(
+        names,
+        f"{source} (--joint-names THEIRS=OURS renames joints, as in --joint-names m0=knee)",
+        LogError,
+    )
     return names
 
 
@@ -233,7 +238,8 @@ def ordered_joints(
     if stated and names and stated != tuple(names):
         raise LogError(
             f"{values} are {', '.join(names)} by the file and {', '.join(stated)} by "
-            "--joint-order; leave the option out; --joint-names THEIRS=OURS renames joints."
+            "--joint-order; leave the option out; --joint-names renames joints, as in "
+            f"--joint-names {names[0]}={stated[0]}."
         )
     joints = stated or tuple(names)
     if len(joints) != count:

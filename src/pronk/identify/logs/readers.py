@@ -221,6 +221,14 @@ def _without_held_joints(path: Path, log: JointLog, robot: RobotSpec) -> JointLo
     )
 
 
+def _unused_joint(log: JointLog, robot: RobotSpec) -> str:
+    """Return a joint of the robot that the log does not have, for an example."""
+    for name in robot.joint_names:
+        if name not in log.joints:
+            return name
+    return robot.joint_names[0]
+
+
 def _examine(
     path: Path, log: JointLog, robot: RobotSpec | None, rate_hz: float | None
 ) -> list[str]:
@@ -238,7 +246,8 @@ def _examine(
         if robot is not None and joint not in robot.joint_names:
             raise RobotError(
                 f"{path}: no joint {joint!r} in {robot.name}; it has "
-                f"{', '.join(robot.joint_names)}; --joint-names THEIRS=OURS renames joints."
+                f"{', '.join(robot.joint_names)}; --joint-names renames joints, as in "
+                f"--joint-names {joint}={_unused_joint(log, robot)}."
             )
         check_radians(log, joint)
         saturation = saturation_note(log, joint)

@@ -21,6 +21,8 @@ from pronk.tables import NOT_MEASURED, Cell, Column, Table, number
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
+_ALL = "all"
+"""Heading of the column over all commands."""
 _ELSEWHERE = ("height", "distance", "flights", "high_flights")
 """Figures of a jump that have a table of their own."""
 _WALK_TABLE = (
@@ -168,7 +170,7 @@ def landings(trial: TrialResults) -> Table:
         columns=(
             Column(heading="policy: command"),
             Column(heading="commanded"),
-            Column(heading="standing"),
+            Column(heading="standing", is_detail=True),
             Column(heading="jumped"),
             Column(heading="landed"),
             Column(heading="success [%]"),
@@ -195,6 +197,7 @@ def other_figures(trial: TrialResults, policy: str) -> Table:
         columns=_command_columns(cells),
         rows=_figure_rows(figures, cells),
         notes=(origin_note(trial),),
+        is_detail=True,
     )
 
 
@@ -249,6 +252,7 @@ def drive_loads(trial: TrialResults) -> Table:
         ),
         rows=tuple(rows),
         notes=(f"margin: {FIGURES['torque_margin'].equation}.",),
+        is_detail=True,
     )
 
 
@@ -311,7 +315,7 @@ def scatter_table(trial: TrialResults, other: str) -> Table:
     ratios = [ratio for ratio in trial.ratios if ratio.other == other]
     commands: list[str] = []
     for ratio in ratios:
-        command = ratio.case or "all"
+        command = ratio.case or _ALL
         if command not in commands:
             commands.append(command)
     rows: list[tuple[Cell, ...]] = []
@@ -320,10 +324,12 @@ def scatter_table(trial: TrialResults, other: str) -> Table:
         for ratio in ratios:
             if ratio.figure == figure:
                 texts.append(ratio_text(ratio).replace(" to ", "-"))
-        rows.append((figure, *texts, number(PAPER_RATIOS.get(figure, math.nan), 2)))
+        rows.append(
+            (figure.replace("_", " "), *texts, number(PAPER_RATIOS.get(figure, math.nan), 2))
+        )
     columns = [Column(heading="figure")]
     for command in commands:
-        columns.append(Column(heading=command))
+        columns.append(Column(heading=command, is_detail=command != _ALL))
     columns.append(Column(heading="paper, all"))
     return Table(
         title=f"Standard deviations, {other} over {policy}, with 95 % bootstrap intervals",
