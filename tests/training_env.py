@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -68,6 +69,33 @@ def nominal() -> Any:
     cfg = config(N, training_gains("naive", ROBOT))
     without_randomization(cfg)
     return _built(cfg)
+
+
+def by_joint_gains() -> TrainingGains:
+    """Gains of each joint of its own: right and left differ, and so do their frictions."""
+    joints = {}
+    frictions = {}
+    for number, joint in enumerate(ROBOT.joints):
+        stiffness = 16.0 + number
+        damping = 0.40 + 0.01 * number
+        joints[joint.name] = GroupGains(
+            stiffness=stiffness,
+            damping=damping,
+            stiffness_range=0.2,
+            damping_range=0.004,
+            ellipsoid=((0.04, 0.0006), (0.0006, 0.000016)),
+            ellipsoid_center=(stiffness, damping),
+        )
+        frictions[joint.name] = (0.10 + 0.01 * number, 0.105 + 0.01 * number)
+    return replace(
+        MATCHED, joints=joints, frictions=frictions, delay_s=0.006, delay_span_s=(0.0055, 0.0065)
+    )
+
+
+@cache
+def drawn_by_joint() -> Any:
+    """Return `MANY` robots with gains by joint."""
+    return _built(config(MANY, by_joint_gains()))
 
 
 @cache

@@ -12,9 +12,14 @@ import torch
 
 import training_env
 from pronk.errors import PronkError
+from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.guidance import foot_sweep
+from pronk.jump.train.mdp.jump import JumpSettings
+from pronk.jump.train.mdp.motion import standing_leg
 from pronk.jump.train.phases import PHASES, TASKS, curriculum, phase_at
 from pronk.jump.train.tasks.reward_weights import reward_weights
+from pronk.robots.legged import legged
 from training_env import N
 
 pytestmark = pytest.mark.train
@@ -115,3 +120,40 @@ def test_guidance_is_added_to_the_targets_of_a_commanded_jump() -> None:
     curriculum(env).apply(env, PHASES["jump_a"], 1.0)
     command.compute(0.0)
     assert command.guidance_scale == pytest.approx(0.7)
+
+
+def test_swept_feet_stand_still_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 2 m/s the foot of the guided leg moves backwards by 2 m/s, below the hip at mid-push."""
+    body = legged("mini_cheetah")
+    settings = JumpSettings()
+    dt = 0.001
+    offsets = foot_sweep(body, settings, dt).double()
+    steps = round(settings.prompt_s / dt)
+    assert offsets.shape == (steps + 1, 12)
+    assert not offsets[-1].any()
+    # A swept leg is the guided one, turned about its hip; the turn is at 1 m/s.
+    time = dt * torch.arange(1, steps + 1, dtype=torch.float64)
+    length = standing_leg(body) + settings.countermovement(time)
+    pitches = offsets[:-1, [1, 4, 7, 10]]
+    assert torch.equal(pitches, pitches[:, :1].expand(-1, 4)), "all legs alike"
+    assert not offsets[:, [0, 2, 3, 5, 6, 8, 9, 11]].any()
+    ahead = length * torch.tan(pitches[:, 0])
+    pushes = time > settings.fall_s
+    speed = ahead[pushes].diff() / dt
+    torch.testing.assert_close(speed, torch.full_like(speed, -1.0), rtol=0.0, atol=1e-3)
+    middle = settings.fall_s + 0.5 * (settings.prompt_s - settings.fall_s)
+    assert float(ahead[round(middle / dt) - 1]) == pytest.approx(0.0, abs=2e-3)
+    env = training_env.fresh(training_env.nominal(), "jump_a", scripted=True)
+    command = motion_command(env)
+    command.jump[:2] = True
+    command.velocity[0, 0] = 2.0
+    command.compute(0.0)
+    action = joint_position_action(env)
+    plain = action.guidance.clone()
+    assert torch.equal(plain[0], plain[1]), "blind to the command"
+    monkeypatch.setattr(command.cfg, "guidance_sweep", 0.5)
+    command.compute(0.0)
+    added = action.guidance - plain
+    first = foot_sweep(body, settings, env.step_dt)[0]
+    torch.testing.assert_close(added[0], command.guidance_scale * 0.5 * 2.0 * first)
+    assert not added[1].any()

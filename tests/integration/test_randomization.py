@@ -13,11 +13,18 @@ from scipy.stats import chisquare, kstest
 pytest.importorskip("mjlab")
 
 import torch
+from mjlab.envs import ManagerBasedRlEnv
 
 import training_env
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.actions import DelayedJointPositionActionCfg, joint_position_action
-from pronk.jump.train.mdp.events import randomize_base_mass, randomize_decimation, reset_state
+from pronk.jump.train.mdp.events import (
+    randomize_base_mass,
+    randomize_decimation,
+    randomize_strength,
+    reset_state,
+)
+from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
 from pronk.robots.legged import legged
 from training_env import MANY, MATCHED, ROBOT, N, drawn
 
@@ -239,6 +246,116 @@ def test_delays_are_drawn_per_episode_and_torques_follow_the_drawn_gains(env: An
     second = drawn(env)["delay"]
     assert torch.equal(second[1::2], first["delay"][1::2])
     assert 0.4 < (second[::2] != first["delay"][::2]).float().mean() < 0.95
+
+
+# --- Gains by joint, and weak drives -------------------------------------------------------------
+
+
+@pytest.fixture
+def joints_env() -> Any:
+    return training_env.fresh(training_env.drawn_by_joint(), scripted=True)
+
+
+def frictions(env: Any) -> Any:
+    """Dry friction of the joints of each robot, in the robot's order. (N, 12)"""
+    joints = env.scene["robot"].indexing.joint_v_adr.long()
+    return env.sim.model.dof_frictionloss[:, joints].clone()
+
+
+def test_by_joint_a_robot_is_the_measured_one_or_its_mirror_image(joints_env: Any) -> None:
+    """All of its joints together: pairs in their ellipses, friction in its interval."""
+    gains = training_env.by_joint_gains()
+    mirror = {"FR": "FL", "FL": "FR", "HR": "HL", "HL": "HR"}
+    joints_env.event_manager.apply(mode="startup")
+    stiffness, damping = drawn(joints_env)["stiffness"], drawn(joints_env)["damping"]
+    friction = frictions(joints_env)
+    fits = torch.ones(MANY, 2, dtype=torch.bool)
+    for i, joint in enumerate(ROBOT.joints):
+        leg, _, rest = joint.name.partition("_")
+        for side, name in enumerate((joint.name, f"{mirror[leg]}_{rest}")):
+            own = gains.joints[name]
+            offset = torch.stack((stiffness[:, i] - own.stiffness, damping[:, i] - own.damping))
+            inverse = torch.linalg.inv(torch.tensor(own.ellipsoid, dtype=torch.float64))
+            distance = torch.einsum("in,ij,jn->n", offset.double(), inverse, offset.double())
+            low, high = gains.frictions[name]
+            is_within = (low - 1e-6 <= friction[:, i]) & (friction[:, i] <= high + 1e-6)
+            fits[:, side] &= (distance <= 1.001) & is_within
+    assert (fits.sum(dim=1) == 1).all(), "one or the other, not a bit of both"
+    assert 0.25 < fits[:, 1].float().mean() < 0.75
+
+
+def test_by_joint_stiffness_and_damping_are_correlated_as_measured(joints_env: Any) -> None:
+    offsets = []
+    for _ in range(10):
+        joints_env.event_manager.apply(mode="startup")
+        for name in ("stiffness", "damping"):
+            # Of the measured robots: right front hips are softer than left ones, by 3 and .03.
+            offsets.append(drawn(joints_env)[name][:, 0])
+    stiffness, damping = torch.cat(offsets[::2]), torch.cat(offsets[1::2])
+    measured = stiffness < 17.0
+    stiffness, damping = stiffness[measured].double(), damping[measured].double()
+    correlation = np.corrcoef(stiffness, damping)[0, 1]
+    assert correlation == pytest.approx(0.75, abs=0.08)  # 6e-4 / sqrt(.04 16e-6)
+    # Uniform in an ellipse: a quarter of the squared half-width along each axis.
+    assert float(stiffness.std()) == pytest.approx(0.1, rel=0.15)
+    assert float(stiffness.mean()) == pytest.approx(16.0, abs=0.03)
+
+
+def test_by_joint_a_delay_keeps_its_mean_between_two_physics_steps(joints_env: Any) -> None:
+    """5.5 to 6.5 ms: one or two steps of 5 ms, 1.2 in the mean."""
+    lags = []
+    for _ in range(20):
+        joints_env.reset()
+        lags.append(drawn(joints_env)["delay"])
+    lag = torch.cat(lags).float()
+    assert set(lag.unique().tolist()) == {1.0, 2.0}
+    assert float(lag.mean()) == pytest.approx(1.2, abs=5 * 0.4 / math.sqrt(lag.numel()))
+
+
+def test_by_joint_the_undisturbed_robot_is_the_measured_one() -> None:
+    gains = training_env.by_joint_gains()
+    cfg = training_env.config(2, gains)
+    without_randomization(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset(seed=0)
+    parameters = drawn(env)
+    for i, joint in enumerate(ROBOT.joints):
+        own = gains.joints[joint.name]
+        assert parameters["stiffness"][:, i].tolist() == pytest.approx([own.stiffness] * 2)
+        assert parameters["damping"][:, i].tolist() == pytest.approx([own.damping] * 2)
+        assert frictions(env)[:, i].tolist() == pytest.approx([0.1025 + 0.01 * i] * 2)
+    assert parameters["delay"].tolist() == [[1], [1]]
+
+
+def test_weak_drives_give_their_share_of_everything(joints_env: Any) -> None:
+    """Drawn again and again, nothing accumulates; the line is that of a weaker magnet."""
+    cfg = joints_env.cfg
+    battery = joint_position_action(joints_env).battery
+    for _ in range(3):
+        joints_env.event_manager.apply(mode="startup")
+        before = drawn(joints_env)["stiffness"]
+        randomize_strength(joints_env, None, weakest=0.7)
+    parameters = drawn(joints_env)
+    share = parameters["stiffness"] / before
+    strength = share[:, :1]
+    assert_uniform(strength, 0.7, 1.0)
+    torch.testing.assert_close(share, strength.expand(-1, 12), rtol=1e-5, atol=0.0)
+    for drive in joints_env.scene["robot"].actuators:
+        rated = ROBOT.joint(drive.target_names[0]).drive
+        voltage = battery.voltage
+        expected = [
+            (drive.force_limit, rated.effort_limit * strength),
+            (drive.saturation_effort, rated.stall_torque * strength * voltage),
+            (drive.velocity_limit_motor, rated.no_load_speed / strength * voltage),
+        ]
+        for value, of_drive in expected:
+            torch.testing.assert_close(value, of_drive.expand_as(value), rtol=1e-4, atol=0.0)
+    randomize_strength(joints_env, None, weakest=1.0)
+    joints_env.event_manager.apply(mode="startup")
+    training_cfg = training_env.config(2, MATCHED)
+    draw_weak_drives(training_cfg, 0.7)
+    assert list(training_cfg.events)[-1] == "strength", "after the gains"
+    assert "strength" not in cfg.events
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from pronk.jump.train.mdp import commands
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.motion import JointMotion, LegMotion, StepMotion, TrunkMotion
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
-from pronk.jump.train.tasks.reward_weights import reward_weights
+from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train
@@ -247,6 +247,33 @@ def test_events_earn_their_weight_once(
     monkeypatch.setattr(command.state, EVENTS[name], torch.arange(N) / 4)
     earned = value(env, name) * env.step_dt
     assert earned.tolist() == pytest.approx([i / 4 for i in range(N)])
+
+
+@pytest.mark.parametrize("decimation", [2, 6])
+def test_candidates_are_events_of_the_first_lift_off(
+    env: Any, monkeypatch: pytest.MonkeyPatch, decimation: int
+) -> None:
+    """1.2 m/s of commanded 1 (rewarded up to 1.35 in jump mode), 1.25 of 2.5 m/s upwards."""
+    fields = {"velocity_heading": v(1.2, 0.5), "velocity_world": v(1.2, 0.5, 1.25)}
+    command = pretend(env, {"command": v(1.0, 0.0, 0.0), **fields})
+    env.cfg.decimation = decimation
+    terms = candidate_terms()
+
+    def earned(name: str) -> list[float]:
+        return (terms[name].func(env, **terms[name].params) * env.step_dt).tolist()
+
+    assert not any(earned("liftoff_speed") + earned("liftoff_angle"))
+    lifts = torch.tensor([0.0, 1.0] + [0.0] * (N - 2))
+    monkeypatch.setattr(command.state, "first_liftoff", lifts)
+    monkeypatch.setattr(command.state, "reward_scale", torch.full((N,), 0.5))
+    monkeypatch.setattr(command.state, "travel_gain", torch.full((N,), 0.3))
+    assert earned("liftoff_speed") == pytest.approx([0.0, 0.5 * 1.2 * 0.5] + [0.0] * (N - 2))
+    angle = math.atan2(1.25, 1.2) - math.atan2(2.0, 1.35)
+    share = math.hypot(1.25, 1.2) / math.hypot(2.0, 1.35)
+    expected = 0.5 * math.exp(-0.5 * (angle / 0.15) ** 2) * share
+    assert earned("liftoff_angle")[JUMPER] == pytest.approx(expected, rel=1e-4)
+    # Half way to 2 m/s forwards: 1 - .6 / 2.
+    assert earned("height_by_speed") == pytest.approx([0.3 * 0.7] * N)
 
 
 def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:

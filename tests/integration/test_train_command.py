@@ -20,7 +20,7 @@ from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import stop_signals
 from pronk.jump.train.run import run_training
-from pronk.jump.train.settings import TrainSettings
+from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
 
 pytestmark = pytest.mark.train
@@ -52,6 +52,10 @@ NAIVE = ("--gains", "naive")
         (("walk", *NAIVE, "--envs", "1"), "envs is 1|2 or more"),
         (("walk", *NAIVE, "--ellipsoid"), "ellipsoid|box"),
         (("walk", *NAIVE, "--ellipsoid", "--resume"), "holds no run"),
+        (("walk", *NAIVE, "--ellipsoid", "--by-joint"), "--ellipsoid|--by-joint|one of them"),
+        (("walk", *NAIVE, "--by-joint"), "--by-joint|--ranges-from"),
+        (("walk", *NAIVE, "--weakest-drive", "0.1"), "--weakest-drive is 0.1|0.3 to 1"),
+        (("walk", *NAIVE, "--weakest-drive", "nan"), "--weakest-drive is nan|0.3 to 1"),
         (("walk", *NAIVE, "--robot", "so101"), "so101|no training task|mini_cheetah"),
         (("walk", "--resume"), "holds no run|--resume"),
     ],
@@ -86,7 +90,12 @@ def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
     again = TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored)
     assert again.iterations == {**TASKS["all"], "walk": 7}
     assert (again.seed, again.envs, again.gains, again.robot) == (0, 4096, "naive", "mini_cheetah")
-    changes: Any = ({"envs": 8}, {"gains": "x.yaml"}, {"ellipsoid": True}, {"phase": ("walk=8",)})
+    changes: Any = (
+        {"envs": 8},
+        {"gains": "x.yaml"},
+        {"draws": DrawSettings(ellipsoid=True)},
+        {"phase": ("walk=8",)},
+    )
     for changed in changes:
         with pytest.raises(PronkError, match="leave it out"):
             TrainSettings(task="all", out=tmp_path, resume=True, **changed).resumed(stored)

@@ -11,7 +11,14 @@ import mujoco
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.identify.match.gains import FittedValue, GroupGains, JointGains, MatchedGains, save_gains
+from pronk.identify.match.gains import (
+    FittedValue,
+    GroupGains,
+    JointGains,
+    MatchedGains,
+    MatchQuality,
+    save_gains,
+)
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.robots import load_robot
@@ -147,3 +154,119 @@ def test_joints_of_a_group_with_different_gains_have_no_naive_pair() -> None:
     joints = tuple(stiff if j.name == "FR_knee" else j for j in ROBOT.joints)
     with pytest.raises(PronkError, match="group knee"):
         training_gains("naive", replace(ROBOT, joints=joints))
+
+
+# --- By joint ------------------------------------------------------------------------------------
+
+
+def measured_joints() -> dict[str, JointGains]:
+    """Every joint with a stiffness of its own, and what is known about it."""
+    joints = {}
+    for number, name in enumerate(ROBOT.joint_names):
+        joints[name] = JointGains(
+            stiffness=FittedValue(value=20.0 + number, total95=(19.0 + number, 20.5 + number)),
+            damping=FittedValue(value=0.5, repeat95=(0.49, 0.51), total95=(0.45, 0.52)),
+            armature=FittedValue(value=0.0026),
+            frictionloss=FittedValue(value=0.2, total95=(0.15, 0.3)),
+            delay_s=FittedValue(value=5e-3, total95=(4e-3, 7e-3)),
+            covariance=((1e-4, 1.6e-6), (1.6e-6, 4e-8)),
+        )
+    return joints
+
+
+def by_joint(tmp_path: Path, joints: dict[str, JointGains]) -> TrainingGains:
+    return training_gains(written(tmp_path, joints=joints), ROBOT, by_joint=True)
+
+
+def test_by_joint_each_has_its_own_pair_interval_and_correlation(tmp_path: Path) -> None:
+    gains = by_joint(tmp_path, measured_joints())
+    for number, joint in enumerate(ROBOT.joints):
+        drawn = gains.of(joint)
+        assert (drawn.stiffness, drawn.damping) == (20.0 + number, 0.5)
+        assert drawn.ellipsoid_center == (20.0 + number, 0.5)
+        # The farther end of each total interval.
+        assert drawn.stiffness_range == pytest.approx(1.0)
+        assert drawn.damping_range == pytest.approx(0.05)
+        # 1.6e-6 / sqrt(1e-4 4e-8) = .8.
+        (a, b), (c, d) = drawn.ellipsoid
+        assert (a, b, c, d) == pytest.approx((1.0, 0.04, 0.04, 0.0025))
+        assert gains.frictions[joint.name] == (0.15, 0.3)
+    assert gains.delay_span_s == (4e-3, 7e-3)
+    by_group = training_gains(tmp_path / "gains.yaml", ROBOT)
+    assert (by_group.joints, by_group.frictions, by_group.delay_span_s) == ({}, {}, None)
+    assert by_group.of(ROBOT.joint("FL_knee")) == GROUPS["knee"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "stiffness_range", "damping_range"),
+    [
+        # The spread over amplitudes, 12 % of 20, beyond the interval; the damping has its own.
+        ({"quality": MatchQuality(amplitude_spread=0.12)}, 2.4, 0.05),
+        # No total interval: that of repeats for the stiffness, the spread for the damping.
+        (
+            {
+                "stiffness": FittedValue(value=20.0, repeat95=(19.9, 20.6)),
+                "damping": FittedValue(value=0.5, repeat95=(0.499, 0.501)),
+                "quality": MatchQuality(amplitude_spread=0.02),
+            },
+            0.6,
+            0.01,
+        ),
+        # Nothing known: half a percent.
+        ({"stiffness": FittedValue(value=20.0), "damping": FittedValue(value=0.5)}, 0.1, 0.0025),
+        # Never down to zero.
+        ({"stiffness": FittedValue(value=20.0, total95=(1.0, 400.0))}, 18.0, 0.05),
+    ],
+)
+def test_widths_by_what_is_known(
+    tmp_path: Path, changes: dict[str, Any], stiffness_range: float, damping_range: float
+) -> None:
+    joints = measured_joints()
+    joints["FR_hip_roll"] = replace(joints["FR_hip_roll"], **changes)
+    drawn = by_joint(tmp_path, joints).joints["FR_hip_roll"]
+    assert drawn.stiffness_range == pytest.approx(stiffness_range)
+    assert drawn.damping_range == pytest.approx(damping_range)
+
+
+def test_by_joint_without_friction_correlation_or_delay_interval(tmp_path: Path) -> None:
+    joint = JointGains(
+        stiffness=FittedValue(value=20.0),
+        damping=FittedValue(value=0.5),
+        armature=FittedValue(value=0.0026),
+        delay_s=FittedValue(value=5e-3),
+    )
+    gains = by_joint(tmp_path, dict.fromkeys(ROBOT.joint_names, joint))
+    assert gains.joints["FL_knee"].ellipsoid[0][1] == 0.0
+    assert gains.frictions["FL_knee"] == (0.2, 0.2), "that of the robot's drives"
+    assert gains.delay_span_s == (5e-3, 5e-3)
+
+
+def test_naive_by_joint_differs_by_the_middles_alone(tmp_path: Path) -> None:
+    path = written(tmp_path, joints=measured_joints())
+    matched = training_gains(path, ROBOT, by_joint=True)
+    naive = training_gains("naive", ROBOT, like=path, by_joint=True)
+    assert naive.delay_span_s == matched.delay_span_s
+    for name, own in naive.joints.items():
+        assert (own.stiffness, own.damping) == (17.0, 0.4)
+        assert own.ellipsoid_center == pytest.approx((17.0, 0.4))
+        assert own.ellipsoid == matched.joints[name].ellipsoid
+    with pytest.raises(PronkError, match=r"gains\.yaml"):
+        training_gains("naive", ROBOT, by_joint=True)
+
+
+def test_by_joint_needs_all_joints(tmp_path: Path) -> None:
+    joints = measured_joints()
+    del joints["HL_knee"]
+    with pytest.raises(ArtefactError, match="HL_knee"):
+        by_joint(tmp_path, joints)
+
+
+def test_the_shipped_gains_have_ellipses_by_joint() -> None:
+    """A file of the first schema: no total interval, the spread over amplitudes of 1 to 2 %."""
+    path = Path(__file__).parents[2] / "policies" / "gains.yaml"
+    gains = training_gains(path, ROBOT, by_joint=True)
+    for drawn in gains.joints.values():
+        assert 0.01 < drawn.stiffness_range / drawn.stiffness < 0.03
+        assert 0.01 < drawn.damping_range / drawn.damping < 0.03
+        (a, b), (_, d) = drawn.ellipsoid
+        assert 0.3 < b / (a * d) ** 0.5 < 1.0

@@ -272,9 +272,13 @@ def _with_explicit_values(arguments: list[str], annotations: Mapping[str, Any]) 
     tyro expects a value there.
     """
     kinds = dict(annotations)
-    for kind in annotations.values():
-        if dataclasses.is_dataclass(kind):
-            kinds |= get_type_hints(kind)
+    groups = list(annotations.values())
+    while groups:
+        group = groups.pop()
+        if dataclasses.is_dataclass(group):
+            hints = get_type_hints(group)
+            kinds |= hints
+            groups += hints.values()
     explicit = {}
     for name, kind in kinds.items():
         if kind == bool | None:

@@ -10,8 +10,8 @@ neuron of the paper's widening (N3).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from pronk.errors import PronkError
@@ -27,6 +27,8 @@ STEPS_PER_ITERATION = 24
 
 Span = tuple[float, float]
 """Values at the beginning and at the end of a phase."""
+Changes = Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
+"""`weights` and `jump_scales` of a recipe: spans by term and phase."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +139,26 @@ def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]
     return phases[-1], 1.0
 
 
+def changed_phases(changes: Changes) -> dict[str, Phase]:
+    """Return the phases with the weights and jump scales of a recipe.
+
+    Args:
+        changes: `weights` and `jump_scales`, each by term and phase.
+    """
+    phases = dict(PHASES)
+    for section in ("weights", "jump_scales"):
+        for term, spans in changes.get(section, {}).items():
+            for name, (start, end) in spans.items():
+                phase = phases[name]
+                if section == "weights":
+                    weights = {**phase.weights, term: (start, end)}
+                    phases[name] = replace(phase, weights=weights)
+                else:
+                    scales = {**phase.jump_scales, term: (start, end)}
+                    phases[name] = replace(phase, jump_scales=scales)
+    return phases
+
+
 class Curriculum:
     """Curriculum term: sets the rewards and the command term to the phase of the iteration.
 
@@ -147,6 +169,8 @@ class Curriculum:
         """Remember the rewards' weights and parameters without any phase."""
         self.iterations = {name: cfg.params[name] for name in PHASES}
         self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
+        self.phases = changed_phases(cfg.params.get("changes") or {})
+        """The phases by name, with the changes of a recipe."""
         self._iteration = -1
         self._weights: dict[str, float] = {}
         self._params: dict[str, dict[str, Any]] = {}
@@ -167,6 +191,7 @@ class Curriculum:
         jump_a: int,
         jump_b: int,
         steps_per_iteration: int,
+        changes: Changes | None = None,
     ) -> dict[str, float]:
         """Apply the phase.
 
@@ -177,6 +202,7 @@ class Curriculum:
             jump_a: The same.
             jump_b: The same.
             steps_per_iteration: Policy steps of an iteration, read at the beginning.
+            changes: What a recipe changes, read at the beginning; see `changed_phases`.
 
         Returns:
             What is logged: number of the phase, and the fraction of it that is over.
@@ -185,7 +211,7 @@ class Curriculum:
         name, done = phase_at(self.iterations, iteration)
         if iteration != self._iteration:
             self._iteration = iteration
-            self.apply(env, PHASES[name], done)
+            self.apply(env, self.phases[name], done)
         return {"phase": float(list(PHASES).index(name)), "done": done}
 
     def apply(self, env: ManagerBasedRlEnv, phase: Phase, done: float) -> None:

@@ -3,6 +3,7 @@
 params/env.yaml, params/agent.yaml   every setting, as mjlab writes them
 provenance.json                      settings, sessions, figures of each phase
 gains.yaml                           copy of the gains, where the run has a file of gains
+recipe.yaml                          copy of the recipe, where the run has one
 model_*.pt, PHASE.pt                 checkpoints
 events.out.*                         TensorBoard
 train.log                            what mjlab, Warp and rsl_rl print
@@ -43,6 +44,11 @@ class RunFolder:
     def gains(self) -> Path:
         """The copy of the file of gains."""
         return self.path / "gains.yaml"
+
+    @property
+    def recipe(self) -> Path:
+        """The copy of the recipe."""
+        return self.path / "recipe.yaml"
 
     def checkpoint(self) -> Path:
         """Return the last numbered checkpoint; ArtefactError if there is none."""

@@ -20,10 +20,12 @@ from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import JumpRunnerCfg
 from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.tasks import JUMP_TASK, Task, load_task
+from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives
 from pronk.robots.robot import RobotSpec
 
 COPIED_VARIABLES = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
@@ -77,16 +79,21 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
         task.robot,
         like=settings.ranges_from,
         allow_unmatched=bool(settings.allow_unmatched),
+        by_joint=bool(settings.draws.by_joint),
     )
+    recipe = None if settings.recipe is None else load_recipe(settings.recipe)
     start = None
     if settings.init_checkpoint is not None:
         start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
-    _env_cfg(task, gains, settings)  # refuses impossible gains
+    _env_cfg(task, gains, settings, recipe)  # refuses impossible gains and recipes
     folder.path.mkdir(parents=True, exist_ok=True)
     gains_file = settings.gains_file
     if gains_file is not None:
         with written_whole(folder.gains) as temporary_path:
             shutil.copyfile(gains_file, temporary_path)
+    if settings.recipe is not None:
+        with written_whole(folder.recipe) as temporary_path:
+            shutil.copyfile(settings.recipe, temporary_path)
     start_sha256 = ""
     if start is not None:
         checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
@@ -101,6 +108,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
             "virtual": gains.virtual,
             "unmatched": dict(gains.unmatched),
         },
+        "recipe": None if recipe is None else recipe.record(),
         "start_sha256": start_sha256,
         "phases": {},
         "finished": False,
@@ -146,7 +154,9 @@ def initial_state(path: Path, iterations: int) -> dict[str, Any]:
 
 def run_gains(folder: RunFolder, robot: RobotSpec) -> TrainingGains:
     """Return the gains of a run, from its copy of the file, unless that was changed."""
-    recorded = folder.read()["gains"]
+    record = folder.read()
+    recorded = record["gains"]
+    by_joint = bool(record["settings"].get("by_joint", False))
     if not recorded["sha256"]:
         return training_gains(NAIVE, robot)
     if not folder.gains.is_file() or sha256(folder.gains) != recorded["sha256"]:
@@ -156,20 +166,42 @@ def run_gains(folder: RunFolder, robot: RobotSpec) -> TrainingGains:
         )
     # What the run began with was accepted then; its hash says that this is the same file.
     if recorded["name"] == NAIVE:
-        return training_gains(NAIVE, robot, like=folder.gains, allow_unmatched=True)
-    return training_gains(folder.gains, robot, allow_unmatched=True)
+        return training_gains(
+            NAIVE, robot, like=folder.gains, allow_unmatched=True, by_joint=by_joint
+        )
+    return training_gains(folder.gains, robot, allow_unmatched=True, by_joint=by_joint)
 
 
-def _env_cfg(task: Task, gains: TrainingGains, settings: TrainSettings) -> Any:
+def run_recipe(folder: RunFolder) -> Recipe | None:
+    """Return the recipe of a run, from its copy of the file, unless that was changed."""
+    recorded = folder.read().get("recipe")
+    if recorded is None:
+        return None
+    if not folder.recipe.is_file() or sha256(folder.recipe) != recorded["sha256"]:
+        raise ArtefactError(
+            f"{folder.recipe}: missing or changed since the run began; put the file with SHA-256 "
+            f"{recorded['sha256'][:12]}... back, or begin a new run."
+        )
+    return load_recipe(folder.recipe)
+
+
+def _env_cfg(
+    task: Task, gains: TrainingGains, settings: TrainSettings, recipe: Recipe | None
+) -> Any:
     """Return the configuration of the environment."""
-    return task.env_cfg(
+    cfg = task.env_cfg(
         task.robot,
         gains,
         iterations=settings.iterations,
-        gain_shape="ellipsoid" if settings.ellipsoid else "box",
+        gain_shape="ellipsoid" if settings.draws.ellipsoid else "box",
         num_envs=settings.envs,
         seed=settings.seed,
     )
+    if settings.draws.weakest_drive not in (None, 1.0):
+        draw_weak_drives(cfg, settings.draws.weakest_drive)
+    if recipe is not None:
+        apply_recipe(cfg, recipe)
+    return cfg
 
 
 def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, ...]) -> str:
@@ -187,6 +219,9 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
             gains_text += " (of the virtual robot)"
         if gains.get("unmatched"):
             gains_text += f" (NO MATCH of {', '.join(gains['unmatched'])})"
+    if settings.draws.by_joint:
+        gains_text += " by joint"
+    recipe_text = "" if settings.recipe is None else f", recipe {settings.recipe}"
     device_text = "cpu"
     if len(gpus) == 1:
         device_text = "cuda"
@@ -194,8 +229,8 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
         device_text = f"each of {len(gpus)} GPUs"
     return (
         f"training {settings.task} of {settings.robot}: {', '.join(phases)} iterations, "
-        f"{settings.envs} robots on {device_text}, {gains_text}, seed {settings.seed}; run folder "
-        f"{settings.out}"
+        f"{settings.envs} robots on {device_text}, {gains_text}{recipe_text}, seed "
+        f"{settings.seed}; run folder {settings.out}"
     )
 
 
@@ -253,13 +288,16 @@ def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
     agent.wandb_project = "pronk"
     agent.show_progress = True
     agent.start_sha256 = folder.read()["start_sha256"]
+    recipe = run_recipe(folder)
+    agent.recipe_sha256 = "" if recipe is None else recipe.sha256
+    agent.torch_compile_mode = "default" if settings.devices.compile else None
     if settings.session.minutes is not None:
         agent.stop_at = time.time() + 60.0 * settings.session.minutes
     if checkpoint.latest_checkpoint(folder.path) is not None:
         agent.resume = True
         agent.load_run = f"^{re.escape(folder.path.resolve().name)}$"
         agent.load_checkpoint = r"^model_\d+\.pt$"
-    return TrainConfig(env=_env_cfg(task, gains, settings), agent=agent)
+    return TrainConfig(env=_env_cfg(task, gains, settings, recipe), agent=agent)
 
 
 def _train_process(config: TrainConfig, log_dir: Path) -> None:

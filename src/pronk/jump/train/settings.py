@@ -12,6 +12,9 @@ import tyro
 from pronk.errors import PronkError
 from pronk.jump.train.phases import TASKS
 
+WEAKEST_DRIVE = 0.3
+"""Smallest share of its torque that a drive may be drawn with: with less a robot cannot stand."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceSettings:
@@ -21,6 +24,31 @@ class DeviceSettings:
     """auto: a GPU if there is one; the CPU is for tests."""
     gpu_ids: str | None = None
     """GPUs of this host, as in 0,1, or all; 0."""
+    compile: bool = False
+    """Compile actor and critic with torch.compile, which changes how they round."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawSettings:
+    """How the robots differ in their drives. None: left out."""
+
+    ellipsoid: bool | None = None
+    """Draw gains from each group's ellipsoid, or its box; box."""
+    by_joint: bool | None = None
+    """Draw each joint about its own gains, with friction and delay, by their intervals in
+    gains.yaml, or about those of its group; group."""
+    weakest_drive: float | None = None
+    """Draw the torque of each robot's drives from this share of nominal to all of it; 1."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and options that do not go together."""
+        if self.ellipsoid and self.by_joint:
+            raise PronkError(
+                "--ellipsoid and --by-joint: the ellipsoid is that of a group; give one of them."
+            )
+        weakest = self.weakest_drive
+        if weakest is not None and not WEAKEST_DRIVE <= weakest <= 1.0:
+            raise PronkError(f"--weakest-drive is {weakest:g}; expected {WEAKEST_DRIVE:g} to 1.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +88,9 @@ class TrainSettings:
     """Seed of all draws; 1. Process r of several draws from seed + r."""
     phase: tuple[str, ...] = ()
     """PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."""
-    ellipsoid: bool | None = None
-    """Draw gains from each group's ellipsoid, or its box; box."""
+    draws: Annotated[DrawSettings, tyro.conf.arg(name="")] = field(default_factory=DrawSettings)
+    recipe: Path | None = None
+    """YAML file with changed weights of rewards, as those in examples/recipes."""
     devices: Annotated[DeviceSettings, tyro.conf.arg(name="")] = field(
         default_factory=DeviceSettings
     )
@@ -83,6 +112,11 @@ class TrainSettings:
             raise PronkError(
                 f"--ranges-from {self.ranges_from} goes with --gains naive; {self.gains} has its "
                 "own ranges."
+            )
+        if self.draws.by_joint and self.gains == "naive" and self.ranges_from is None:
+            raise PronkError(
+                "--by-joint draws by the intervals of a gains.yaml; give --ranges-from with "
+                "--gains naive, or leave it out."
             )
         if self.init_checkpoint is not None and self.task != "jump":
             raise PronkError(
@@ -148,7 +182,11 @@ class TrainSettings:
             robot="mini_cheetah" if self.robot is None else self.robot,
             envs=4096 if self.envs is None else self.envs,
             seed=1 if self.seed is None else self.seed,
-            ellipsoid=False if self.ellipsoid is None else self.ellipsoid,
+            draws=DrawSettings(
+                ellipsoid=bool(self.draws.ellipsoid),
+                by_joint=bool(self.draws.by_joint),
+                weakest_drive=1.0 if self.draws.weakest_drive is None else self.draws.weakest_drive,
+            ),
             allow_unmatched=bool(self.allow_unmatched),
         )
 
@@ -179,8 +217,14 @@ class TrainSettings:
             init_checkpoint=_optional_path(stored["init_checkpoint"]),
             envs=stored["envs"],
             seed=stored["seed"],
-            ellipsoid=stored["ellipsoid"],
-            # Runs of earlier versions had no joints that are no match.
+            # Runs of earlier versions had no recipes, groups of joints alone, full drives, and no
+            # joints that are no match.
+            draws=DrawSettings(
+                ellipsoid=stored["ellipsoid"],
+                by_joint=stored.get("by_joint", False),
+                weakest_drive=stored.get("weakest_drive", 1.0),
+            ),
+            recipe=_optional_path(stored.get("recipe")),
             allow_unmatched=stored.get("allow_unmatched", False),
             phase=tuple(stored["phase"]),
         )
@@ -195,7 +239,10 @@ class TrainSettings:
             "init_checkpoint": _optional_text(self.init_checkpoint),
             "envs": self.envs,
             "seed": self.seed,
-            "ellipsoid": self.ellipsoid,
+            "ellipsoid": self.draws.ellipsoid,
+            "by_joint": self.draws.by_joint,
+            "weakest_drive": self.draws.weakest_drive,
+            "recipe": _optional_text(self.recipe),
             "allow_unmatched": self.allow_unmatched,
             "phase": list(self.phase),
         }

@@ -34,11 +34,21 @@ class DelayedJointPositionActionCfg(JointPositionActionCfg):
 
     delay_steps: tuple[int, int] = (0, 0)
     """Smallest and largest delay, drawn uniformly at the start of an episode [physics steps]."""
+    delay_span: tuple[float, float] | None = None
+    """If not None: the delay is drawn uniformly in this span, within `delay_steps`, and rounded up
+    or down by chance so that its mean is right [physics steps]."""
 
     def __post_init__(self) -> None:
         """Refuse a delay that is negative or falls."""
         super().__post_init__()
         low, high = self.delay_steps
+        if self.delay_span is not None and not (
+            low <= self.delay_span[0] <= self.delay_span[1] <= high
+        ):
+            raise PronkError(
+                f"delay_span is {self.delay_span}; expected it rising within {low} to {high} "
+                "physics steps."
+            )
         if not 0 <= low <= high:
             raise PronkError(
                 f"delay_steps is {low} to {high} physics steps; expected 0 or more, rising."
@@ -127,8 +137,16 @@ class DelayedJointPositionAction(JointPositionAction):
             return
         self._targets[:, robots] = self._default[robots]
         if low < high:
-            delays = torch.randint(low, high + 1, self.lag.shape, device=self.device)
+            if self.cfg.delay_span is None:
+                delays = torch.randint(low, high + 1, self.lag.shape, device=self.device)
+            else:
+                delays = self._rounded_delays(self.cfg.delay_span).clamp(low, high)
             self.lag[robots] = delays[robots]
+
+    def _rounded_delays(self, span: tuple[float, float]) -> Tensor:
+        """Draw delays in a span, rounded by chance to physics steps of the same mean."""
+        delays = torch.empty(self.lag.shape, device=self.device).uniform_(*span)
+        return (delays + torch.rand_like(delays)).floor().to(self.lag.dtype)
 
 
 def joint_position_action(env: ManagerBasedRlEnv) -> DelayedJointPositionAction:

@@ -55,7 +55,7 @@ def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[DcMotorActuatorC
     cfgs = []
     for group in robot.groups:
         joints = robot.group(group)
-        group_gains = gains.groups[group]
+        group_gains = gains.groups[group]  # by joint: until `events.randomize_drives`
         drive = joints[0].drive
         for joint in joints:
             if joint.drive != drive:
@@ -96,6 +96,7 @@ class Battery:
         for drive in self._drives:
             back_emf = drive.saturation_effort / drive.velocity_limit_motor
             self._heat[:, drive.target_ids] = 1.0 / back_emf
+        self._strength = torch.ones_like(self._heat[:, :1])
         self.no_load = torch.ones_like(self._heat[:, :1])
         """U over the rated voltage. (N, 1)"""
         self.drop = torch.zeros_like(self.no_load)
@@ -117,6 +118,23 @@ class Battery:
         self.drop.copy_(4.0 * resistance / rated**2)
         self.voltage.copy_(self.no_load)
         self.ideal = False
+        self._apply()
+
+    def weaken(self, strength: Tensor) -> None:
+        """Give the motors of each robot a share of their nominal motor constant.
+
+        Stall torque, K U / r, is in proportion to the motor constant K, no-load speed, U / K, in
+        inverse proportion, and the heat per torque squared to its inverse square.
+
+        Args:
+            strength: The shares, (N, 1).
+        """
+        change = strength / self._strength
+        for stall_torque, speed in zip(self._rated_stall_torques, self._rated_speeds, strict=True):
+            stall_torque.mul_(change)
+            speed.div_(change)
+        self._heat.div_(change.square())
+        self._strength = strength
         self._apply()
 
     def advance(self) -> None:

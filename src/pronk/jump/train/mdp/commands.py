@@ -16,9 +16,14 @@ from torch import Tensor
 
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import joint_position_action
-from pronk.jump.train.mdp.guidance import guidance
+from pronk.jump.train.mdp.guidance import foot_sweep, guidance
 from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
-from pronk.jump.train.mdp.motion import StepMotion, measure_motion, standing_leg
+from pronk.jump.train.mdp.motion import (
+    StepMotion,
+    measure_motion,
+    mirror_joints,
+    standing_leg,
+)
 from pronk.jump.train.mdp.speed_ranges import SpeedRanges
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
@@ -59,6 +64,9 @@ class MotionCommandCfg(CommandTermCfg):
     """In jump mode the rewarded horizontal speed is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not rewarded."""
+    guidance_sweep: float = 0.0
+    """Share of the commanded forward velocity with which guided feet are swept backwards; 0 keeps
+    them below the hips."""
     settings: JumpSettings = field(default_factory=JumpSettings)
     """Definition of a good jump."""
 
@@ -88,10 +96,16 @@ class MotionCommand(CommandTerm):
         """Joint angles of the default pose [rad]. (N, 12)"""
         self.position_limits: Tensor = entity.data.joint_pos_limits
         """Lowest and highest joint angles [rad]. (N, 12, 2)"""
+        robot = load_robot(cfg.robot)
+        mirror = mirror_joints(self.body)
         nominal = []
-        for joint in load_robot(cfg.robot).joints:
-            gains = cfg.gains.groups[joint.group]
-            nominal.append((gains.stiffness, gains.damping, joint.drive.effort_limit))
+        for joint in robot.joints:
+            # The mean of both sides: half of the robots that are drawn by joint are mirror images.
+            gains = cfg.gains.of(joint)
+            other = cfg.gains.of(robot.joint(mirror[joint.name]))
+            stiffness = 0.5 * (gains.stiffness + other.stiffness)
+            damping = 0.5 * (gains.damping + other.damping)
+            nominal.append((stiffness, damping, joint.drive.effort_limit))
         self.stiffness, self.damping, self.effort_limit = torch.tensor(nominal).T.to(device)
         """Nominal [N m/rad, N m s/rad], and of the drives [N m]. (12,)"""
         self.scripted = False
@@ -101,6 +115,7 @@ class MotionCommand(CommandTerm):
         self._guidance = guidance(
             self.body, cfg.settings, self.stiffness, self.damping, env.step_dt
         )
+        self._sweep = foot_sweep(self.body, cfg.settings, env.step_dt).to(device)
         self._standing_leg = standing_leg(self.body)
         self.state = JumpState(count, device, cfg.settings)
         self.ranges = SpeedRanges(device)
@@ -270,7 +285,11 @@ class MotionCommand(CommandTerm):
         steps = (state.since / self._env.step_dt).round().long().clamp_max(last_step)
         on_the_ground = state.mode & (state.liftoffs == 0.0)
         steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last_step))
-        action.guidance = self.guidance_scale * self._guidance[steps]
+        offsets = self._guidance[steps]
+        if self.cfg.guidance_sweep != 0.0:
+            speed = self.cfg.guidance_sweep * self.velocity[:, :1]
+            offsets = offsets + speed * self._sweep[steps]
+        action.guidance = self.guidance_scale * offsets
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Draw velocities (count, 3), and times until the next, with jump and without it [s]."""

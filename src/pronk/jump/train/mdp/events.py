@@ -1,9 +1,11 @@
 """Randomization events (paper D1 to D6), and the state in which an episode begins.
 
 What a real robot has once is drawn once for each simulated robot, when the environment is built
-(mode `startup`): friction of the feet, gains, shank lengths, mass of the trunk, battery. The
-command delay is drawn in each episode (`actions`), the length of the policy step in each step,
-noise in each observation. All draws are uniform, from PyTorch's generator of the device.
+(mode `startup`): friction of the feet, gains, shank lengths, mass of the trunk, battery. Gains are
+drawn by group (`randomize_gains`, the paper's box) or by joint, with dry friction
+(`randomize_drives`); weak drives (`randomize_strength`) on request. The command delay is drawn in
+each episode (`actions`), the length of the policy step in each step, noise in each observation. All
+draws are uniform, from PyTorch's generator of the device.
 """
 
 from __future__ import annotations
@@ -56,6 +58,72 @@ def randomize_gains(
             gains.append(sample_gains(ranges[name], shape, env.num_envs, env.device))
         stiffness, damping = torch.stack(gains, dim=-1).unbind(dim=1)
         drive.set_gains(slice(None), kp=stiffness, kd=damping)
+
+
+@requires_model_fields("dof_frictionloss")  # type: ignore[untyped-decorator]
+def randomize_drives(
+    env: Any,
+    env_ids: None,
+    gains: Mapping[str, GroupGains],
+    friction: Mapping[str, Range],
+    mirror: Mapping[str, str],
+    nominal: bool = False,
+) -> None:
+    """Draw stiffness, damping and dry friction of every joint about its own match.
+
+    Every robot is the measured one or, as likely, its mirror image, whose joints have what is drawn
+    for those on the other side: see `rl.symmetry` for the reason.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        gains: Pair and ellipse of each joint by its name.
+        friction: Lowest and highest dry friction of each joint by its name [N m].
+        mirror: The joint on the other side, by the name of each joint.
+        nominal: True to give all robots the middle of each draw, and none the mirror image.
+    """
+    robot = env.scene["robot"]
+    is_mirrored = torch.rand(env.num_envs, 1, 1, device=env.device) < (0.0 if nominal else 0.5)
+    for drive in robot.actuators:
+        names = list(drive.target_names)
+        drives = []
+        for name in names:
+            pair = torch.tensor([gains[name].stiffness, gains[name].damping], device=env.device)
+            pairs = pair.expand(env.num_envs, 2)
+            low, high = friction[name]
+            if nominal:
+                low = high = 0.5 * (low + high)
+            else:
+                pairs = sample_gains(gains[name], "ellipsoid", env.num_envs, env.device)
+            drives.append(torch.cat([pairs, _uniform(env, (low, high), env.num_envs, 1)], dim=1))
+        drawn = torch.stack(drives, dim=1)  # (N, joints, 3)
+        other = [names.index(mirror[name]) for name in names]
+        stiffness, damping, frictionloss = torch.where(is_mirrored, drawn[:, other], drawn).unbind(
+            dim=-1
+        )
+        drive.set_gains(slice(None), kp=stiffness, kd=damping)
+        dofs = robot.indexing.joint_v_adr[drive.target_ids].long()
+        env.sim.model.dof_frictionloss[:, dofs] = frictionloss
+
+
+def randomize_strength(env: Any, env_ids: None, weakest: float) -> None:
+    """Draw by how much the drives of each robot are weaker than nominal, all of a robot alike.
+
+    A motor whose torque constant is the share s of what its drive assumes gives s of each torque
+    that is commanded, of the effort limit and of the stall torque, and turns 1 / s as fast without
+    load: its stiffness and damping are s of those drawn.
+
+    Args:
+        env: The environment.
+        env_ids: All robots; their gains have just been drawn.
+        weakest: Smallest share; the largest is 1.
+    """
+    strength = _uniform(env, (weakest, 1.0), env.num_envs, 1)
+    for drive in env.scene["robot"].actuators:
+        drive.set_gains(slice(None), kp=drive.stiffness * strength, kd=drive.damping * strength)
+        limit = drive.cfg.effort_limit * strength
+        drive.set_effort_limit(slice(None), limit.expand(-1, len(drive.target_names)))
+    joint_position_action(env).battery.weaken(strength)
 
 
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:

@@ -81,6 +81,34 @@ def guidance(
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)
 
 
+def foot_sweep(body: Legged, settings: JumpSettings, dt: float) -> Tensor:
+    """Compute offsets of the hip pitch that sweep a foot backwards, per speed [rad / (m/s)].
+
+    A standing foot stays where it is while the trunk passes over it. The trunk is over the foot in
+    the middle of the push, and the sweep begins with it: a foot is then ahead of its hip by half of
+    the way of the push, and behind it by as much at the lift-off. Positive angles of the hip pitch
+    move the foot forwards, in the sense in which a positive knee moves it.
+
+    Args:
+        body: Dimensions of the robot.
+        settings: The countermovement.
+        dt: Duration of a policy step [s].
+
+    Returns:
+        The offsets at 1 m/s forwards, (steps + 1, 12), in the rows of `guidance`.
+    """
+    time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
+    push_s = settings.prompt_s - settings.fall_s
+    middle = settings.fall_s + 0.5 * push_s
+    ahead = (middle - time).clamp(-0.5 * push_s, 0.5 * push_s)  # at 1 m/s [m]
+    length = standing_leg(body) + settings.countermovement(time)
+    sign = 1.0 if body.default_position["knee"] >= 0.0 else -1.0
+    angles = torch.zeros(len(time), len(body.leg_joints), dtype=torch.float64)
+    angles[:, body.leg_joints.index("hip_pitch")] = sign * torch.atan(ahead / length)
+    offsets = angles.repeat(1, len(body.legs))
+    return torch.cat((offsets, torch.zeros_like(offsets[:1]))).float()
+
+
 def _countermovement_angles(body: Legged, settings: JumpSettings, time: Tensor) -> Tensor:
     """Compute the angles of a leg's joints at times after a jump command [rad], (n, 3)."""
     pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(time))

@@ -162,6 +162,7 @@ class JumpState:
         self.score_gain = zeros()
         self.liftoffs = zeros()  # number of lift-offs that are no strides
         self.hop = zeros()  # 1 where the last step was a lift-off after the first
+        self.first_liftoff = zeros()  # 1 where it was the first
         self.highest = zeros()  # trunk [m]
         self.lowest = zeros()  # trunk before the first lift-off, `crouch` or more [m]
         self.travel = zeros()  # `highest` minus `lowest`, at most `max_travel` [m]
@@ -192,6 +193,7 @@ class JumpState:
             self.score_gain,
             self.liftoffs,
             self.hop,
+            self.first_liftoff,
             self.highest,
             self.lowest,
             self.travel,
@@ -247,6 +249,7 @@ class JumpState:
         self.score_gain = self.best_score - score_before
         liftoffs_before = self.liftoffs * keep
         self.hop = jumped * (liftoffs_before > 0.0)
+        self.first_liftoff = jumped - self.hop
         self.liftoffs = liftoffs_before + jumped
 
         # Countermovement, leg by leg: the trunk's velocity shows the action of one leg only with

@@ -92,6 +92,20 @@ class StepMotion:
         self.joints.torque[env_ids] = 0.0
 
 
+def other_side(leg: str) -> str:
+    """Return the leg on the other side, as HL for HR."""
+    return leg[0] + ("L" if leg[1] == "R" else "R")
+
+
+def mirror_joints(body: Legged) -> dict[str, str]:
+    """Return the joint on the other side by the name of each joint."""
+    mirror = {}
+    for leg in body.legs:
+        for joint in body.leg_joints:
+            mirror[f"{leg}_{joint}"] = f"{other_side(leg)}_{joint}"
+    return mirror
+
+
 def leg_length(body: Legged, knee: Tensor) -> Tensor:
     """Compute the distance from the axis of the hip pitch to the foot's centre [m].
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from pronk.jump.train.mdp import liftoff
 from pronk.jump.train.mdp.commands import MotionCommand, motion_command
 
 if TYPE_CHECKING:
@@ -237,3 +238,47 @@ def stray_foot(env: Env, jump_scale: float = 1.0) -> Tensor:
     falls = command.motion.trunk.velocity_world[:, 2] < 0.0
     depth = below * (state.airborne & state.mode & falls)
     return command.scaled_in_jump_mode(depth, jump_scale)
+
+
+# --- Candidates, which only a recipe has ---------------------------------------------------------
+
+
+def _liftoff_along(command: MotionCommand) -> Tensor:
+    """Return the horizontal velocity along the command, zero without one [m/s]."""
+    commanded = command.velocity[:, :2]
+    speed = torch.linalg.vector_norm(commanded, dim=-1).clamp_min(1e-6)
+    return (command.motion.trunk.velocity_heading * commanded).sum(dim=-1) / speed
+
+
+def liftoff_speed(env: Env) -> Tensor:
+    """Speed along the command that the first lift-off carries into its flight [m/s]; an event."""
+    command = _measured(env)
+    state = command.state
+    speed = liftoff.carried_speed(
+        _liftoff_along(command),
+        torch.linalg.vector_norm(command.target, dim=-1),
+        command.motion.trunk.velocity_world[:, 2],
+        state.settings.liftoff_velocity,
+    )
+    return speed * state.reward_scale * state.first_liftoff / env.step_dt
+
+
+def liftoff_angle(env: Env, vertical: float, std: float) -> Tensor:
+    """Similarity of the first lift-off's direction to the asked-for one, 0 to 1; an event."""
+    command = _measured(env)
+    state = command.state
+    kernel = liftoff.angle_kernel(
+        _liftoff_along(command),
+        torch.linalg.vector_norm(command.target, dim=-1),
+        command.motion.trunk.velocity_world[:, 2],
+        vertical,
+        std,
+    )
+    return kernel * state.reward_scale * state.first_liftoff / env.step_dt
+
+
+def height_by_speed(env: Env, full_speed: float, least: float) -> Tensor:
+    """As `jump_height`, less of it the faster forwards is commanded [m]; an event."""
+    command = _measured(env)
+    share = liftoff.height_share(command.velocity[:, 0], full_speed, least)
+    return command.state.travel_gain * share / env.step_dt

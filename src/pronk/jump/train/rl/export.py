@@ -68,10 +68,10 @@ def contract_for(
     stiffness = []
     damping = []
     for joint in robot.joints:
-        group_gains = gains.groups[joint.group]
+        joint_gains = gains.of(joint)
         default_position.append(joint.default_position)
-        stiffness.append(group_gains.stiffness)
-        damping.append(group_gains.damping)
+        stiffness.append(joint_gains.stiffness)
+        damping.append(joint_gains.damping)
     shortest_delay, longest_delay = action.delay_steps
     command_ranges = {}
     for name, limit in zip(COMMANDS, command.limits, strict=True):

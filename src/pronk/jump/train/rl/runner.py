@@ -49,6 +49,10 @@ class JumpRunnerCfg(RslRlOnPolicyRunnerCfg):
     """Time at which training stops, at a checkpoint [Unix time, s]; None for no limit."""
     start_sha256: str = ""
     """Hash of the checkpoint that training began with, for the exported policy's contract."""
+    recipe_sha256: str = ""
+    """Hash of the recipe, likewise; empty without one."""
+    torch_compile_mode: str | None = None
+    """Mode of torch.compile for actor and critic, which rsl_rl reads; None for none."""
 
 
 class PronkRunner(MjlabOnPolicyRunner):
@@ -276,6 +280,8 @@ class PronkRunner(MjlabOnPolicyRunner):
             "ranges_sha256": motion_command(env).cfg.gains.sha256,
             "start_sha256": self.cfg.get("start_sha256", ""),
         }
+        if self.cfg.get("recipe_sha256"):
+            provenance["recipe_sha256"] = self.cfg["recipe_sha256"]
         unmatched = motion_command(env).cfg.gains.unmatched
         if unmatched:
             # Joints that were no match, with the reasons (`pronk train --allow-unmatched`).

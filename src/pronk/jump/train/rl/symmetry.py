@@ -4,6 +4,15 @@ The robot is its own mirror image in the plane of its trunk's x and z axes. In t
 vectors change the sign of y, angular velocities those of x and z; right and left legs change
 places; hip_roll (about x) changes sign, hip_pitch and knee (about y) do not. rsl_rl's symmetry
 extension trains on both sides (Mittal et al. 2024).
+
+A real robot is not its own mirror image: its right and left joints have different gains. The mirror
+image of a sample belongs to the robot with left and right gains exchanged, and `mirrored` exchanges
+them in what the critic sees, so the sample is a true one of that other robot. It belongs to the
+robots that are trained for only if those are as likely as their mirror images. By group that holds,
+because all joints of a group are drawn alike. By joint `events.randomize_drives` makes every second
+robot the mirror image of the measured one. So the policy is trained for the measured robot and its
+mirror image alike, without being told which of them it is, and does not learn to limp on one side;
+what it could gain by knowing the weaker leg, it does not.
 """
 
 from __future__ import annotations
@@ -18,6 +27,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.motion import other_side
 from pronk.jump.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.policy.observation import ESTIMATE, MEASURED
 from pronk.robots.legged import Legged
@@ -71,7 +81,7 @@ def _mirror(
     group: str, legs: tuple[str, ...], joints: tuple[str, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Return index and sign of the original's number that each number of the image is."""
-    leg_indices = [legs.index(_other_side(leg)) for leg in legs]
+    leg_indices = [legs.index(other_side(leg)) for leg in legs]
     joint_indices = []
     joint_signs = []
     for leg_index in leg_indices:
@@ -98,11 +108,6 @@ def _mirror(
             sources += [start + index for index in quantity_indices]
             signs += quantity_signs
     return torch.tensor(sources, device=device), torch.tensor(signs, device=device)
-
-
-def _other_side(leg: str) -> str:
-    """Return the leg on the other side, as HL for HR."""
-    return leg[0] + ("L" if leg[1] == "R" else "R")
 
 
 def with_mirror_image(

@@ -35,6 +35,7 @@ from pronk.jump.train import phases
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp import actions, commands, events, observations, terminations
 from pronk.jump.train.mdp.actuators import drive_cfgs
+from pronk.jump.train.mdp.motion import mirror_joints
 from pronk.jump.train.tasks.reward_weights import reward_weights
 from pronk.policy.observation import ACTIONS, HISTORY
 from pronk.robots.legged import legged
@@ -65,11 +66,18 @@ def jump_env_cfg(
         robot: The robot.
         gains: Nominal gains, their ranges and the command delay.
         iterations: PPO iterations of each phase.
-        gain_shape: Whether gains are drawn in the box or in the ellipsoid of their ranges.
+        gain_shape: Whether gains are drawn in the box or in the ellipsoid of their ranges; those
+            by joint are drawn in the ellipse of each joint.
         num_envs: Number of robots.
         seed: Seed of all draws.
     """
     delay = round(gains.delay_s / robot.timestep_s)
+    delay_steps = (max(0, delay - DELAY_STEPS), delay + DELAY_STEPS)
+    delay_span = None
+    if gains.delay_span_s is not None:
+        shortest, longest = (end / robot.timestep_s for end in gains.delay_span_s)
+        delay_span = (shortest, longest)
+        delay_steps = (math.floor(shortest), math.ceil(longest))
     return ManagerBasedRlEnvCfg(
         seed=seed,
         decimation=robot.decimation,
@@ -83,7 +91,8 @@ def jump_env_cfg(
                 scale=0.35,
                 use_default_offset=True,
                 preserve_order=True,
-                delay_steps=(max(0, delay - DELAY_STEPS), delay + DELAY_STEPS),
+                delay_steps=delay_steps,
+                delay_span=delay_span,
             )
         },
         commands={commands.NAME: commands.MotionCommandCfg(robot=robot.source, gains=gains)},
@@ -128,12 +137,31 @@ def without_randomization(cfg: ManagerBasedRlEnvCfg, *, noise: bool = False) -> 
     events_that_stay = ["reset"]
     if noise:
         events_that_stay.append("decimation")
+    gains_term = cfg.events.get("gains")
+    if gains_term is not None and gains_term.func is events.randomize_drives:
+        # Drives are built by group: their joints get gains of their own by this event.
+        events_that_stay.append("gains")
+        gains_term.params["nominal"] = True
     cfg.events = {name: term for name, term in cfg.events.items() if name in events_that_stay}
     if not noise:
         cfg.observations["measured"].enable_corruption = False
+        delay_s = cfg.commands[commands.NAME].gains.delay_s
+        middle = round(delay_s / cfg.sim.mujoco.timestep)
         action = cfg.actions[actions.NAME]
-        middle = action.delay_steps[1] - DELAY_STEPS
+        action.delay_span = None
         action.delay_steps = (middle, middle)
+
+
+def draw_weak_drives(cfg: ManagerBasedRlEnvCfg, weakest: float) -> None:
+    """Draw the torque of each robot's drives from a share of nominal to all of it.
+
+    Args:
+        cfg: Configuration of the environment, which is changed.
+        weakest: The share, above 0.
+    """
+    cfg.events["strength"] = EventTermCfg(
+        func=events.randomize_strength, mode="startup", params={"weakest": weakest}
+    )
 
 
 def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
@@ -260,11 +288,26 @@ def _events(
     feet = SceneEntityCfg("robot", geom_names=".*_foot_collision", site_names=".*_foot")
     shanks = SceneEntityCfg("robot", geom_names=".*_shank_collision")
     base = SceneEntityCfg("robot", body_names=robot.base_body)
-    ranges = {joint.name: gains.groups[joint.group] for joint in robot.joints}
-    if gain_shape == "ellipsoid":
-        for group in gains.groups.values():
-            events.check_ellipsoid(group)
     body = legged(robot.source)
+    draws = {joint.name: gains.of(joint) for joint in robot.joints}
+    gains_event = EventTermCfg(  # D3, D4
+        func=events.randomize_gains,
+        mode="startup",
+        params={"ranges": draws, "shape": gain_shape},
+    )
+    if gains.joints:
+        gains_event = EventTermCfg(
+            func=events.randomize_drives,
+            mode="startup",
+            params={
+                "gains": draws,
+                "friction": dict(gains.frictions),
+                "mirror": mirror_joints(body),
+            },
+        )
+    if gains.joints or gain_shape == "ellipsoid":
+        for draw in draws.values():
+            events.check_ellipsoid(draw)
     # D5, .18 to .20 m, and D6, -.4 to 1.6 kg, of the Mini Cheetah, in proportion.
     shank = (0.18 / 0.195 * body.shank_length, 0.20 / 0.195 * body.shank_length)
     added = (-0.4 / 12.0 * body.total_mass, 1.6 / 12.0 * body.total_mass)
@@ -282,11 +325,7 @@ def _events(
             mode="startup",
             params={"ranges": (0.05, 3.0), "shared_random": True, "asset_cfg": feet},
         ),
-        "gains": EventTermCfg(  # D3, D4
-            func=events.randomize_gains,
-            mode="startup",
-            params={"ranges": ranges, "shape": gain_shape},
-        ),
+        "gains": gains_event,
         "shank_length": EventTermCfg(
             func=events.randomize_shank_length,
             mode="startup",

@@ -87,3 +87,19 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         # A policy trotted on in the air and landed on one foot: 40 ms early, thighs on the ground.
         "stray_foot": _term(rewards.stray_foot, -30.0),
     }
+
+
+def candidate_terms() -> dict[str, RewardTermCfg]:
+    """Terms that no task has unless a recipe gives them a weight (`pronk.jump.train.recipe`).
+
+    They are not among the default terms with a weight of zero: another row in the sum of all terms
+    changes how it is rounded.
+    """
+    return {
+        "liftoff_speed": _term(rewards.liftoff_speed, 0.0),
+        # 2 m/s upwards beside 2.6 m/s forwards, as in the paper's jumps at 2 m/s: .97 m in .40 s.
+        # A kernel of .15 rad separates 53 degrees (today's 2.2 and 1.67 m/s) from 38.
+        "liftoff_angle": _term(rewards.liftoff_angle, 0.0, vertical=2.0, std=0.15),
+        # Table III: .318 and .244 m at 1 and 2 m/s forwards, .38 m at most elsewhere.
+        "height_by_speed": _term(rewards.height_by_speed, 0.0, full_speed=2.0, least=0.4),
+    }

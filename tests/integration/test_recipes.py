@@ -1,0 +1,168 @@
+"""Recipes: their files, what they change in a task, and what they refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mjlab")
+
+import training_env
+from command_line import refused
+from pronk.errors import PronkError
+from pronk.jump.train.gains import training_gains
+from pronk.jump.train.mdp.commands import NAME as COMMAND
+from pronk.jump.train.phases import PHASES, TASKS, changed_phases
+from pronk.jump.train.recipe import SCHEMA, apply_recipe, load_recipe
+from pronk.jump.train.settings import DrawSettings, TrainSettings
+from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
+from training_env import ROBOT, config
+
+pytestmark = pytest.mark.train
+
+RECIPES = sorted((Path(__file__).parents[2] / "examples" / "recipes").glob("*.yaml"))
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "recipe.yaml"
+    path.write_text(f"schema: {SCHEMA}\n{text}\n")
+    return path
+
+
+def task(text: str, folder: Path) -> Any:
+    """The environment's configuration with a recipe."""
+    cfg = config(8, training_gains("naive", ROBOT))
+    apply_recipe(cfg, load_recipe(written(folder, text)))
+    return cfg
+
+
+def phases_of(cfg: Any) -> Any:
+    return changed_phases(cfg.curriculum["phases"].params["changes"])
+
+
+def test_a_number_holds_in_all_phases_and_zero_removes(tmp_path: Path) -> None:
+    cfg = task("rewards: {posture: -0.5, slip: 0, hop: 0.0}", tmp_path)
+    assert set(cfg.rewards) == set(reward_weights()) - {"slip", "hop"}
+    for phase in phases_of(cfg).values():
+        assert phase.weights["posture"] == (-0.5, -0.5)
+
+
+def test_a_phase_that_is_named_changes_alone(tmp_path: Path) -> None:
+    text = "rewards: {jump_height: {jump_b: [16, 4]}, landing: {jump_b: -7}}\n"
+    text += "jump_scales: {knees: {jump_b: [1, 3]}, orientation: 1.5}"
+    phases = phases_of(task(text, tmp_path))
+    assert phases["jump_b"].weights["jump_height"] == (16.0, 4.0)
+    assert phases["jump_a"].weights["jump_height"] == PHASES["jump_a"].weights["jump_height"]
+    assert phases["jump_b"].weights["landing"] == (-7.0, -7.0)
+    assert phases["jump_b"].jump_scales["knees"] == (1.0, 3.0)
+    assert phases["jump_b"].jump_scales["collision"] == PHASES["jump_b"].jump_scales["collision"]
+    assert phases["walk"].jump_scales["orientation"] == (1.5, 1.5)
+    assert phases["walk"].weights == {}
+
+
+def test_a_candidate_is_added_only_where_it_has_a_weight(tmp_path: Path) -> None:
+    assert not set(candidate_terms()) & set(reward_weights())
+    cfg = task("rewards: {liftoff_speed: {jump_a: 4}, liftoff_angle: 0}", tmp_path)
+    assert set(cfg.rewards) - set(reward_weights()) == {"liftoff_speed"}
+    assert cfg.rewards["liftoff_speed"].weight == 0.0, "the phase gives it its weight"
+
+
+def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
+    text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1}"
+    command = task(text, tmp_path).commands[COMMAND]
+    assert (command.settings.liftoff_velocity, command.settings.late_s) == (2.2, 0.2)
+    assert (command.jump_speed_added, command.guidance_sweep) == (0.9, 1.0)
+    assert command.settings.ready_s == 0.26
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("rewards: {speed: 3}", "'speed'|tracking_linear|liftoff_speed"),
+        ("jump_scales: {speed: 3}", "'speed'|tracking_linear"),
+        ("jump_scales: {sparse_jump: 3}", "'sparse_jump'|no jump_scale|orientation"),
+        ("rewards: {posture: {run: 3}}", "'run'|walk, jump_a, jump_b"),
+        ("rewards: {posture: {walk: [1, 2, 3]}}", "rewards"),
+        ("rewards: {posture: fast}", "rewards"),
+        ("rewards: {posture: .nan}", "finite"),
+        ("weights: {posture: 1}", "weights|rewards, jump_scales and jump"),
+        ("jump: {height: 3}", "'height'|late_s|speed_added|guidance_sweep"),
+        ("jump: {late_s: 0}", "late_s"),
+        ("jump: {ready_s: 3}", "ready_s"),
+    ],
+)
+def test_what_there_is_not_is_refused_with_what_there_is(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    with pytest.raises(PronkError) as refusal:
+        task(text, tmp_path)
+    for word in (*words.split("|"), "recipe.yaml"):
+        assert word in str(refusal.value), word
+
+
+def test_the_command_refuses_before_anything_is_written(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    bad = written(tmp_path, "rewards: {speed: 3}")
+    words = ("train", "walk", "--gains", "naive", "--out", out, "--recipe")
+    assert "'speed'" in refused(*words, bad)
+    assert "no such file" in refused(*words, tmp_path / "none.yaml")
+    bad.write_text("schema: pronk/gains/1")
+    assert SCHEMA in refused(*words, bad)
+    assert not out.exists()
+
+
+def test_a_recipe_is_part_of_a_run(tmp_path: Path) -> None:
+    path = written(tmp_path, "rewards: {slip: 0}")
+    first = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=path)
+    stored = first.completed().stored_values()
+    again = TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored)
+    assert again.recipe == path
+    other = TrainSettings(task="all", out=tmp_path, resume=True, recipe=Path("other.yaml"))
+    with pytest.raises(PronkError, match="leave it out"):
+        other.resumed(stored)
+    by_joint = TrainSettings(
+        task="all", out=tmp_path, resume=True, draws=DrawSettings(by_joint=True)
+    )
+    with pytest.raises(PronkError, match="--by-joint"):
+        by_joint.resumed(stored)
+    # A run of an earlier version has no such entries.
+    for name in ("recipe", "by_joint", "weakest_drive"):
+        del stored[name]
+    assert TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored).recipe is None
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+def test_the_shipped_recipes_apply(path: Path) -> None:
+    """Each changes something, and says in its comments what for."""
+    cfg = config(8, training_gains("naive", ROBOT))
+    before = repr((list(cfg.rewards), cfg.commands, PHASES))
+    apply_recipe(cfg, load_recipe(path))
+    assert repr((list(cfg.rewards), cfg.commands, phases_of(cfg))) != before
+    assert path.read_text().startswith("# ")
+    if path.stem == "lean":
+        for phase in phases_of(cfg).values():
+            weights = {name: (term.weight,) for name, term in cfg.rewards.items()}
+            weights |= {name: span for name, span in phase.weights.items() if name in weights}
+            assert sum(1 for span in weights.values() if any(span)) <= 20
+
+
+def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
+    """Step by step through the phases, with a term that was added."""
+    from mjlab.envs import ManagerBasedRlEnv
+
+    from pronk.jump.train.phases import STEPS_PER_ITERATION, curriculum
+
+    cfg = task("rewards: {liftoff_speed: {jump_b: [4, 8]}, posture: -0.5, slip: 0}", tmp_path)
+    cfg.curriculum["phases"].params.update(TASKS["all"])
+    cfg.scene.num_envs = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    for iteration, expected in ((0, 0.0), (300, 0.0), (520, 4.0), (800, 6.0)):
+        env.common_step_counter = iteration * STEPS_PER_ITERATION
+        env.curriculum_manager.compute()
+        assert env.reward_manager.get_term_cfg("liftoff_speed").weight == pytest.approx(expected)
+        assert env.reward_manager.get_term_cfg("posture").weight == -0.5
+        assert curriculum(env).total == 1080
+    assert "slip" not in env.reward_manager.active_terms
+    env.step(training_env.torch.zeros(2, 12))
