@@ -15,6 +15,8 @@ from pronk.identify.logs.sage_reader import SAGE_JOINTS
 from pronk.robots import ROBOT_NAMES, load_robot
 from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
+from pronk.robots.motor import torque_limits
+from pronk.robots.robot import RobotSpec
 
 CHEETAH = legged("mini_cheetah")
 MODELS = {name: free_spec(load_robot(name)).compile() for name in ROBOT_NAMES}
@@ -63,8 +65,10 @@ def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
         # S6 and A12 of the paper; stall torque and no-load speed of the open software.
         ("mini_cheetah", "FR_hip_pitch", (0.0026, 17.0, 62.4, 40.0)),
         ("mini_cheetah", "FR_knee", (0.0063, 26.4, 97.1, 25.7)),
-        ("go2", "FR_hip_pitch", (0.01, 23.7, 23.7, 30.1)),
-        ("go2", "FR_knee", (0.036749, 45.43, 45.43, 15.70)),
+        # Limits of unitree_ros; the stall torque is where the line through the corner of the test
+        # of the motor by its maker, 20.2 N m at 13.5 rad/s, meets standstill.
+        ("go2", "FR_hip_pitch", (0.01, 23.7, 36.62, 30.1)),
+        ("go2", "FR_knee", (0.036749, 45.43, 70.2, 15.70)),
     ],
 )
 def test_drives_have_the_published_figures(
@@ -74,6 +78,76 @@ def test_drives_have_the_published_figures(
     assert drive.armature == pytest.approx(figures[0], abs=5e-5)
     limits = (drive.effort_limit, drive.stall_torque, drive.no_load_speed)
     assert limits == pytest.approx(figures[1:], abs=0.05)
+
+
+def test_knees_of_the_go2_are_their_motors_behind_a_linkage() -> None:
+    # unitree_ros, go2_description.urdf: effort and velocity of hip, thigh and calf.
+    hip = load_robot("go2").joint("RL_hip_pitch").drive
+    knee = load_robot("go2").joint("RL_knee").drive
+    ratio = 45.43 / 23.7
+    assert (hip.effort_limit, hip.no_load_speed) == (23.7, 30.1)
+    assert (knee.effort_limit, knee.no_load_speed) == (45.43, 15.70)
+    assert ratio == pytest.approx(1.917, abs=5e-4)
+    assert knee.gear_ratio / hip.gear_ratio == pytest.approx(ratio, rel=1e-3)
+    assert knee.armature / hip.armature == pytest.approx(ratio**2, rel=1e-3)
+    assert hip.corner_speed / knee.corner_speed == pytest.approx(ratio, rel=1e-3)
+    # unitree_rl_lab's test of the motor: its corner lies on the line.
+    _, greatest = torque_limits(13.5, hip.stall_torque, hip.no_load_speed, hip.effort_limit)
+    assert float(greatest) == pytest.approx(20.2, abs=0.05)
+
+
+def test_a_drive_has_a_flat_limit_a_corner_and_a_no_load_speed(tmp_path: Path) -> None:
+    robot = drive_of(tmp_path, "corner_speed: 4.0", "no_load_speed: 10.0", "effort_limit: 12.0")
+    drive = robot.joints[0].drive
+    assert drive.corner_speed == pytest.approx(4.0)
+    speeds = np.array([0.0, 3.9, 7.0, 10.0, -5.0])
+    low, high = torque_limits(speeds, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
+    assert high == pytest.approx([12.0, 12.0, 6.0, 0.0, 12.0])
+    assert low == pytest.approx([-12.0, -12.0, -12.0, -12.0, -10.0])
+    # The straight line from standstill on is a corner at rest.
+    line = drive_of(tmp_path, "corner_speed: 0.0", "no_load_speed: 10.0", "effort_limit: 12.0")
+    assert line.joints[0].drive.stall_torque == 12.0
+    assert line.joints[0].drive.corner_speed == 0.0
+
+
+@pytest.mark.parametrize(
+    ("entries", "word"),
+    [
+        (("corner_speed: 10.0", "no_load_speed: 10.0"), "above"),
+        (("corner_speed: 4.0",), "no_load_speed"),
+        (("corner_speed: 4.0", "no_load_speed: 10.0", "stall_torque: 30.0"), "stall_torque"),
+        (("corner_speed: 4.0", "torque_constant: 0.1", "resistance: 0.2"), "constants"),
+        (("corner_speed: -1.0", "no_load_speed: 10.0"), "corner_speed"),
+    ],
+)
+def test_a_corner_that_contradicts_the_line_is_refused(
+    tmp_path: Path, entries: tuple[str, ...], word: str
+) -> None:
+    with pytest.raises(RobotError, match=word):
+        drive_of(tmp_path, "effort_limit: 12.0", *entries)
+
+
+def drive_of(folder: Path, *entries: str) -> RobotSpec:
+    """Write a robot of one joint whose drive has these entries, and read it."""
+    (folder / "arm.xml").write_text(
+        "<mujoco><worldbody><body name='link'><joint name='elbow' type='hinge' axis='0 1 0' "
+        "range='-1 1' limited='true'/><geom type='capsule' fromto='0 0 0 0 0 -.2' size='.02' "
+        "mass='.3'/></body></worldbody><compiler angle='radian'/></mujoco>"
+    )
+    lines = [
+        "schema: pronk/robot/1",
+        "name: arm",
+        "model: arm.xml",
+        "drives:",
+        "  motor:",
+        *(f"    {entry}" for entry in entries),
+        "groups:",
+        "  elbow: {drive: motor, stiffness: 5.0, damping: 0.1, band_hz: [0.5, 5.0]}",
+        "poses:",
+        "  default: {elbow: 0.0}",
+    ]
+    (folder / "robot.yaml").write_text("\n".join(lines))
+    return load_robot(folder / "robot.yaml")
 
 
 @pytest.mark.parametrize(

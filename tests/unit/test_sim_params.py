@@ -13,7 +13,7 @@ import yaml
 
 from pronk.errors import RobotError
 from pronk.jump.virtual.plant import Plant
-from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params
 from pronk.robots import load_robot
 from sized_joint import SIZES, sized_robot
@@ -89,6 +89,54 @@ def test_impossible_fields_are_named(path: str, value: Any) -> None:
         parse_sim_params(changed(path, value), "my.yaml")
     assert str(caught.value).startswith("my.yaml: ")
     assert "\n" not in str(caught.value)
+
+
+def test_the_virtual_go2_has_hidden_parameters_of_its_own() -> None:
+    go2 = load_robot("go2")
+    params = load_sim_params(None, go2)
+    assert params.robot == "go2"
+    params.check_joints(go2.joint_names)
+    for joint in go2.joints:
+        hidden = params.joints[joint.name]
+        assert 0.9 <= hidden.torque_scale <= 1.1, joint.name
+        assert hidden.torque_scale != 1.0, joint.name
+        assert 0.0 < hidden.load_friction < 0.1, joint.name
+        assert hidden.rotor_inertia == pytest.approx(joint.drive.rotor_inertia, rel=0.15)
+        assert hidden.rotor_inertia != joint.drive.rotor_inertia, joint.name
+        assert hidden.coulomb != joint.drive.frictionloss, joint.name
+    # A command and its state pass the network and the robot's computer at 500 Hz.
+    assert params.machine.command_delay_s + params.machine.measurement_delay_s > 0.004
+    # Another model that has this name is no Go2.
+    arm = replace(load_robot("so101"), name="go2")
+    assert set(load_sim_params(None, arm).joints) == set(arm.joint_names)
+
+
+def test_friction_grows_with_the_load() -> None:
+    go2 = load_robot("go2")
+    shipped = load_sim_params(None, go2)
+    torques = {}
+    for share in (0.0, 0.3):
+        joints = {}
+        for name, joint in shipped.joints.items():
+            joints[name] = replace(joint, load_friction=share, encoder_offset=0.0)
+        machine = VirtualRobot(go2, replace(shipped, joints=joints), legs=("FR",))
+        machine.connect()
+        hold = hold_of(go2)
+        position = np.array(hold.position)
+        spans = []
+        # A slow way up and down: half of the difference in torque at one angle is the friction.
+        for tick in range(800):
+            phase = 2.0 * np.pi * tick / 400.0
+            position[1] = hold.position[1] + 0.3 * np.sin(phase)
+            machine.send(replace(hold, position=position.copy()))
+            machine.wait(machine.now() + 0.01)
+            if tick >= 400:
+                spans.append((machine.latest().position[1], machine.latest().torque[1], phase))
+        up = [torque for angle, torque, phase in spans if np.cos(phase) > 0.9]
+        down = [torque for angle, torque, phase in spans if np.cos(phase) < -0.9]
+        torques[share] = 0.5 * (np.mean(up) - np.mean(down)), abs(np.mean(up + down))
+    friction, load = torques[0.0]
+    assert torques[0.3][0] - friction == pytest.approx(0.3 * load, rel=0.35)
 
 
 def test_an_older_schema_is_refused_with_what_changed() -> None:

@@ -8,7 +8,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -173,8 +173,8 @@ def load_policy(path: Path | str) -> Policy:
         'mini_cheetah'
     """
     path = Path(path)
-    content = _read(path)
-    session = _session(content, path)
+    content = read_network(path)
+    session = open_session(content, path)
     try:
         text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
     except UnicodeDecodeError:
@@ -195,28 +195,28 @@ def load_policy(path: Path | str) -> Policy:
         _check_tensors(path, "outputs", session.get_outputs(), _OUTPUT_SIZES)
     except UnicodeDecodeError:
         raise ArtefactError(f"{path}: damaged: a name in its network is not text.") from None
-    _run_once(session, input_sizes, path)
+    run_once(session, input_sizes, list(_OUTPUT_SIZES), path)
     return Policy(session, contract, sha256=hashlib.sha256(content).hexdigest())
 
 
-def _read(path: Path) -> bytes:
-    """Return the bytes of a policy of limited size."""
+def read_network(path: Path, writer: str = _WRITER) -> bytes:
+    """Return the bytes of a policy of limited size; errors end with what writes one."""
     try:
         size = path.stat().st_size
         if size > _MAX_FILE_BYTES:
             raise ArtefactError(
                 f"{path}: {size >> 20} MiB; a policy takes {_MAX_FILE_BYTES >> 20} MiB or less; "
-                f"{_WRITER}."
+                f"{writer}."
             )
         return path.read_bytes()
     except FileNotFoundError:
-        raise ArtefactError(f"{path}: no such file; {_WRITER}.") from None
+        raise ArtefactError(f"{path}: no such file; {writer}.") from None
     except OSError as error:
         raise ArtefactError(f"{path}: cannot be read ({error.strerror}).") from None
 
 
-def _session(content: bytes, path: Path) -> Any:
-    """Return the ONNX Runtime session of a network on one thread."""
+def open_session(content: bytes, path: Path, writer: str = _WRITER) -> Any:
+    """Return the ONNX Runtime session of a network on one thread; see `read_network`."""
     try:
         import onnxruntime
     except ImportError:
@@ -247,7 +247,7 @@ def _session(content: bytes, path: Path) -> Any:
         reason = " ".join(str(error).split())[:200]
         raise ArtefactError(
             f"{path}: not a network that ONNX Runtime can run from this one file ({reason}); "
-            f"{_WRITER}."
+            f"{writer}."
         ) from error
 
 
@@ -266,8 +266,20 @@ def _limit_memory() -> None:
     onnxruntime.create_and_register_allocator(memory, limit)
 
 
-def _run_once(session: Any, input_sizes: Mapping[str, int], path: Path) -> None:
-    """Run the network once, under a time limit."""
+def run_once(
+    session: Any, input_sizes: Mapping[str, int], outputs: Sequence[str], path: Path
+) -> None:
+    """Run a network once on zeros, under a time limit.
+
+    Args:
+        session: Its ONNX Runtime session.
+        input_sizes: Size of each input behind its batch axis, by name.
+        outputs: Names of the outputs.
+        path: The file, for the message.
+
+    Raises:
+        ArtefactError: It does not run.
+    """
     import onnxruntime
 
     options = onnxruntime.RunOptions()
@@ -280,7 +292,7 @@ def _run_once(session: Any, input_sizes: Mapping[str, int], path: Path) -> None:
     timer.start()
     inputs = {name: np.zeros((1, size), np.float32) for name, size in input_sizes.items()}
     try:
-        session.run(list(_OUTPUT_SIZES), inputs, options)
+        session.run(list(outputs), inputs, options)
     except Exception as error:  # Operators raise errors of any kind.
         raise ArtefactError(
             f"{path}: its network cannot be run within {_MAX_FIRST_INFERENCE_S:g} s "

@@ -51,7 +51,11 @@ class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class DriveEntry(_Entry, frozen=True):
-    """A drive: its torque-speed line or the motor's constants, from which the line follows."""
+    """A drive: its torque-speed line or the motor's constants, from which the line follows.
+
+    The torque is at most effort_limit and at most the line from stall_torque at rest to nothing at
+    no_load_speed. corner_speed, where the two meet, may stand in place of stall_torque.
+    """
 
     effort_limit: _Positive
     bus_voltage: _Positive = 24.0
@@ -59,6 +63,7 @@ class DriveEntry(_Entry, frozen=True):
     rotor_inertia: _NotNegative | None = None
     armature: _NotNegative | None = None
     stall_torque: _Positive | None = None
+    corner_speed: _NotNegative | None = None
     no_load_speed: _Positive | None = None
     torque_constant: _Positive | None = None
     joint_torque_constant: _Positive | None = None
@@ -83,6 +88,8 @@ class DriveEntry(_Entry, frozen=True):
         resistance = self.resistance
         stall_torque = self.stall_torque
         no_load_speed = self.no_load_speed
+        if self.corner_speed is not None:
+            stall_torque = self._stall_torque_of_corner(self.corner_speed, source)
         if torque_constant is not None and resistance is not None:
             stall_torque = torque_factor * gear_ratio * torque_constant * voltage / resistance
             no_load_speed = voltage / (emf_factor * gear_ratio * torque_constant)
@@ -92,7 +99,7 @@ class DriveEntry(_Entry, frozen=True):
         else:
             raise RobotError(
                 f"{source}: the torque-speed line is missing; give stall_torque and no_load_speed, "
-                "or torque_constant and resistance."
+                "corner_speed and no_load_speed, or torque_constant and resistance."
             )
         rotor_inertia = self.rotor_inertia
         if rotor_inertia is None:
@@ -110,6 +117,21 @@ class DriveEntry(_Entry, frozen=True):
             torque_constant=torque_constant,
             stribeck_speed=self.stribeck_speed,
         )
+
+    def _stall_torque_of_corner(self, corner_speed: float, source: str) -> float:
+        """Return where the line through the corner and the no-load speed meets standstill [N m]."""
+        others = (self.stall_torque, self.torque_constant, self.joint_torque_constant)
+        if self.resistance is not None or any(value is not None for value in others):
+            raise RobotError(
+                f"{source}: corner_speed and stall_torque, or the constants of the motor, both say "
+                "where the torque-speed line begins; give corner_speed and no_load_speed alone."
+            )
+        if self.no_load_speed is None or not corner_speed < self.no_load_speed:
+            raise RobotError(
+                f"{source}: corner_speed is {corner_speed:g} rad/s, with no_load_speed "
+                f"{self.no_load_speed}; expected a no_load_speed above it."
+            )
+        return self.effort_limit / (1.0 - corner_speed / self.no_load_speed)
 
 
 class GroupEntry(_Entry, frozen=True):

@@ -31,7 +31,8 @@ class Drive:
     rotor_inertia: float
     """Inertia of the rotor about its axis, motor side [kg m^2]."""
     stall_torque: float
-    """Torque at standstill with the full bus voltage across the winding [N m]."""
+    """Torque at standstill with the full bus voltage across the winding, where the torque-speed
+    line begins; the effort limit cuts the line off below it [N m]."""
     no_load_speed: float
     """Speed at which back-EMF equals the bus voltage [rad/s]."""
     effort_limit: float
@@ -76,6 +77,15 @@ class Drive:
     def armature(self) -> float:
         """Rotor inertia at the joint, `rotor_inertia * gear_ratio**2` [kg m^2]."""
         return self.rotor_inertia * self.gear_ratio**2
+
+    @property
+    def corner_speed(self) -> float:
+        """Speed up to which the drive gives its effort limit [rad/s].
+
+        Beyond it the torque falls in a straight line to nothing at the no-load speed; 0 where it
+        falls from standstill on.
+        """
+        return max(0.0, self.no_load_speed * (1.0 - self.effort_limit / self.stall_torque))
 
     @property
     def motor(self) -> tuple[float, float]:

@@ -221,3 +221,5 @@ class Physics:
         # A battery's power is largest at half its voltage.
         self._voltage = max(new_voltage, 0.5 * machine.bus_voltage)
         plant.inverters[:] = self._voltage
+        if plant.has_load_friction:
+            plant.set_load(torque)

@@ -69,6 +69,8 @@ _STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (
 _KP = 4
 _KD = 6
 _VMAX = 7
+_COULOMB = 3
+_BREAKAWAY = 4
 _STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
 
 
@@ -172,6 +174,7 @@ class Plant:
         # Reflected through the gear [kg m^2], and viscous friction [N m s/rad].
         self._rotor_inertia = np.zeros(count)
         self._viscous = np.zeros(count)
+        self._load_friction = np.zeros(count)
         self.encoder_offset = np.zeros(count)
         """Reading of each encoder minus the true angle [rad]."""
         for k, (drive, joint_params) in enumerate(zip(drives, params, strict=True)):
@@ -185,7 +188,11 @@ class Plant:
             self._rotor_inertia[k] = joint_params.rotor_inertia * drive.gear_ratio**2
             self._viscous[k] = joint_params.viscous
             self.encoder_offset[k] = joint_params.encoder_offset
+            self._load_friction[k] = joint_params.load_friction
         self._lowest_torque = -self._effort_limit
+        self._dry_friction = model.actuator_biasprm[self.actuator, _COULOMB : _BREAKAWAY + 1].copy()
+        self.has_load_friction = bool(self._load_friction.any())
+        """Whether the dry friction of a joint grows with its torque."""
         self.inverters = model.actuator_gainprm[:, _VMAX]
         """Voltages at which the inverters clip, a view; every actuator of the plant is a motor
         [V]."""
@@ -292,6 +299,16 @@ class Plant:
         np.maximum(torque, self._lowest_torque, out=torque)
         limited: Array = np.minimum(torque, self._effort_limit, out=torque)
         return limited
+
+    def set_load(self, torque: Array) -> None:
+        """Add the friction that torques of the motors [N m], (joints,), press out of the gears.
+
+        Friction while slipping and at the onset of slip grow by the same torque.
+        """
+        added = self._load_friction * np.abs(torque)
+        friction = self.model.actuator_biasprm
+        friction[self.actuator, _COULOMB] = self._dry_friction[:, 0] + added
+        friction[self.actuator, _BREAKAWAY] = self._dry_friction[:, 1] + added
 
     def set_clamps(
         self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float

@@ -29,6 +29,8 @@ SHIPPED_ROBOT = "mini_cheetah"
 """Robot whose parameters are shipped."""
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 """File of the shipped parameters."""
+SHIPPED_FILES = {SHIPPED_ROBOT: SHIPPED, "go2": Path(__file__).with_name("go2_sim_params.yaml")}
+"""Files of parameters of the robots that have one."""
 
 # Bounds exclude errors by a factor of ten or more in a file. Those of joints hold for every size,
 # from a finger of grams to a leg of fifty kilograms; `Plant` refuses what does not suit the links.
@@ -71,6 +73,8 @@ class JointParams(Bounded):
     """Damping of the bristles, LuGre sigma_1 [N m s/rad]."""
     viscous: _Torque
     """Viscous friction of the rotor [N m s/rad]."""
+    load_friction: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    """Dry friction that the torque through the gear adds, per torque of the motor [1]."""
     encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
     """Reading minus true angle; the drive closes its loop on the reading [rad]."""
 
@@ -265,15 +269,27 @@ def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = No
     """Read a parameter file.
 
     Args:
-        path: The file; None for the shipped one, whose match is the paper's Table I.
+        path: The file; None for the one shipped for the robot. Without a robot it is the Mini
+            Cheetah's, whose match is the paper's Table I.
         robot: The robot, of which `default_sim_params` are returned where there is no file.
 
     Raises:
         RobotError: The file is missing or not a valid file of parameters.
     """
-    if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
+    if path is not None:
+        return _parse_file(Path(path))
+    if robot is None:
+        return _parse_file(SHIPPED)
+    if robot.name not in SHIPPED_FILES:
         return default_sim_params(robot)
-    path = SHIPPED if path is None else Path(path)
+    shipped = _parse_file(SHIPPED_FILES[robot.name])
+    if set(shipped.joints) != set(robot.joint_names):  # another model of this name
+        return default_sim_params(robot)
+    return shipped
+
+
+def _parse_file(path: Path) -> SimParams:
+    """Read one file of parameters."""
     body = read_yaml(path, RobotError, f"copy {SHIPPED} and edit it")
     return parse_sim_params(body, str(path))
 
