@@ -20,7 +20,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.files import read_yaml
 
@@ -283,9 +285,12 @@ def _command_ranges(commands: Any, source: str) -> dict[str, tuple[float, float]
     return ranges
 
 
-def shaped(values: Any, term: Term) -> np.ndarray[Any, np.dtype[np.float64]]:
+def shaped(values: ArrayLike, term: Term) -> Array:
     """Clip and scale one sample of a term."""
     scale = np.asarray(term.scale)
+    lowest, highest = term.clip
     if term.scale_first:
-        return np.clip(np.asarray(values) * scale, *term.clip)
-    return np.clip(np.asarray(values), *term.clip) * scale
+        scaled_first: Array = np.clip(np.asarray(values) * scale, lowest, highest)
+        return scaled_first
+    clipped_first: Array = np.clip(np.asarray(values), lowest, highest) * scale
+    return clipped_first

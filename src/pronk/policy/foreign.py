@@ -89,7 +89,7 @@ class ForeignPolicy:
     def _observation(self, measured: Measurement, command: Array) -> Array:
         """Return the observation with its histories, shape (width,)."""
         deploy = self.deploy
-        samples = []
+        samples: list[Array] = []
         for term in deploy.terms:
             samples.append(shaped(self._value(term, measured, command), term))
         if not self._histories:
@@ -103,7 +103,7 @@ class ForeignPolicy:
             if deploy.newest_first:
                 row.reverse()
             rows.append(row)
-        parts = []
+        parts: list[Array] = []
         if deploy.by_sample:
             for samples_of_time in zip(*rows, strict=True):
                 parts += samples_of_time
@@ -115,16 +115,18 @@ class ForeignPolicy:
     def _value(self, term: Term, measured: Measurement, command: Array) -> Array:
         """Return the present value of a term, before it is clipped and scaled."""
         if term.name == "base_ang_vel":
-            return np.asarray(measured.angular_velocity)
+            return np.array(measured.angular_velocity, dtype=np.float64)
         if term.name == "projected_gravity":
-            return self.deploy.gravity_sign * np.asarray(measured.projected_gravity)
+            gravity = np.array(measured.projected_gravity, dtype=np.float64)
+            return self.deploy.gravity_sign * gravity
         if term.name in COMMAND_TERMS:
             return command
         if term.name == "last_action":
             return self._action
         if term.name in ("joint_vel", "joint_vel_rel"):
-            return np.asarray(measured.velocity)[self._places]
-        position = np.asarray(measured.position)[self._places]
+            velocity: Array = np.asarray(measured.velocity)[self._places]
+            return velocity
+        position: Array = np.asarray(measured.position)[self._places]
         if term.name == "joint_pos":
             return position
         return position - self._default_position
@@ -253,8 +255,7 @@ def deploy_problems(deploy: DeployFile, robot: RobotSpec) -> list[str]:
     """List what contradicts the robot's file.
 
     Raises:
-        ArtefactError: The policy has another number of joints, or a pose that the robot cannot
-            take.
+        ArtefactError: The policy has another number of joints.
     """
     joints = robot.joints
     if len(deploy.joint_ids) != len(joints):
@@ -262,14 +263,13 @@ def deploy_problems(deploy: DeployFile, robot: RobotSpec) -> list[str]:
             f"deploy.yaml has {len(deploy.joint_ids)} joints; {robot.name} has {len(joints)}."
         )
     problems = []
-    for name, place in (("default_joint_pos", deploy.default_position),):
-        for index, value in zip(deploy.joint_ids, place, strict=True):
-            low, high = joints[index].range
-            if not low <= value <= high:
-                problems.append(
-                    f"{name} puts {joints[index].name} at {value:g} rad, outside its range of "
-                    f"{low:.3g} to {high:.3g}: the joint order is another one, or the robot"
-                )
+    for index, value in zip(deploy.joint_ids, deploy.default_position, strict=True):
+        low, high = joints[index].range
+        if not low <= value <= high:
+            problems.append(
+                f"default_joint_pos puts {joints[index].name} at {value:g} rad, outside its range "
+                f"of {low:.3g} to {high:.3g}: the order of the joints is another one, or the robot"
+            )
     for joint, stiffness, damping in zip(joints, deploy.stiffness, deploy.damping, strict=True):
         if not math.isclose(stiffness, joint.stiffness, rel_tol=1e-3) or not math.isclose(
             damping, joint.damping, rel_tol=1e-3
