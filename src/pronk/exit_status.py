@@ -22,5 +22,7 @@ class ExitStatus(IntEnum):
     """`match`: at least one joint is no match. The files are written, with the joint marked."""
     RUN_FAULT = 5
     """`deploy`: a safety rule ended the run, a check refused it, or its log or capture was lost."""
+    POLICY_FELL = 8
+    """`policy check`: the policy fell on the virtual robot."""
     INTERRUPTED = 130
     """The command was interrupted, by Ctrl-C or by a signal to end."""

@@ -56,6 +56,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
     "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
     "deploy": ("pronk.cli.deploy:deploy_command", "Run a policy on a robot or the virtual robot."),
+    "policy": ("pronk.cli.policy:policy", "Check a policy that was trained elsewhere."),
     "simulate": ("pronk.cli.simulate:simulate", "Run the virtual robot as a process of its own."),
     "robot": ("pronk.cli.robot:robot", "Write or check the robot.yaml of a model."),
     "report": ("pronk.cli.report:report", "Write one HTML page of matches, trials, deployments."),

@@ -129,7 +129,8 @@ class ForeignPolicy:
         position: Array = np.asarray(measured.position)[self._places]
         if term.name == "joint_pos":
             return position
-        return position - self._default_position
+        relative: Array = position - self._default_position
+        return relative
 
 
 def load_network(path: Path, deploy: DeployFile) -> Callable[[Array], Array]:
