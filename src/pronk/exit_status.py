@@ -22,6 +22,11 @@ class ExitStatus(IntEnum):
     """`match`: at least one joint is no match. The files are written, with the joint marked."""
     RUN_FAULT = 5
     """`deploy`: a safety rule ended the run, a check refused it, or its log or capture was lost."""
+    DRIFTED = 6
+    """`drift`: at least one gain, friction or delay has changed by more than its intervals."""
+    NOT_RESOLVED = 7
+    """`drift`: none has changed by more than its intervals, and of at least one stiffness or
+    damping a change that matters would not show."""
     POLICY_FELL = 8
     """`policy check`: the policy fell on the virtual robot."""
     INTERRUPTED = 130

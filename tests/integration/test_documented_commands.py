@@ -71,6 +71,7 @@ PARSED = {
     "chirp_sweep": "needs recordings that are not in the repository",
     "step_response": "needs recordings that are not in the repository",
     "menagerie:NAME": "needs a robot that is downloaded",
+    "OLD.yaml": "needs an earlier match",
     "NET.pt": "needs an actuator network",
     "YOUR_SIM_PARAMS": "needs parameters of the reader's own",
 }

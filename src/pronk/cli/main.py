@@ -42,6 +42,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     ),
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.predict:predict_logs", "Replay logs that the fit has not used."),
+    "drift": ("pronk.cli.drift:drift", "Say which gains have changed since an earlier match."),
     "export": ("pronk.cli.export:export_gains", "Write gains as configuration of a simulator."),
     "translate": (
         "pronk.cli.translate:translate_gains",
