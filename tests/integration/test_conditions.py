@@ -35,10 +35,12 @@ from pronk.jump.trial.conditions import (
 from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.results import load_results
 from pronk.jump.trial.trial import TrialPlan, TrialSetup
+from pronk.jump.virtual.plant import Plant
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Script
 from pronk.report.trial_figures import draw_conditions
+from pronk.robots.model import bench_inertia
 
 SIM_PARAMS = load_sim_params()
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0)
@@ -101,21 +103,67 @@ def test_a_robot_that_cannot_exist_is_refused(change: Change, words: str) -> Non
     assert "condition odd" in str(refusal.value)
 
 
+@pytest.mark.parametrize("error_db", [-4.0, -1.0, 0.25, 0.5])
+def test_a_gain_error_is_one_of_the_response(error_db: float) -> None:
+    """Recomputed for each joint; softer with a minus, and the torque limits stay."""
+    change = Change(parameters=("joints.gain_scale",), gain_error_db=error_db)
+    condition = Condition(name="off", changes=(change,))
+    changed = changed_params(condition, SIM_PARAMS, ROBOT)
+    for joint in ROBOT.joints:
+        params = changed.joints[joint.name]
+        assert replace(params, gain_scale=1.0) == SIM_PARAMS.joints[joint.name]
+        assert (params.gain_scale > 1.0) == (error_db > 0.0)
+        inertia, _ = bench_inertia(ROBOT, joint.name)
+        s = 2j * math.pi * np.linspace(*joint.band_hz, 1000)
+        levels = []
+        for scale in (1.0, params.gain_scale):
+            stiffness = scale * params.torque_scale * joint.stiffness
+            damping = scale * params.torque_scale * joint.damping + params.viscous
+            levels.append(
+                20.0 * np.log10(abs(stiffness / (inertia * s**2 + damping * s + stiffness)))
+            )
+        rms = math.sqrt(np.mean((levels[1] - levels[0]) ** 2))
+        assert rms == pytest.approx(abs(error_db), rel=0.02)
+
+
+def test_a_gain_error_that_no_drive_has_is_refused() -> None:
+    change = Change(parameters=("joints.gain_scale",), gain_error_db=4.0)
+    with pytest.raises(RobotError, match="at most") as refusal:
+        changed_params(Condition(name="too stiff", changes=(change,)), SIM_PARAMS, ROBOT)
+    assert "condition too stiff" in str(refusal.value)
+
+
+def test_the_virtual_robot_applies_the_scale_to_the_gains_alone() -> None:
+    """A joint that is held off its target gives that share of the torque."""
+    torques = []
+    for scale in (1.0, 0.5):
+        change = Change(parameters=("joints.gain_scale",), value=scale)
+        params = changed_params(Condition(name="off", changes=(change,)), SIM_PARAMS, ROBOT)
+        plant = Plant(ROBOT, params, ("FR",), 2.5e-4)
+        plant.set_gains(np.full(3, 20.0), np.full(3, 0.5))
+        torques.append(plant.model.actuator_gainprm[plant.actuator].copy())
+        limits = plant.inverters.copy()
+    stiffness = 4  # place of kp in MuJoCo's parameters of a dcmotor
+    np.testing.assert_allclose(torques[1][:, stiffness], 0.5 * torques[0][:, stiffness])
+    np.testing.assert_array_equal(limits, plant.inverters)
+
+
 # --- Files --------------------------------------------------------------------------------------
 
 
-def test_the_tolerance_is_three_series_about_the_nominal_robot() -> None:
+def test_the_tolerance_is_four_series_about_the_nominal_robot() -> None:
     conditions = load_conditions("tolerance", SIM_PARAMS, ROBOT)
     series: dict[str, list[float]] = {}
     for condition in conditions:
         assert condition.place is not None
         series.setdefault(condition.series, []).append(condition.place)
-    torque, delay, friction = series.values()
+    torque, delay, friction, gain_error = series.values()
     assert (min(torque), max(torque)) == (0.5, 1.7)
     assert (min(delay), max(delay)) == (0.0, 0.02)
     assert (min(friction), max(friction)) == (0.0, 5.0)
+    assert (min(gain_error), max(gain_error)) == (-4.0, 0.5)
     for condition in conditions:
-        if condition.name.startswith("torque of the drives 1 "):
+        if condition.name.startswith(("torque of the drives 1 ", "gain error 0 ")):
             assert changed_params(condition, SIM_PARAMS, ROBOT) == SIM_PARAMS
 
 
@@ -144,7 +192,12 @@ def test_the_tolerance_is_three_series_about_the_nominal_robot() -> None:
         ),
         (
             "schema: pronk/conditions/1\nseries: [{name: a, parameters: [ground.friction]}]",
-            "factors, offsets and values",
+            "factors, offsets, values and",
+        ),
+        (
+            "schema: pronk/conditions/1\nconditions: [{name: a, changes: "
+            "[{parameters: [ground.friction], gain_error_db: 2}]}]",
+            "joints.gain_scale",
         ),
     ],
 )

@@ -56,8 +56,8 @@ class StudyOptions:
     """Also cross gaps and steps of growing size."""
     conditions: str | None = None
     """Instead of all that, jump under other conditions of the virtual robot: a YAML file,
-    "tolerance" (weaker and stronger drives, delay, friction) or "bodies" (random robots). A run
-    that was interrupted goes on in its folder."""
+    "tolerance" (weaker and stronger drives, delay, friction, gain error) or "bodies" (random
+    robots). A run that was interrupted goes on in its folder."""
 
 
 @dataclass(frozen=True, kw_only=True)

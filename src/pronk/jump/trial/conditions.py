@@ -1,6 +1,7 @@
 """Conditions of a trial: named changes of the virtual robot's parameters.
 
-A condition is a list of changes; each multiplies, shifts or replaces numbers of `SimParams`:
+A condition is a list of changes; each multiplies, shifts or replaces numbers of `SimParams`, or
+scales the gains of drives by an error of the joint's response (`gain_scale_of`):
 
     weak = Condition(
         name="weak knees",
@@ -22,7 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
+from scipy.optimize import brentq
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError, PronkError, RobotError
 from pronk.files import read_yaml
 from pronk.jump.trial.bodies import Number, draw_body
@@ -37,6 +41,7 @@ from pronk.jump.virtual.sim_params import (
     TrunkParams,
 )
 from pronk.names import check_names
+from pronk.robots.model import bench_inertia
 from pronk.robots.robot import RobotSpec
 
 SCHEMA = "pronk/conditions/1"
@@ -58,12 +63,18 @@ _PARTS: dict[str, Any] = {
     "ground": Ground,
 }
 """Parts of `SimParams` that a condition may change."""
+GAIN_SCALE = "joints.gain_scale"
+"""The parameter that a gain error changes."""
+_LARGEST_GAIN_SCALE = 10.0
+"""Largest factor on the gains of a drive; its inverse is the smallest."""
+_BAND_POINTS = 200
+"""Frequencies of a band at which responses are compared."""
 _SCENE = ("terrain", "floor")
 """Fields of the ground that belong to a scene, not to a robot."""
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One change, by exactly one of a factor, an offset and a value, of one or more numbers."""
+    """One change, by exactly one of its four ways, of one or more numbers."""
 
     parameters: tuple[str, ...]
     """Part and name of each number, as in `joints.torque_scale`."""
@@ -75,18 +86,27 @@ class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What is added to the nominal number, in its unit."""
     value: Number | None = None
     """What replaces the nominal number, in its unit."""
+    gain_error_db: float | None = None
+    """Of `joints.gain_scale` alone: error of each joint's response, root mean square in its band,
+    negative where the drives are softer than they should be [dB]."""
 
     def __post_init__(self) -> None:
-        """Refuse a change of nothing, of unknown numbers, or by more than one of the three."""
+        """Refuse a change of nothing, of unknown numbers, or by more than one of the four."""
         if not self.parameters:
             raise ValueError("parameters is empty; expected one or more, as joints.torque_scale")
         for parameter in self.parameters:
             _check_parameter(parameter)
-        count = 3 - (self.factor, self.offset, self.value).count(None)
+        ways = (self.factor, self.offset, self.value, self.gain_error_db)
+        count = len(ways) - ways.count(None)
         if count != 1:
             raise ValueError(
-                f"the change of {', '.join(self.parameters)} has {count} of factor, offset and "
-                "value; expected exactly one"
+                f"the change of {', '.join(self.parameters)} has {count} of factor, offset, value "
+                "and gain_error_db; expected exactly one"
+            )
+        if self.gain_error_db is not None and self.parameters != (GAIN_SCALE,):
+            raise ValueError(
+                f"the change of {', '.join(self.parameters)} has a gain_error_db, which is one of "
+                f"{GAIN_SCALE}; give that parameter alone"
             )
 
     def applied(self, nominal: Number) -> Number:
@@ -118,7 +138,7 @@ class Condition(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Conditions that change the same numbers by one of several factors, offsets or values."""
+    """Conditions that change the same numbers, each by another number in the same way."""
 
     name: str
     unit: str = ""
@@ -127,9 +147,10 @@ class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     factors: tuple[float, ...] = ()
     offsets: tuple[float, ...] = ()
     values: tuple[float, ...] = ()
+    gain_errors_db: tuple[float, ...] = ()
 
     def conditions(self) -> list[Condition]:
-        """Return one condition for each factor, offset or value."""
+        """Return one condition for each factor, offset, value or gain error."""
         changes = []
         for factor in self.factors:
             changes.append((factor, self._change(factor=factor)))
@@ -137,6 +158,8 @@ class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             changes.append((offset, self._change(offset=offset)))
         for value in self.values:
             changes.append((value, self._change(value=value)))
+        for error_db in self.gain_errors_db:
+            changes.append((error_db, self._change(gain_error_db=error_db)))
         heading = f"{self.name} [{self.unit}]" if self.unit else self.name
         conditions = []
         for place, change in changes:
@@ -150,6 +173,7 @@ class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         factor: float | None = None,
         offset: float | None = None,
         value: float | None = None,
+        gain_error_db: float | None = None,
     ) -> Change:
         return Change(
             parameters=self.parameters,
@@ -157,15 +181,17 @@ class _Series(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             factor=factor,
             offset=offset,
             value=value,
+            gain_error_db=gain_error_db,
         )
 
     def __post_init__(self) -> None:
         """Refuse a series without points, or with points of two kinds."""
-        count = 3 - (self.factors, self.offsets, self.values).count(())
+        ways = (self.factors, self.offsets, self.values, self.gain_errors_db)
+        count = len(ways) - ways.count(())
         if count != 1:
             raise ValueError(
-                f"the series {self.name} has {count} of factors, offsets and values; expected "
-                "exactly one"
+                f"the series {self.name} has {count} of factors, offsets, values and "
+                "gain_errors_db; expected exactly one"
             )
 
 
@@ -195,6 +221,18 @@ def changed_params(condition: Condition, sim_params: SimParams, robot: RobotSpec
     part_numbers: dict[str, dict[str, Number]] = {name: {} for name in _PARTS}
     for change in condition.changes:
         names = _joints_of(change, robot, condition.name)
+        if change.gain_error_db is not None:
+            for name in names:
+                try:
+                    scale = gain_scale_of(
+                        robot, name, sim_params.joints[name], change.gain_error_db
+                    )
+                except RobotError as error:
+                    raise RobotError(f"condition {condition.name}: {error}") from None
+                nominal = joint_numbers[name].get("gain_scale", sim_params.joints[name].gain_scale)
+                assert isinstance(nominal, float)
+                joint_numbers[name]["gain_scale"] = nominal * scale
+            continue
         for parameter in change.parameters:
             part, _, field = parameter.partition(".")
             if part == "joints":
@@ -225,6 +263,60 @@ def changed_params(condition: Condition, sim_params: SimParams, robot: RobotSpec
         )
     except RobotError as error:
         raise RobotError(f"condition {condition.name}: {error}") from None
+
+
+def gain_scale_of(robot: RobotSpec, name: str, params: JointParams, error_db: float) -> float:
+    """Compute the factor on a drive's gains that changes its joint's response by an error.
+
+    The response is that of a rigid joint with a PD drive (reading A9), |stiffness / (stiffness -
+    I w^2 + j w (damping + viscous))|, with the nominal gains of the drive times its scales. The
+    error is the root mean square, over the band of the joint, of the change of 20 log10 of it, as
+    `error_db` of `gains.yaml` is. It is a matter of the response, not of the gains: half the gains
+    are 2.7 to 4 dB on the legs of the Mini Cheetah with its nominal 17 / 0.4, twice the gains 0.9
+    to 1.6 dB. A stiff joint follows its command and can do no more, so that the error of stiffer
+    drives has an upper bound.
+
+    Args:
+        robot: The robot.
+        name: Name of the joint.
+        params: Its parameters.
+        error_db: The error, negative for softer drives [dB].
+
+    Returns:
+        The factor, below 1 for softer and above 1 for stiffer drives [1].
+
+    Raises:
+        RobotError: No factor from 0.1 to 10 gives such an error.
+    """
+    if error_db == 0.0:
+        return 1.0
+    joint = robot.joint(name)
+    inertia, _ = bench_inertia(robot, name)
+    omega = 2.0 * math.pi * np.linspace(*joint.band_hz, _BAND_POINTS)
+    share = params.torque_scale * params.gain_scale
+    stiffness = share * joint.stiffness
+    damping = share * joint.damping
+
+    def magnitude_db(scale: float) -> Array:
+        rest = scale * stiffness - inertia * omega**2
+        response = scale * stiffness / (rest + 1j * omega * (scale * damping + params.viscous))
+        return np.asarray(20.0 * np.log10(np.abs(response)))
+
+    nominal_db = magnitude_db(1.0)
+
+    def excess(log_scale: float) -> float:
+        change = magnitude_db(math.exp(log_scale)) - nominal_db
+        return float(np.sqrt(np.mean(change**2))) - abs(error_db)
+
+    farthest = math.copysign(math.log(_LARGEST_GAIN_SCALE), error_db)
+    if excess(farthest) < 0.0:
+        most = excess(farthest) + abs(error_db)
+        word = "stiffer" if error_db > 0.0 else "softer"
+        raise RobotError(
+            f"a {word} drive of {name} changes its response by {most:.2g} dB at most, not "
+            f"{abs(error_db):g} dB; give a smaller gain error."
+        )
+    return math.exp(float(brentq(excess, 0.0, farthest, xtol=1e-9)))
 
 
 def _apply(change: Change, field: str, part: object, numbers: dict[str, Number]) -> None:

@@ -175,6 +175,7 @@ class Plant:
         self._rotor_inertia = np.zeros(count)
         self._viscous = np.zeros(count)
         self._load_friction = np.zeros(count)
+        self._gain_scale = np.ones(count)
         self.encoder_offset = np.zeros(count)
         """Reading of each encoder minus the true angle [rad]."""
         for k, (drive, joint_params) in enumerate(zip(drives, params, strict=True)):
@@ -187,6 +188,7 @@ class Plant:
             self._effort_limit[k] = joint_params.torque_scale * drive.effort_limit
             self._rotor_inertia[k] = joint_params.rotor_inertia * drive.gear_ratio**2
             self._viscous[k] = joint_params.viscous
+            self._gain_scale[k] = joint_params.gain_scale
             self.encoder_offset[k] = joint_params.encoder_offset
             self._load_friction[k] = joint_params.load_friction
         self._lowest_torque = -self._effort_limit
@@ -200,7 +202,7 @@ class Plant:
         """Numbers in a raw state: positions, velocities, activations, bus voltage."""
         self._rotor_mass = model.body_mass[model.dof_bodyid[self.rotor]].copy()
         damping = np.array([robot.joint(name).damping for name in names])
-        self.largest_timestep = self._largest_timestep(params, damping)
+        self.largest_timestep = self._largest_timestep(params, damping * self._gain_scale)
         """Largest physics step at which belts, friction and drives can be simulated [s]."""
         self._params = params
         if checked:
@@ -274,7 +276,9 @@ class Plant:
         )
 
     def set_gains(self, stiffness: Array, damping: Array) -> None:
-        """Set the drives' gains [N m/rad, N m s/rad] from the next physics step."""
+        """Command the drives' gains [N m/rad, N m s/rad] from the next physics step."""
+        stiffness = stiffness * self._gain_scale
+        damping = damping * self._gain_scale
         volts = self.resistance / self._believed
         self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
         self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant

@@ -77,6 +77,9 @@ class JointParams(Bounded):
     """Dry friction that the torque through the gear adds, per torque of the motor [1]."""
     encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
     """Reading minus true angle; the drive closes its loop on the reading [rad]."""
+    gain_scale: _Share = 1.0
+    """Stiffness and damping that the drive applies per those commanded; its torque limits stay [1].
+    """
 
     def __post_init__(self) -> None:
         """Refuse a joint that cannot exist."""
