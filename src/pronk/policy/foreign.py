@@ -271,12 +271,16 @@ def deploy_problems(deploy: DeployFile, robot: RobotSpec) -> list[str]:
                 f"default_joint_pos puts {joints[index].name} at {value:g} rad, outside its range "
                 f"of {low:.3g} to {high:.3g}: the order of the joints is another one, or the robot"
             )
+    named: dict[str, list[str]] = {}
     for joint, stiffness, damping in zip(joints, deploy.stiffness, deploy.damping, strict=True):
-        if not math.isclose(stiffness, joint.stiffness, rel_tol=1e-3) or not math.isclose(
-            damping, joint.damping, rel_tol=1e-3
-        ):
-            problems.append(
-                f"the gains of {joint.name} are {stiffness:g} N m/rad and {damping:g} N m s/rad; "
-                f"{robot.name}'s file has {joint.stiffness:g} and {joint.damping:g}"
-            )
+        same_stiffness = math.isclose(stiffness, joint.stiffness, rel_tol=1e-3)
+        if same_stiffness and math.isclose(damping, joint.damping, rel_tol=1e-3):
+            continue
+        text = (
+            f"{stiffness:g} N m/rad and {damping:g} N m s/rad in deploy.yaml; {robot.name}'s file "
+            f"has {joint.stiffness:g} and {joint.damping:g}"
+        )
+        named.setdefault(text, []).append(joint.name)
+    for text, names in named.items():
+        problems.append(f"gains of {', '.join(names)}: {text}")
     return problems
