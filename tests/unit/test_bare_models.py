@@ -319,7 +319,6 @@ TENDON = '<tendon><fixed name="t"><joint joint="j" coef="3"/></fixed></tendon>'
             ("position", 70.0, 0.9, 8.0),
         ),
         ('<intvelocity joint="j" kp="50" actrange="-1 1"/>', "", ("position", 50.0, 0.0, None)),
-        ('<velocity joint="j" kv="4" ctrlrange="-9 9"/>', "", ("velocity", None, 4.0, None)),
         ('<motor joint="j" gear="20" ctrlrange="-0.5 0.5"/>', "", ("motor", None, None, 10.0)),
         (
             '<general joint="j" gainprm="5" gear="3" ctrlrange="-1 1"/>',
@@ -374,6 +373,40 @@ def test_numbers_of_actuators_are_those_that_mujoco_computes_at_the_joint(
     assert (read.drive.armature, read.drive.viscous_damping) == (0.03, 0.07)
     checked = accepted("robot", "check", tmp_path / "robot.yaml")
     assert "nothing is inconsistent" not in checked
+
+
+VELOCITY = '<velocity joint="j" kv="4" gear="2" ctrlrange="-9 9"/>'
+
+
+def test_a_velocity_servo_has_no_stiffness_so_that_its_joint_is_held(tmp_path: Path) -> None:
+    """No number is invented for it; a joint beside it can be swept, and it can be given gains."""
+    path = tmp_path / "actuated.xml"
+    actuators = VELOCITY + '<position joint="spring" kp="5" kv="0.1" forcerange="-3 3"/>'
+    path.write_text(ACTUATED.format(actuators=actuators, joint="", tendon=""))
+    said = accepted("robot", "new", path)
+    robot = load_robot(tmp_path / "robot.yaml")
+    assert robot.joint_names == ("spring",)
+    assert robot.held_joints == ("j",)
+    assert "j" in said
+    held_line = next(
+        line for line in (tmp_path / "robot.yaml").read_text().splitlines() if line[:5] == "  j: "
+    )
+    assert "velocity servo" in held_line
+    assert " 16 N m s/rad" in held_line
+    sweep = ("sweep", tmp_path / "robot.yaml", "--repeats", "1", "--plan-only")
+    out = ("--out", tmp_path / "logs")
+    sentence = refused(*sweep, "--joints", "j", *out)
+    assert "velocity servo" in sentence
+    assert "stiffness" in sentence
+    accepted(*sweep, "--joints", "spring", "--amplitude", "0.02", *out)
+
+
+def test_a_model_of_velocity_servos_alone_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "actuated.xml"
+    path.write_text(ACTUATED.format(actuators=VELOCITY, joint="", tendon=""))
+    sentence = refused("robot", "new", path)
+    assert "position servo" in sentence
+    assert not (tmp_path / "robot.yaml").exists()
 
 
 def test_stiffness_is_the_derivative_of_the_torque_of_the_actuators(tmp_path: Path) -> None:

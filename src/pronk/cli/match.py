@@ -219,8 +219,7 @@ def next_commands(result: MatchResult, out: Path, options: str = "") -> list[str
         options: Options with which logs were read, for the command that reads another log.
     """
     if result.gains.unmatched:
-        joints = ", ".join(result.gains.unmatched)
-        return [f"record {joints} again; --allow-unmatched exports these gains all the same"]
+        return unmatched_commands(result)
     if by_torque_alone(result):
         robot = result.robot_path or result.robot
         return [f"pronk sweep {robot} --out LOGS, for torque tells no gains: match that sweep"]
@@ -246,6 +245,49 @@ def export_target(result: MatchResult) -> str | None:
         if target.profile and profile(target.profile) == held:
             return name
     return "mjcf"
+
+
+WITHOUT_RECORDING = {
+    "armature": "set armature of {joints} in {robot}: the rotor inertia of the motor times the "
+    "gear ratio squared. Where no data sheet has it, the same command with --mode drive fits it, "
+    "if the stiffness on the drive is known. Then match the same log again",
+    "stability": "set a smaller timestep_s and a larger decimation in {robot} for {joints}, or "
+    "give --simulator isaaclab-implicit, and match the same log again",
+    "pose": "check the joint order of the file (--joint-order), the signs and how the base hangs, "
+    "for {joints}, and match the same log again",
+    "compliance": "lower the upper end of band_hz of {joints} in {robot} below the resonance, and "
+    "match the same log again",
+}
+"""What to do about a joint that is no match for a reason that another recording does not mend, by
+the first word of the reason."""
+
+
+def unmatched_commands(result: MatchResult) -> list[str]:
+    """Return what to do about the joints of a match that are none, a line for each remedy.
+
+    Args:
+        result: The match.
+    """
+    joints_by_remedy: dict[str, list[str]] = {}
+    for name, reasons in result.gains.unmatched.items():
+        remedy = "record"
+        for word in WITHOUT_RECORDING:
+            if any(reason.startswith(f"{word}: ") for reason in reasons):
+                remedy = word
+                break
+        joints_by_remedy.setdefault(remedy, []).append(name)
+    robot = result.robot_path or f"the robot's file of {result.robot}"
+    if result.robot_path and not result.robot_path.endswith((".yaml", ".yml")):
+        robot = f"the file of `pronk robot new {robot}`"
+    lines = []
+    for remedy, names in joints_by_remedy.items():
+        joints = ", ".join(names)
+        if remedy == "record":
+            lines.append(f"record {joints} again")
+        else:
+            lines.append(WITHOUT_RECORDING[remedy].format(joints=joints, robot=robot))
+    lines[-1] += "; --allow-unmatched exports these gains all the same"
+    return lines
 
 
 def by_torque_alone(result: MatchResult) -> bool:

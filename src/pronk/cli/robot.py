@@ -77,7 +77,10 @@ def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
 
 def _held_sentence(names: tuple[str, ...]) -> str:
     """Say which joints are held."""
-    return f"held at the pose, as they are no hinges or have no drive: {', '.join(names)}"
+    return (
+        "held at the pose, as they are no hinges or nothing drives them to a position: "
+        f"{', '.join(names)}"
+    )
 
 
 def _check_robot(path: Path, *, wide: bool) -> None:

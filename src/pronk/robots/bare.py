@@ -119,8 +119,8 @@ def describe_model(path: Path) -> ModelDescription:
     hinges = [index for index in source.hinges if source.joint_names[index] not in held_joints]
     if not hinges:
         raise RobotError(
-            f"{path}: no hinge joint of the model has an actuator, and all are held: "
-            f"{', '.join(held_joints)}."
+            f"{path}: no hinge joint of the model has a position servo or a motor, and all are "
+            f"held: {', '.join(held_joints)}."
         )
     _relieve(source, hinges, servos, qpos, moves)
     data = mujoco.MjData(model)
@@ -303,6 +303,11 @@ def _held_joints(source: SourceModel, servos: tuple[JointServo, ...]) -> dict[st
             held_joints[name] = f"hinge with a range of {np.ptp(model.jnt_range[index]):.2g} rad"
         elif not source.has_mass(index):
             held_joints[name] = "hinge with no mass behind it [rad]"
+        elif servo.servo_type == "velocity":
+            held_joints[name] = (
+                f"velocity servo {', '.join(servo.actuators)} of {servo.damping:.4g} N m s/rad, "
+                "which holds no position [rad]"
+            )
         elif has_actuators and not servo.actuators and not model.jnt_actfrclimited[index]:
             held_joints[name] = "hinge without an actuator [rad]"
     return held_joints
@@ -376,9 +381,7 @@ def _joint_entries(
             damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
             text = f"assumed, damping ratio {DAMPING_RATIO:g}"
             remarks["damping"] = Remark(mark="CHECK", text=text)
-        if servo.servo_type == "velocity":
-            text = f"velocity servo {names} holds no position"
-        elif servo.servo_type == "motor":
+        if servo.servo_type == "motor":
             text = f"{names} is a motor, its gains are in no model"
         else:
             text = "a URDF has no gains" if source.is_urdf else "no actuator moves it"

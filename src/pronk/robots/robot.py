@@ -224,8 +224,11 @@ class RobotSpec:
                 return joint
         if name in self.held_joints:
             raise RobotError(
-                f"{name} of {self.name} is held and not driven: it is no hinge, has no actuator, "
-                "follows another joint, or has no range to speak of; see `held` in its robot.yaml."
+                f"{name} of {self.name} is held and not driven: it is no hinge, has no actuator or "
+                "a velocity servo, follows another joint, or has no range to speak of (`held` in "
+                "its robot.yaml says which). To drive a hinge to a position all the same, take it "
+                "out of `held`, and state its drive, a group with its stiffness and damping, and "
+                "its pose."
             )
         raise RobotError(
             f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."

@@ -49,6 +49,7 @@ from pronk.identify.match.least_squares import (
 )
 from pronk.identify.match.nominal_gains import gains_on_drive
 from pronk.identify.match.parameters import (
+    FREE,
     GAINS,
     PARAMETERS,
     SearchRange,
@@ -217,6 +218,7 @@ class CountedReplay(Replay):
         self.joints = replay.joints
         self.recordings = replay.recordings
         self.delay_step_s = replay.delay_step_s
+        self.step_s = replay.step_s
         self.uncertain_s = replay.uncertain_s
         self._replay = replay
         self._expected = expected
@@ -373,23 +375,33 @@ def _parameters_to_hold(
         if count >= MOST_HELD or len(fitted[joint]) == 1:
             cannot_hold = True
     if cannot_hold:
-        raise _not_identified(unknown)
+        raise _not_identified(unknown, fitted)
     to_hold = []
     for joint, names in unknown.items():
         to_hold.append((joint, min(names, key=HOLD_FIRST.index)))
     return to_hold
 
 
-def _not_identified(unknown: Mapping[str, Sequence[str]]) -> IdentifiabilityError:
-    """The error that names parameters by joint, and what to record."""
+def _not_identified(
+    unknown: Mapping[str, Sequence[str]], fitted: Mapping[str, Sequence[str]]
+) -> IdentifiabilityError:
+    """The error that names parameters by joint, those that may be fitted, and what to record."""
     joints = []
     remedies: dict[str, str] = {}
     for joint, names in unknown.items():
         joints.append(f"{joint}: {', '.join(names)}")
         for name in names:
             remedies[name] = PARAMETERS[name].remedy
+    remaining = []
+    for name in FREE:
+        in_all = all(name in names for names in fitted.values())
+        if in_all and all(name not in names for names in unknown.values()):
+            remaining.append(f"--fit {name}")
+    fewer = "fit fewer parameters"
+    if remaining:
+        fewer = f"fit the others alone ({' '.join(remaining)})"
     return IdentifiabilityError(
-        f"these recordings do not identify {'; '.join(joints)}; fit fewer parameters, hold one "
+        f"these recordings do not identify {'; '.join(joints)}; {fewer}, hold one "
         f"at a known value, or record more: {'; '.join(remedies.values())}."
     )
 
@@ -530,8 +542,10 @@ def _parameter_flags(
 def _early_position(joint: str, best: Optimum, ci95: tuple[float, float]) -> tuple[str, ...]:
     """Say that the position leads its command, and why where that can be told.
 
-    The timestamps of a log are right to a sample, so the delay counts as negative where it is so
-    by a sample more than its interval. A fit that leaves some of the motion unexplained shifts in
+    The timestamps of a log are right to a sample, and the drive laws of two simulators, or of one
+    and a real drive, differ by up to a step of the simulator: an explicit step answers half a step
+    later than a drive without steps. So the delay counts as negative where it is so by a sample
+    and a step more than its interval. A fit that leaves some of the motion unexplained shifts in
     time to make up for it; then nothing is said of the cause.
 
     Args:
@@ -542,7 +556,7 @@ def _early_position(joint: str, best: Optimum, ci95: tuple[float, float]) -> tup
     residuals = best.residuals
     samples = [recording for recording in residuals.replay.recordings if recording.joint == joint]
     period_s = max(float(np.median(np.diff(recording.time))) for recording in samples)
-    if ci95[1] + period_s >= 0.0:
+    if ci95[1] + period_s + residuals.replay.step_s >= 0.0:
         return ()
     delay_s = best.drives()[joint]["delay"]
     lead = (

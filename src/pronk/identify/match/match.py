@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.joint_log import Excitation, JointLog
@@ -16,6 +18,7 @@ from pronk.identify.match.checks import (
     check_armature,
     check_excitations,
     check_explained_motion,
+    check_mean_position,
     check_response,
     unexplained_motion,
     unwrapped,
@@ -53,6 +56,7 @@ from pronk.identify.match.parameters import (
     DRIVE_MODE,
     FREE,
     GAINS_MODE,
+    PARAMETERS,
     WITHOUT_FRICTION,
     checked_names,
 )
@@ -69,14 +73,24 @@ from pronk.identify.match.result import (
 )
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.match.simulation import Simulation, find_simulation
+from pronk.identify.match.torque_column import check_torque_scale
 from pronk.identify.match.torque_fit import fit_torque_drives, left_out_by_torque, with_torque
-from pronk.identify.match.torque_limit import MISFIT, effort_limit_reached, fit_torque_limit
+from pronk.identify.match.torque_limit import (
+    MISFIT,
+    effort_limit_reached,
+    fit_flat_limit,
+    fit_torque_limit,
+    may_be_limited,
+    stated_limit_flag,
+    with_flat_limits,
+)
 from pronk.identify.match.uncertainty import widen_by_step
 from pronk.identify.response.estimate import resolution_note
 from pronk.identify.response.response import ShortExcitationError
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.simulator import JointRigs
+from pronk.identify.simulators.stability import joint_stability_share
 from pronk.progress import Progress, no_progress
 from pronk.robots import ROBOT_NAMES
 from pronk.robots.menagerie import MENAGERIE
@@ -97,6 +111,9 @@ LIMITED_FACTOR = 3.0
 """What the step leaves open of gains that were fitted with the torque limit, over what it leaves
 open of others: a limited joint shows its gains between two limits alone. Measured on 12 joints of
 `tests/joint_mechanisms.py` (saturation, limit wrong, seed 5)."""
+NEAR_LIMIT = 0.5
+"""Share of the limit of stability from which on a search may have ended at it: finite differences
+and longer steps of the search diverge well below."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 
@@ -205,15 +222,24 @@ def match(
             else:
                 excitations = excitations_of(sources[name], name)
                 replay = JointReplay(rigs, excitations)
-                fit = fit_drives(
-                    replay,
-                    parameters=parameters,
-                    nominal={name: nominal[name]},
-                    unidentified="refuse" if mode == "drive" else "flag",
-                )[name]
+                try:
+                    fit = fit_drives(
+                        replay,
+                        parameters=parameters,
+                        nominal={name: nominal[name]},
+                        unidentified="refuse" if mode == "drive" else "flag",
+                    )[name]
+                except IdentifiabilityError as error:
+                    raise IdentifiabilityError(
+                        f"{error}{wrong_stiffness(replay, parameters, nominal[name])}"
+                    ) from error
                 if rigs.sets_effort_limit:
                     fit = fit_torque_limit(
                         replay, excitations, rigs.robot, fit, parameters, nominal[name]
+                    )
+                if simulation.uses_mujoco:
+                    fit = without_speed_line(
+                        fit, simulation, settings, excitations, parameters, nominal[name]
                     )
                 if mode == "drive" and simulation.name == "mujoco":
                     widened_fits, drive_values = physical_drives(
@@ -222,6 +248,11 @@ def match(
                     fit = widened_fits[name]
                     physical |= drive_values
                 fits[name] = with_step_uncertainty(fit, rigs.robot)
+                if simulation.uses_mujoco:
+                    excitation_flags[name] = (
+                        *stability_flags(fit, rigs.robot, nominal[name]),
+                        *excitation_flags[name],
+                    )
             progress("fit", len(fits) / len(measured))
 
         joints: dict[str, JointResult] = {}
@@ -229,6 +260,10 @@ def match(
             if name in measured:
                 reached = effort_limit_reached(excitations_of(sources[name], name), robot, fit)
                 excitation_flags[name] = with_limit_flag(excitation_flags[name], reached)
+                excitation_flags[name] = (
+                    *excitation_flags[name],
+                    *check_torque_scale(excitations_of(sources[name], name), fit),
+                )
             if not measured.get(name):
                 flags = excitation_flags.get(name, ())
                 if name in measured:
@@ -274,6 +309,107 @@ def match(
         excluded = left_out_by_torque(torque_fits, joints)
         result = match_result(simulation, simulation.info(rigs), joints, logs, excluded, method)
         return replace(result, gain_uncertainty=settings.gain_uncertainty)
+
+
+def without_speed_line(
+    fit: DriveFit,
+    simulation: Simulation,
+    settings: MatchSettings,
+    excitations: Sequence[Excitation],
+    parameters: Sequence[str],
+    nominal: Mapping[str, float],
+) -> DriveFit:
+    """Fit a joint without the torque-speed line of its drive where the torque limit is reached.
+
+    Args:
+        fit: The fit with the line.
+        simulation: The robot in its simulator.
+        settings: The threads and the interpreter of the simulator.
+        excitations: Excitations of the joint.
+        parameters: Names of the parameters that were fitted.
+        nominal: All parameters of the joint with the gains stated for its drive.
+    """
+    if not may_be_limited(excitations, simulation.robot, fit, nominal):
+        return fit
+    robot = simulation.robot
+    flat_robot = with_flat_limits(robot, fit.joint)
+    if flat_robot is not None:
+        flat = replace(simulation, robot=flat_robot)
+        with flat.open_rigs(settings.threads, settings.simulator_python) as rigs:
+            replay = JointReplay(rigs, excitations)
+            flat_fit = fit_flat_limit(replay, excitations, robot, fit, parameters, nominal)
+        if flat_fit is not fit:
+            return flat_fit
+    flags = stated_limit_flag(excitations, robot, fit, nominal)
+    return replace(fit, flags=(*flags, *fit.flags))
+
+
+def wrong_stiffness(
+    replay: JointReplay, parameters: Sequence[str], nominal: Mapping[str, float]
+) -> str:
+    """Say that the stiffness stated for a drive contradicts the log, where it does.
+
+    Args:
+        replay: Recordings of a joint whose drive could not be identified with that stiffness.
+        parameters: Names of the parameters that were fitted.
+        nominal: All parameters of the joint with the gains stated for its drive.
+
+    Returns:
+        A sentence with the stiffness that the log gives, to follow another one; empty where the
+        stiffness was fitted, is not identified, or agrees.
+    """
+    if "stiffness" in parameters:
+        return ""
+    joint = replay.joints[0]
+    fit = fit_drives(replay, parameters=GAINS_MODE, nominal={joint: nominal})[joint]
+    low, high = fit.total95["stiffness"]
+    known = fit.sd["stiffness"] <= PARAMETERS["stiffness"].sd_max
+    stated = nominal["stiffness"]
+    if not known or low <= stated <= high:
+        return ""
+    return (
+        f" The stiffness stated for {joint}, {stated:.4g} N m/rad, may be the reason: mode drive "
+        f"takes it as known, and with the armature of the robot's file this log gives "
+        f"{fit.values['stiffness']:.4g} N m/rad ({low:.3g} to {high:.3g}). State the gains that "
+        "were on the drive (--drive-gains), or match in mode gains."
+    )
+
+
+def stability_flags(
+    fit: DriveFit, robot: RobotSpec, nominal: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Say that the gains stated for a drive are not stable in the simulator's drive law.
+
+    A search cannot pass the limit of stability. Where the joint is damped far above critical, gains
+    below it that have the same ratio follow the command alike, so that the response does not show
+    that they are several times too small.
+
+    Args:
+        fit: Fit of a joint.
+        robot: The robot with the step and the drive law of the simulator.
+        nominal: All parameters of the joint with the gains stated for its drive.
+
+    Returns:
+        A flag, which begins with `NO_MATCH` where the matched gains are near the limit; none where
+        the stated gains are stable.
+    """
+    stated_share = joint_stability_share(robot, fit.joint, nominal)
+    if stated_share < 1.0:
+        return ()
+    share = joint_stability_share(robot, fit.joint, fit.values)
+    flag = (
+        f"stability: the gains stated for the drive, {nominal['stiffness']:.4g} N m/rad and "
+        f"{nominal['damping']:.4g} N m s/rad, are {stated_share:.2g} times the limit of drive law "
+        f"{robot.law.label} at {1e3 * robot.timestep_s:g} ms"
+    )
+    if share < NEAR_LIMIT:
+        return (f"{flag}; those matched are {share:.2g} times the limit",)
+    return (
+        f"{NO_MATCH}{flag}, which no search can pass; the gains that were found are {share:.2g} "
+        "times the limit. They may follow the command alike, and are not those of the drive: take "
+        "a smaller timestep_s in the robot's file, or match for a framework whose drives are "
+        "implicit, as --simulator isaaclab-implicit",
+    )
 
 
 def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
@@ -433,6 +569,8 @@ def match_chains(
             matched_positions, nominal_positions = chain.run([matched, nominal])
             for column, name in enumerate(chain.joints):
                 joint_matched = joint_positions(matched_positions, column)
+                measured = [log.position[:, log.column(name)] for log in chain.logs]
+                travels = [float(np.ptp(log.command[:, log.column(name)])) for log in chain.logs]
                 compared = compare_recordings(
                     robot,
                     name,
@@ -446,8 +584,12 @@ def match_chains(
                     responses[name] = compared
                     motion_flags[name] = compared_flags(compared)
                 else:
-                    measured = [log.position[:, log.column(name)] for log in chain.logs]
                     motion_flags[name] = check_explained_motion(measured, joint_matched)
+                motion_flags[name] = (
+                    *motion_flags[name],
+                    *check_mean_position(measured, joint_matched, 0.5 * max(travels)),
+                    *stability_flags(chain_fits[name], robot, nominal[name]),
+                )
             if "stiffness" not in parameters:
                 chain_fits, drive_values = physical_drives(
                     replay, chain_fits, robot, settings.gain_uncertainty
@@ -455,7 +597,10 @@ def match_chains(
                 physical |= drive_values
             for name, fit in chain_fits.items():
                 reached = effort_limit_reached(excitations_of(logs_in_motion, name), robot, fit)
-                excitation_flags[name] = with_limit_flag(excitation_flags[name], reached)
+                excitation_flags[name] = (
+                    *with_limit_flag(excitation_flags[name], reached),
+                    *check_torque_scale(excitations_of(logs_in_motion, name), fit),
+                )
             fits.update(chain_fits)
             excluded.update(chain.excluded)
     joints = {}

@@ -31,6 +31,8 @@ class Replay(ABC):
     recordings: Sequence[Recording]
     delay_step_s = PARAMETERS["delay"].step
     """Finite difference of the delay [s]."""
+    step_s: float
+    """Physics step of the simulator [s]."""
     uncertain_s: tuple[float, float] = (0.0, 0.0)
     """How much earlier and later the commands may have been sent than they are simulated [s]: the
     delay of the drive is then longer or shorter."""
@@ -74,6 +76,7 @@ class JointReplay(Replay):
             LogError: The unit of the joint is not radians.
         """
         self.joints = (excitations[0].joint,)
+        self.step_s = rigs.robot.timestep_s
         self._rigs = rigs
         self._traces: list[CommandTrace] = []
         """The commands: of each the first, the largest amplitude first."""
@@ -184,6 +187,7 @@ class ChainReplay(Replay):
         """
         self.joints = simulation.joints
         self.simulation = simulation
+        self.step_s = simulation.robot.timestep_s
         self._chain = chain_recordings(simulation)
         self.recordings = self._chain.recordings
         self.trusted_hz = self._chain.trusted_hz

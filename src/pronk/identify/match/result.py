@@ -478,6 +478,7 @@ def unidentified_gains(fit: DriveFit, robot: RobotSpec) -> list[str]:
     """Name the fitted gains of a joint that its logs do not identify.
 
     A gain is identified if its relative standard deviation is no more than `Parameter.sd_max`. A
+    stiffness that was held at its nominal value is none, for the logs do not identify it. A
     damping is also identified if its deviation is small beside that of a critically damped joint,
     `2 sqrt(stiffness inertia)`: a drive may have no damping of its own.
 
@@ -486,6 +487,8 @@ def unidentified_gains(fit: DriveFit, robot: RobotSpec) -> list[str]:
         robot: The robot, which has the inertia of the joint.
     """
     unidentified = []
+    if "stiffness" in fit.held:
+        unidentified.append("stiffness")
     for index, name in enumerate(GAINS):
         if name not in fit.ci95:
             continue

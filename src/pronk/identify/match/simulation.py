@@ -27,6 +27,11 @@ class Simulation:
     framework: Profile | None = None
     """Framework whose drive law MuJoCo computes; None for MuJoCo itself and other simulators."""
 
+    @property
+    def uses_mujoco(self) -> bool:
+        """True if MuJoCo computes the joint, by the drive law of `robot`."""
+        return self.framework is not None or self.name == "mujoco"
+
     def open_rigs(self, threads: int, python: Path | None) -> JointRigs:
         """Open the joints of the robot, excited one at a time.
 
@@ -47,7 +52,7 @@ class Simulation:
         Raises:
             PronkError: The simulator is neither MuJoCo nor a framework, which MuJoCo computes.
         """
-        if self.framework is None and self.name != "mujoco":
+        if not self.uses_mujoco:
             raise PronkError(
                 f"simulator {self.name}: several joints of these logs move at once, which only "
                 "simulator mujoco matches; record one joint at a time."

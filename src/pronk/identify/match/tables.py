@@ -105,6 +105,13 @@ def decimals(values: Sequence[float], fewest: int) -> int:
     return max(fewest, 2 - int(np.floor(np.log10(min(positive)))))
 
 
+OF_STATED_INERTIA = (
+    "Gains and intervals hold for the inertia in the robot's file: a motion tells gains over "
+    "inertia alone."
+)
+"""What no motion shows: with a heavier link and larger gains by the same factor it is the same."""
+
+
 def gains_summary_table(result: MatchResult) -> Table:
     """Make the table of the matched gains that fits a terminal of 80 columns.
 
@@ -132,7 +139,10 @@ def gains_summary_table(result: MatchResult) -> Table:
         Column(heading="error", unit="dB", digits=2),
     )
     return Table(
-        title="Matched gains", columns=columns, rows=tuple(rows), notes=dead_band_notes(result)
+        title="Matched gains",
+        columns=columns,
+        rows=tuple(rows),
+        notes=(OF_STATED_INERTIA, *dead_band_notes(result)),
     )
 
 

@@ -17,6 +17,7 @@ more of the motion unexplained.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -51,6 +52,11 @@ LIMIT_FACTORS = (0.4, 0.55, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0, 1.15, 1.4)
 """Limits at which the search may begin, over the torque that the motion shows."""
 MARGIN = 0.9
 """Torque of a recommended amplitude over the limit."""
+SHOWN = 0.8
+"""Torque that the motion shows over the limit of the robot's file from which on it shows the
+limit."""
+NO_LINE = 1e4
+"""No-load speed of a drive whose torque does not depend on its speed [rad/s]."""
 SMOOTH_PERIODS = 2.0
 """Highest frequency of the acceleration over the top of the joint's band. Beyond it the noise of an
 encoder, twice differentiated, is larger than the motion."""
@@ -197,6 +203,125 @@ def fit_torque_limit(
             f"the joint with {fitting:.2g} rad or less"
         )
     return replace(limited, held_out=held_out, flags=(flag, *other_flags))
+
+
+def with_flat_limits(robot: RobotSpec, joint_name: str) -> RobotSpec | None:
+    """Return a robot whose joint has its effort limit at every speed, without a torque-speed line.
+
+    Args:
+        robot: The robot.
+        joint_name: The joint.
+
+    Returns:
+        The robot; None where the line is never below the effort limit.
+    """
+    joints = []
+    for joint in robot.joints:
+        if joint.name == joint_name:
+            drive = joint.drive
+            if not math.isfinite(drive.effort_limit) or drive.no_load_speed >= NO_LINE:
+                return None
+            drive = replace(drive, stall_torque=drive.effort_limit, no_load_speed=NO_LINE)
+            joint = replace(joint, drive=drive)
+        joints.append(joint)
+    return replace(robot, joints=tuple(joints))
+
+
+def fit_flat_limit(
+    replay: JointReplay,
+    excitations: Sequence[Excitation],
+    robot: RobotSpec,
+    plain: DriveFit,
+    parameters: Sequence[str],
+    nominal: Mapping[str, float],
+) -> DriveFit:
+    """Fit a joint again without the torque-speed line of its drive, where it is at its limit.
+
+    A line that falls too early takes torque from a drive that is at its limit in motion, and no
+    gains make up for it.
+
+    Args:
+        replay: Recordings of the joint, on rigs of `with_flat_limits`.
+        excitations: The excitations of the recordings.
+        robot: The robot with the line.
+        plain: The fit with the line.
+        parameters: Names of the parameters that it fitted.
+        nominal: All parameters of the joint with the gains stated for its drive.
+
+    Returns:
+        The fit without the line and a flag that says so, or the plain fit.
+    """
+    amplitude = max(recording.amplitude for recording in replay.recordings)
+    flat = fit_drives(replay, parameters=parameters, nominal={plain.joint: nominal})[plain.joint]
+    error = flat.held_out["matched"]
+    if error > EXPLAINED * amplitude or error > BETTER * plain.held_out["matched"]:
+        return plain
+    drive = robot.joint(plain.joint).drive
+    delay_s = max(flat.values["delay"], 0.0)
+    torques = drive_torques(excitations, robot, {**flat.values, "delay": delay_s})
+    flag = effort_limit_flag(
+        torques.demanded, drive.effort_limit, flat.values["stiffness"], amplitude
+    )
+    if not flag:
+        return plain
+    flag = (
+        f"{flag}. The drive gives its limit at every speed of the log, where the robot's file has "
+        f"less (stall_torque {drive.stall_torque:g} N m, no_load_speed {drive.no_load_speed:g} "
+        "rad/s): the fit left that line out; correct these two"
+    )
+    return replace(flat, flags=(flag, *flat.flags))
+
+
+def stated_limit_flag(
+    excitations: Sequence[Excitation],
+    robot: RobotSpec,
+    plain: DriveFit,
+    nominal: Mapping[str, float],
+) -> tuple[str, ...]:
+    """Say for how much of the time the stated gains ask for more torque than the drive has.
+
+    It is for a log that no gains explain, so that there are none but those that are stated. The
+    motion has to show the limit too: stated gains may be off by half.
+
+    Args:
+        excitations: Excitations of one joint.
+        robot: The robot.
+        plain: The fit with the limit of the robot's file.
+        nominal: All parameters of the joint with the gains stated for its drive.
+
+    Returns:
+        A flag; none where the fit explains the log, or the motion stays below the limit.
+    """
+    amplitude = max(excitation.amplitude for excitation in excitations)
+    delay_s = max(plain.values["delay"], 0.0)
+    torques = drive_torques(excitations, robot, {**nominal, "delay": delay_s})
+    limit = nominal["effort_limit"]
+    if plain.rmse <= EXPLAINED * amplitude or torques.delivered < SHOWN * limit:
+        return ()
+    flag = effort_limit_flag(torques.demanded, limit, nominal["stiffness"], amplitude)
+    return (f"{flag}. No gains explain this log, and these are by the stated ones",) if flag else ()
+
+
+def may_be_limited(
+    excitations: Sequence[Excitation],
+    robot: RobotSpec,
+    plain: DriveFit,
+    nominal: Mapping[str, float],
+) -> bool:
+    """Return whether a fit misses a joint whose stated gains ask for more than its effort limit.
+
+    Args:
+        excitations: Excitations of the joint.
+        robot: The robot.
+        plain: The fit with the limit of the robot's file.
+        nominal: All parameters of the joint with the gains stated for its drive.
+    """
+    amplitude = max(excitation.amplitude for excitation in excitations)
+    if not plain.held_out or plain.rmse < MISFIT * amplitude or "effort_limit" in plain.sd:
+        return False
+    delay_s = max(plain.values["delay"], 0.0)
+    torques = drive_torques(excitations, robot, {**nominal, "delay": delay_s})
+    return float(np.mean(torques.demanded > nominal["effort_limit"])) > AT_LIMIT
 
 
 def _best_limit(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -12,7 +12,7 @@ import scipy.linalg
 
 from pronk.errors import PronkError
 from pronk.identify.simulators.profiles import Profile
-from pronk.robots.model import free_spec
+from pronk.robots.model import bench_inertia, free_spec
 from pronk.robots.robot import RobotSpec
 
 SMALLEST_STEP_S = 1e-5
@@ -81,6 +81,32 @@ def stability_share(robot: RobotSpec, drives: Sequence[JointDrives]) -> float:
         eigvals_only=True,
     )
     return float(eigenvalues[-1] / 4.0)
+
+
+def joint_stability_share(robot: RobotSpec, joint: str, values: Mapping[str, float]) -> float:
+    """Compute how much of the drive law's stability limit a joint alone uses; 1 is the limit.
+
+    It is `stability_share` for one joint: its base is fixed and its neighbours stand still, so that
+    it feels more inertia than in a robot that floats.
+
+    Args:
+        robot: The robot with the law and the step of its simulator.
+        joint: Name of the joint.
+        values: `stiffness`, `damping` and `armature` of its drive.
+    """
+    drive = robot.joint(joint).drive
+    inertia, _ = bench_inertia(robot, robot.joint(joint).original[0])
+    inertia += values["armature"] - drive.armature
+    law = robot.law
+    step = law.substep(robot.timestep_s)
+    damping = law.damping(values["stiffness"], values["damping"], step)
+    if law.kind != "explicit":
+        inertia += step * damping
+    if law.passive_damping == "explicit":
+        damping += drive.viscous_damping
+    else:
+        inertia += step * drive.viscous_damping
+    return (2.0 * step * damping + step**2 * values["stiffness"]) / (4.0 * inertia)
 
 
 def require_stable(profile: Profile, robot: RobotSpec, drives: Sequence[JointDrives]) -> float:
