@@ -73,7 +73,6 @@ PARSED = {
     "menagerie:NAME": "needs a robot that is downloaded",
     "OLD.yaml": "needs an earlier match",
     "NET.pt": "needs an actuator network",
-    "YOUR_SIM_PARAMS": "needs parameters of the reader's own",
 }
 """Words of commands that are parsed and not run, and why."""
 OTHER_PROGRAMS = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,8 +28,14 @@ if TYPE_CHECKING:
 ROBOT = "mini_cheetah"
 QUICK_LEG = "FR"
 """The leg that `--quick` sweeps."""
-FILMED = "forward 2"
-"""The command of which one jump is filmed."""
+QUICK_CHIRP_S = 10.0
+"""Length of a chirp with `--quick`, half of the usual [s]: most of the time goes into the simulated
+robot and the safety filter, in proportion to it. The gains are the same to 0.5 %."""
+QUICK_COMMAND = "forward 2"
+"""The command that `--quick` jumps with."""
+FILMED = (QUICK_COMMAND, "back 2")
+"""The commands of which one jump of each policy is filmed. At the second one the policy of nominal
+gains lands on its belly, and that of matched gains on its feet."""
 
 
 def demo(
@@ -46,7 +53,8 @@ def demo(
         pronk demo --quick
 
     Args:
-        quick: One leg, two repeats, one policy and one jump with each command: half a minute.
+        quick: One leg, chirps of half the length, two repeats, one policy and one jump: half a
+            minute.
         out: Folder for everything.
         policies: Folder of policies to try; those that come with pronk if left out.
         jumps: Jumps with each of the paper's commands.
@@ -56,6 +64,7 @@ def demo(
             jump as well.
     """
     from pronk.files import require_place
+    from pronk.identify.excitation.signals import Chirp
     from pronk.jump.trial import tables
     from pronk.report import figures, style
     from pronk.report.build import write_report
@@ -80,7 +89,8 @@ def demo(
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
     with console.progress() as report, pool(1) as process:
         jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed, quick)
-        result, replays = sweep_and_match(robot, joints, out, repeats, seed, report)
+        chirp_s = QUICK_CHIRP_S if quick else Chirp.length_s
+        result, replays = sweep_and_match(robot, joints, out, repeats, seed, report, chirp_s)
         report("jumps and film", 0.0)
         trial, films = jumping.result()
         report("jumps and film", 1.0)
@@ -104,15 +114,15 @@ def demo(
         "page": page,
         "seconds_total": seconds,
     }
-    following = [
-        f"open {page} in a browser",
-        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
-    ]
+    following = [f"open {page} in a browser"]
+    if quick:
+        following.append("pronk demo   # all joints, two policies: some minutes")
+    else:
+        gains_file = shlex.quote(str(out / "gains.yaml"))
+        following.append(f"pronk train all --gains {gains_file} --out runs/matched   # on a GPU")
     if tried:
-        following.append(f"pronk trial {tried[0]} --out out/trial")
-    following.append(
-        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS"
-    )
+        following.append(f"pronk trial {shlex.quote(str(tried[0]))} --out out/trial")
+    following.append(f"pronk sweep {ROBOT} --joints FL_knee --out logs")
     return console.Outcome(
         figures=summary(result) | demo_figures,
         wrote=[out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page],
@@ -150,10 +160,10 @@ def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
 def jump_and_film(
     policies: Sequence[Path], out: Path, jumps: int, seed: int, quick: bool = False
 ) -> tuple[TrialResults | None, tuple[Path, ...]]:
-    """Run a short trial on the shipped virtual robot and film one jump of each policy.
+    """Run a short trial on the shipped virtual robot and film jumps of each policy.
 
     An existing trial is replaced. Without policies the results are None and no film. A quick trial
-    has the filmed command alone.
+    has one command alone.
     """
     from pronk.jump.trial.films.record import record_trial
     from pronk.jump.trial.protocol import PAPER_COMMANDS
@@ -164,11 +174,11 @@ def jump_and_film(
     setup = setup_of(policies[0], out)
     cases = PAPER_COMMANDS
     if quick:
-        cases = tuple(case for case in cases if case.name == FILMED)
+        cases = tuple(case for case in cases if case.name == QUICK_COMMAND)
     plan = TrialPlan(cases=cases, jumps=jumps, seed=seed)
     trial = run_trial(policies, plan, setup, overwrite=True)
     films = record_trial(
-        trial, out, out / VIDEOS, robot=setup.robot, cases=(FILMED,), slow=2.0, warn=console.warn
+        trial, out, out / VIDEOS, robot=setup.robot, cases=FILMED, slow=2.0, warn=console.warn
     )
     return trial, films
 
@@ -180,10 +190,23 @@ def sweep_and_match(
     repeats: int,
     seed: int,
     report: console.Reporter,
+    chirp_s: float,
 ) -> tuple[MatchResult, list[JointPrediction]]:
     """Sweep joints, match them, and predict a sweep that was not matched.
 
     The smaller amplitude only shows whether the gains hold there too; it has one repeat.
+
+    Args:
+        robot: The robot.
+        joints: Names of the joints.
+        out: Folder for everything.
+        repeats: Repeats of the larger amplitude.
+        seed: Seed of the virtual robot's noise.
+        report: Progress.
+        chirp_s: Length of a chirp [s].
+
+    Returns:
+        The match, and the prediction of each joint of the sweep that was not matched.
     """
     from pronk.deploy.bench.virtual_sweep import sweep_virtual
     from pronk.identify.excitation.plan import make_plan
@@ -212,10 +235,22 @@ def sweep_and_match(
         )
 
     repeats_by_amplitude = (repeats, *[1] * len(AMPLITUDES[1:]))
-    sweep = make_plan(robot, joints, Chirp(), amplitudes=AMPLITUDES, repeats=repeats_by_amplitude)
+    sweep = make_plan(
+        robot,
+        joints,
+        Chirp(length_s=chirp_s),
+        amplitudes=AMPLITUDES,
+        repeats=repeats_by_amplitude,
+    )
     # One joint of a leg shows whether the gains hold on another signal.
     fresh_joints = joints if len(joints) == len(robot.joint_names) else joints[-1:]
-    fresh_sweep = make_plan(robot, fresh_joints, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
+    fresh_sweep = make_plan(
+        robot,
+        fresh_joints,
+        LogChirp(length_s=chirp_s),
+        amplitudes=AMPLITUDES[:1],
+        repeats=1,
+    )
     log_paths = record("logs", sweep, seed)
     fresh_paths = record("fresh", fresh_sweep, seed + 1)
     logs = read_logs(log_paths, processes=processes, robot=robot)
