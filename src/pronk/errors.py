@@ -55,3 +55,7 @@ class ArtefactError(PronkError):
 
 class HardwareError(PronkError):
     """A machine does not respond, or a limit was breached while it moved."""
+
+
+class NotStandingError(HardwareError):
+    """A robot that does not stand, so that no policy may start on it."""

@@ -336,6 +336,20 @@ def test_an_interrupted_run_goes_on(
     assert repr(again.cells) == repr(results.cells)
 
 
+def test_a_robot_that_cannot_stand_has_not_landed(policies: list[Path], tmp_path: Path) -> None:
+    """With a fifth of the gains it sags too far for a policy to start; the others go on."""
+    soft = Change(parameters=("joints.gain_scale",), value=0.2)
+    conditions = [Condition(name="soft", changes=(soft,)), Condition(name="nominal")]
+    results = run_conditions(policies[:1], conditions, PLAN, setup(tmp_path))
+    cell, nominal = results.cells
+    assert (cell.jumps, cell.landed, cell.fell) == (1, 0, 0)
+    assert math.isnan(cell.height.mean)
+    assert nominal.height.mean > 0.0
+    again = run_conditions(policies[:1], conditions, PLAN, setup(tmp_path))
+    assert again.kept == 2
+    draw_conditions(again)
+
+
 def test_another_plan_has_cells_of_its_own(
     results: ConditionResults, policies: list[Path], folder: Path, tmp_path: Path
 ) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.errors import HardwareError
+from pronk.errors import NotStandingError
 from pronk.policy.contract import check
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy
@@ -53,12 +53,12 @@ def check_standing(robot: RobotSpec, state: State) -> None:
     """Check that a policy can start.
 
     Raises:
-        HardwareError: The robot does not stand in its default pose.
+        NotStandingError: The robot does not stand in its default pose.
     """
     for joint, position in zip(robot.joints, state.position, strict=True):
         # NaN is not within the distance.
         if not abs(position - joint.default_position) <= MAX_STANDING_DEVIATION_RAD:
-            raise HardwareError(
+            raise NotStandingError(
                 f"{joint.name} is at {position:.2f} rad; a policy starts on a robot that stands, "
                 f"with this joint within {MAX_STANDING_DEVIATION_RAD:g} rad of "
                 f"{joint.default_position:g}."
@@ -66,7 +66,7 @@ def check_standing(robot: RobotSpec, state: State) -> None:
     cosine = -float(projected_gravity(state.orientation)[2])
     if not cosine >= math.cos(math.radians(MAX_STANDING_TILT_DEG)):
         tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-        raise HardwareError(
+        raise NotStandingError(
             f"the trunk is tilted by {tilt_deg:.0f} degrees; a policy starts on a robot that "
             f"stands, tilted by {MAX_STANDING_TILT_DEG:g} degrees at most."
         )
@@ -94,7 +94,7 @@ def ticks(
     Raises:
         ArtefactError: The contract does not fit, before anything is sent; or a number is not
             finite.
-        HardwareError: The robot does not stand.
+        NotStandingError: The robot does not stand.
     """
     check(policy.contract, robot)
     policy.reset()

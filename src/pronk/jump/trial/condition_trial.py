@@ -29,7 +29,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from pronk.errors import ArtefactError, PronkError
+from pronk.errors import ArtefactError, NotStandingError, PronkError
 from pronk.files import write_text
 from pronk.jump.trial.conditions import Condition, changed_params, check_conditions
 from pronk.jump.trial.jumps import JumpFigures
@@ -254,7 +254,8 @@ def _run_cells(
         jobs += plan_jobs([cell.subject], plan, replace(setup, sim_params=cell.sim_params))
         last_jobs[len(jobs) - 1] = cell
     rows: list[TrialRun] = []
-    for index, row in enumerate(results_in_order(run_job, jobs, processes=setup.processes)):
+    results = results_in_order(run_condition_job, jobs, processes=setup.processes)
+    for index, row in enumerate(results):
         rows.append(row)
         if index in last_jobs:
             cell = last_jobs[index]
@@ -263,6 +264,15 @@ def _run_cells(
             rows = []
         if progress is not None:
             progress((index + 1) / len(jobs))
+
+
+def run_condition_job(job: TrialJob) -> TrialRun:
+    """Run one job; a robot that does not stand under its condition has not landed."""
+    try:
+        return run_job(job)
+    except NotStandingError:
+        # An outcome of the condition: drives that are too soft for the robot's weight.
+        return replace(job.row, figures=JumpFigures(standing=False))
 
 
 def _sum_up(cell: _PlannedCell, rows: Sequence[TrialRun]) -> ConditionCell:

@@ -105,9 +105,9 @@ class PronkRunner(MjlabOnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train on, until the last phase is over or `stop_reason` is set.
 
-        This is rsl_rl's loop, with the phase set before every iteration and the checks of
-        `_finish_iteration` behind it. The first SIGINT or SIGTERM ends training after the present
-        iteration.
+        This is rsl_rl's loop, with the phase set before every iteration, the logger behind the
+        rollout, and the checks of `_finish_iteration` at the end. The first SIGINT or SIGTERM ends
+        training after the present iteration.
 
         Args:
             num_learning_iterations: Iterations to train, at most.
@@ -134,11 +134,17 @@ class PronkRunner(MjlabOnPolicyRunner):
                 start = time.time()
                 try:
                     with torch.inference_mode():
+                        steps = []
                         for _ in range(self.cfg["num_steps_per_env"]):
                             actions = self.alg.act(obs)
                             # The environment ends the episode of a robot whose state is not finite.
                             obs, rewards, dones, extras = self.env.step(actions)
                             self.alg.process_env_step(obs, rewards, dones, extras)
+                            # mjlab returns one dictionary, whose entries it replaces.
+                            steps.append((rewards, dones, dict(extras)))
+                        # The logger waits for the device three times a step, and keeps it from
+                        # being given the next step meanwhile; after the rollout it waits once.
+                        for rewards, dones, extras in steps:
                             self.logger.process_env_step(rewards, dones, extras)
                         collect_time = time.time() - start
                         self.alg.compute_returns(obs)
