@@ -133,7 +133,7 @@ def test_friction_and_delay_are_compared_where_both_are_fitted() -> None:
     )
     worn = replace(sure, frictionloss=estimate(0.5, 0.02))
     parameters = compare_gains(robot_gains(a=sure), robot_gains(a=worn)).parameters
-    assert {each.parameter: each.verdict for each in parameters} == {
+    assert {drift.parameter: drift.verdict for drift in parameters} == {
         "stiffness": "within",
         "damping": "within",
         "frictionloss": "outside",

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
+    "record": ("pronk.cli.record:record", "Record a robot under another program; sends nothing."),
     "log": ("pronk.cli.log:log", "Guess how a log is read; write it down beside the log."),
     "response": ("pronk.cli.response:response", "Estimate frequency responses; Bode plots."),
     "match": (

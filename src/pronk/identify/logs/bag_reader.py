@@ -33,6 +33,7 @@ from pronk.identify.logs.columns import (
 from pronk.identify.logs.joint_log import JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record, Wanted
 from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
+from pronk.identify.logs.recording import RECORDING_PREFIX
 from pronk.identify.logs.segmentation import MOVED_RAD
 from pronk.identify.logs.unitree import COMMAND_TYPES, PARALLEL_MODE, STATE_TYPES, motor_joints
 from pronk.robots.robot import RobotSpec
@@ -138,7 +139,7 @@ def wanted_messages(options: ReadOptions) -> Wanted:
 
     def is_wanted(record: Record) -> bool:
         type_name = "" if record.schema is None else message_type(record.schema)
-        is_own = record.topic.startswith("/sweep/")
+        is_own = record.topic.startswith(("/sweep/", RECORDING_PREFIX))
         return is_own or type_name in types or record.topic in topics
 
     return is_wanted

@@ -276,7 +276,7 @@ def probe_network(
                 "most 1, as in 0.02."
             )
     stated = network_input or NetworkInput()
-    torque = _Torque(load_network(path), path, stated)
+    torque = _Torque(load_torchscript(path), path, stated)
     offset = torque.at_rest(np.zeros(1))[0]
     sides = np.array([SMALL_ERROR_RAD, -SMALL_ERROR_RAD])
     slope = float(np.diff(torque.at_rest(sides))[0] / np.diff(sides)[0])
@@ -425,7 +425,7 @@ class _Torque:
         """Find how many samples the network takes.
 
         Args:
-            network: What `load_network` returned.
+            network: What `load_torchscript` returned.
             path: Its file, for messages.
             stated: How its input is made.
         """
@@ -498,7 +498,7 @@ class _Torque:
         )
 
 
-def load_network(path: Path) -> Any:
+def load_torchscript(path: Path) -> Any:
     """Load a network of TorchScript, in evaluation mode, without running code of others.
 
     The archive of TorchScript holds the network as text in a language of its own, and PyTorch's

@@ -163,15 +163,18 @@ class Participant:
                 "has it an address? (`ip addr` lists them)"
             ) from None
 
-    def reader(self, topic: str, message: Any, *, include_local: bool = True) -> Any:
+    def reader(
+        self, topic: str, message: Any, *, include_local: bool = True, depth: int = _QUEUE
+    ) -> Any:
         """Make a reader.
 
         Args:
             topic: Name of the topic.
             message: Its IDL type.
             include_local: Whether samples of this participant are read too.
+            depth: Messages kept between two reads.
         """
-        policies = [Policy.History.KeepLast(_QUEUE)]
+        policies = [Policy.History.KeepLast(depth)]
         if not include_local:
             policies.append(Policy.IgnoreLocal.Participant)
         return DataReader(self.entity, self._topic(topic, message), Qos(*policies))
