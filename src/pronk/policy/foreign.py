@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,10 +17,26 @@ from pronk.policy.deploy_yaml import COMMAND_TERMS, DeployFile, Term, shaped
 from pronk.policy.observation import Measurement
 from pronk.policy.rollout import measurement
 from pronk.policy.runtime import open_session, read_network, run_once
-from pronk.robots.machine import Command, Machine
+from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
 _WRITER = "export the policy to ONNX, in one file"
+
+
+class Driven(Protocol):
+    """What `run_foreign` needs of a `Machine`."""
+
+    def now(self) -> float:
+        """Return the time of its clock [s]."""
+
+    def latest(self) -> State:
+        """Return the newest state."""
+
+    def send(self, command: Command) -> None:
+        """Put a command into force."""
+
+    def wait(self, until: float) -> list[State]:
+        """Let time pass to `until` [s] on its clock; return the states since the last call."""
 
 
 class ForeignPolicy:
@@ -212,7 +228,7 @@ def _width_reason(width: int, deploy: DeployFile) -> str:
 
 
 def run_foreign(
-    machine: Machine,
+    machine: Driven,
     policy: ForeignPolicy,
     source: Callable[[float], ArrayLike],
     *,
