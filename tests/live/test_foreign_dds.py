@@ -54,17 +54,17 @@ def policy_of(name: str) -> ForeignPolicy:
 
 @needs_policies
 @pytest.mark.parametrize(
-    ("name", "command", "least"),
+    ("name", "command", "slowest"),
     [(FAST, (4.0, 0.0, 0.0), 3.5), (OTHER, (1.0, 0.0, 0.0), 0.85)],
 )
 def test_real_policies_walk_and_run_on_the_virtual_go2(
-    name: str, command: Velocity, least: float
+    name: str, command: Velocity, slowest: float
 ) -> None:
     run = run_on_virtual_robot(
         GO2, load_sim_params(None, GO2), policy_of(name), command, seconds=10.0, seed=3
     )
     assert run.fell_s is None
-    assert run.velocity[0] >= least
+    assert run.velocity[0] >= slowest
 
 
 class RobotTime:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from pronk.robots.robot import RobotSpec
 
 _LONGEST_S = 120.0
+"""Longest run [s]."""
+OFF = 0.3
+"""Distance from the command beyond which a velocity is said to be another one, as a share of the
+command, at least of 1 m/s and 1 rad/s together."""
 
 COLUMNS = (
     Column(heading="change"),
@@ -102,13 +106,20 @@ def policy(
         changes = single_changes(deploy_file, robot_spec)
         console.note(f"fell after {outcome.fell_s:.1f} s; trying {len(changes)} single changes")
         tried = try_changes(changes, run)
-    found = remedies(tried, velocity)
+    helpful = remedies(tried, velocity)
     rows = [_row("none", outcome)]
-    for change in tried if wide else found:
+    for change in tried if wide else helpful:
         rows.append(_row(change.text, change.run))
     title = f"on the virtual {robot_spec.name}, command {velocity}, {seconds:g} s, seed {seed}"
     console.show(Table(title=title, columns=COLUMNS, rows=tuple(rows)))
-    console.say(_verdict(outcome, found))
+    console.say(_verdict(outcome, helpful))
+    if outcome.fell_s is None and math.dist(outcome.velocity, velocity) > OFF * max(
+        1.0, math.hypot(*velocity)
+    ):
+        console.warn(
+            "its velocity is not the commanded one: a scale of the command or of an observation "
+            "may be another one, or the command is beyond what it was trained for"
+        )
     return console.Outcome(
         figures={
             "robot": robot_spec.name,
@@ -119,7 +130,7 @@ def policy(
             "problems": problems,
             "run": _figures(outcome),
             "tried": [{"change": change.text, **_figures(change.run)} for change in tried],
-            "remedies": [change.text for change in found],
+            "remedies": [change.text for change in helpful],
         },
         status=ExitStatus.DONE if outcome.fell_s is None else ExitStatus.POLICY_FELL,
     )
@@ -174,16 +185,16 @@ def _figures(run: ForeignRun) -> dict[str, Any]:
     return {"fell_s": run.fell_s, "lasted_s": run.lasted_s, "velocity": run.velocity}
 
 
-def _verdict(outcome: ForeignRun, found: tuple[TriedChange, ...]) -> str:
+def _verdict(outcome: ForeignRun, helpful: tuple[TriedChange, ...]) -> str:
     """Say whether it fell, and what helps."""
     if outcome.fell_s is None:
         return "it did not fall"
-    if not found:
+    if not helpful:
         return "it fell, and with every single change that was tried it fell as well"
-    if len(found) == 1:
-        return f"it fell; with one change it does not: {found[0].text}"
-    names = "; ".join(change.text for change in found)
+    if len(helpful) == 1:
+        return f"it fell; with one change it does not: {helpful[0].text}"
+    names = "; ".join(change.text for change in helpful)
     return (
-        f"it fell; with any one of {len(found)} changes it does not, the nearest to the command "
+        f"it fell; with any one of {len(helpful)} changes it does not, the nearest to the command "
         f"first: {names}"
     )

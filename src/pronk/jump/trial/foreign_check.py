@@ -52,7 +52,7 @@ class ForeignRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Change:
+class DeployChange:
     """One change of a `deploy.yaml`."""
 
     text: str
@@ -140,16 +140,14 @@ def _mean_velocity(machine: VirtualRobot, begin_s: float) -> tuple[float, float,
 
 
 def try_changes(
-    changes: Sequence[Change],
+    changes: Sequence[DeployChange],
     run: Callable[[DeployFile], ForeignRun],
-    each: Callable[[int], None] = lambda count: None,
 ) -> tuple[TriedChange, ...]:
     """Run a policy with each of some changes.
 
     Args:
         changes: The changes.
         run: Runs the policy by a changed file.
-        each: Called after each with how many are done.
     """
     tried = []
     for change in changes:
@@ -158,7 +156,6 @@ def try_changes(
         except ArtefactError:  # An action that is not finite: no remedy.
             lost = ForeignRun(fell_s=0.0, lasted_s=0.0, velocity=(math.nan,) * 3)
             tried.append(TriedChange(text=change.text, run=lost))
-        each(len(tried))
     return tuple(tried)
 
 
@@ -172,38 +169,42 @@ def remedies(tried: Sequence[TriedChange], command: Velocity) -> tuple[TriedChan
     return tuple(sorted(upright, key=error))
 
 
-def single_changes(deploy: DeployFile, robot: RobotSpec) -> tuple[Change, ...]:
+def single_changes(deploy: DeployFile, robot: RobotSpec) -> tuple[DeployChange, ...]:
     """List the changes that people most often need: each is one, and none is in the file."""
     changes = [
-        Change(text="gravity with the other sign", deploy=replace(deploy, gravity_sign=-1.0))
+        DeployChange(text="gravity with the other sign", deploy=replace(deploy, gravity_sign=-1.0))
     ]
     for text, joint_ids in _orders(robot):
         if joint_ids != deploy.joint_ids:
             changes.append(
-                Change(text=f"joint_ids_map {text}", deploy=replace(deploy, joint_ids=joint_ids))
+                DeployChange(
+                    text=f"joint_ids_map {text}", deploy=replace(deploy, joint_ids=joint_ids)
+                )
             )
     inverse = tuple(int(place) for place in np.argsort(deploy.joint_ids))
     known_orders = [deploy.joint_ids, *(joint_ids for _, joint_ids in _orders(robot))]
     if inverse not in known_orders:
         changes.append(
-            Change(text="joint_ids_map inverted", deploy=replace(deploy, joint_ids=inverse))
+            DeployChange(text="joint_ids_map inverted", deploy=replace(deploy, joint_ids=inverse))
         )
     lengths = {term.history_length for term in deploy.terms}
     if max(lengths) > 1:
         order = "oldest" if deploy.newest_first else "newest"
         reversed_deploy = replace(deploy, newest_first=not deploy.newest_first)
         changes.append(
-            Change(text=f"history with the {order} sample first", deploy=reversed_deploy)
+            DeployChange(text=f"history with the {order} sample first", deploy=reversed_deploy)
         )
         if len(lengths) == 1:
             layout = "term after term" if deploy.by_sample else "sample after sample"
             other_layout = replace(deploy, by_sample=not deploy.by_sample)
-            changes.append(Change(text=f"history {layout} (use_gym_history)", deploy=other_layout))
+            changes.append(
+                DeployChange(text=f"history {layout} (use_gym_history)", deploy=other_layout)
+            )
     changes += _gain_changes(deploy, robot)
     changes += _scale_changes(deploy)
     if deploy.action_offset != deploy.default_position:
         changes.append(
-            Change(
+            DeployChange(
                 text="actions.offset as default_joint_pos",
                 deploy=replace(deploy, action_offset=deploy.default_position),
             )
@@ -240,14 +241,14 @@ def _orders(robot: RobotSpec) -> list[tuple[str, tuple[int, ...]]]:
     return orders
 
 
-def _gain_changes(deploy: DeployFile, robot: RobotSpec) -> list[Change]:
+def _gain_changes(deploy: DeployFile, robot: RobotSpec) -> list[DeployChange]:
     """Return the changes of the gains of the drives."""
     changes = []
     stiffness = tuple(joint.stiffness for joint in robot.joints)
     damping = tuple(joint.damping for joint in robot.joints)
     if (stiffness, damping) != (deploy.stiffness, deploy.damping):
         changes.append(
-            Change(
+            DeployChange(
                 text=f"gains of {robot.name}'s file",
                 deploy=replace(deploy, stiffness=stiffness, damping=damping),
             )
@@ -257,7 +258,7 @@ def _gain_changes(deploy: DeployFile, robot: RobotSpec) -> list[Change]:
     moved_damping = tuple(float(value) for value in np.array(deploy.damping)[places])
     if (moved_stiffness, moved_damping) != (deploy.stiffness, deploy.damping):
         changes.append(
-            Change(
+            DeployChange(
                 text="stiffness and damping in the order of the network",
                 deploy=replace(deploy, stiffness=moved_stiffness, damping=moved_damping),
             )
@@ -265,7 +266,7 @@ def _gain_changes(deploy: DeployFile, robot: RobotSpec) -> list[Change]:
     return changes
 
 
-def _scale_changes(deploy: DeployFile) -> list[Change]:
+def _scale_changes(deploy: DeployFile) -> list[DeployChange]:
     """Return the changes of one scale to another usual one."""
     changes = []
     for index, term in enumerate(deploy.terms):
@@ -282,12 +283,12 @@ def _scale_changes(deploy: DeployFile) -> list[Change]:
                 changed_term,
                 *deploy.terms[index + 1 :],
             )
-            changes.append(Change(text=text, deploy=replace(deploy, terms=terms)))
+            changes.append(DeployChange(text=text, deploy=replace(deploy, terms=terms)))
     for action_scale in USUAL_ACTION_SCALES:
         full_scale = (action_scale,) * len(deploy.action_scale)
         if full_scale != deploy.action_scale:
             text = f"scale of the action {action_scale:g} in place of {_short(deploy.action_scale)}"
-            changes.append(Change(text=text, deploy=replace(deploy, action_scale=full_scale)))
+            changes.append(DeployChange(text=text, deploy=replace(deploy, action_scale=full_scale)))
     return changes
 
 
