@@ -56,6 +56,7 @@ LEG_PLACES = ("docs/your-log.md", "docs/your-robot.md", "CONTRIBUTING.md")
 """Pages about a robot of the reader's own; help texts are read in its folder as well."""
 PARSED = {
     "train": "needs a GPU",
+    "study": "trains for hours",
     "evaluate": "needs a GPU",
     "play": "serves a browser until it is ended",
     "simulate": "runs until it is ended",
@@ -80,6 +81,7 @@ PARSED = {
 """Words of commands that are parsed and not run, and why."""
 OTHER_PROGRAMS = (
     "pip",
+    "ray",
     "pipx",
     "uvx",
     "python3",

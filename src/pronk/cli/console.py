@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import select
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +22,8 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -38,6 +41,8 @@ _HEADING_WIDTH = 10
 """Characters of a line of a heading at least."""
 _BETWEEN_COLUMNS = 2
 """Characters between two columns."""
+_LINE_S = 60.0
+"""Time between two lines of progress where standard error is not a terminal [s]."""
 _POLL_S = 0.2
 """Time between two looks at standard input while a person works at the rig [s]."""
 
@@ -251,6 +256,46 @@ def _fitting_lines(text: str, console: Console, indent: int = 0) -> list[str]:
             break_on_hyphens=False,
         ) or [""]
     return lines
+
+
+class LiveTable:
+    """A table on standard error that changes in place; without a terminal, a line now and then."""
+
+    def __init__(self) -> None:
+        self._live: Live | None = None
+        self._said_at = -math.inf
+
+    def __enter__(self) -> LiveTable:
+        """Begin to show."""
+        console = err()
+        if console.is_terminal:
+            self._live = Live(console=console, auto_refresh=False, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the table from the terminal."""
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, line: str, table: Callable[[int], Table]) -> None:
+        """Show how far the work is.
+
+        Args:
+            line: What a stream without a terminal gets, once every `_LINE_S`.
+            table: Makes the table, of the number of rows at most that it is given.
+        """
+        moment = time.monotonic()
+        if self._live is None:
+            if moment - self._said_at >= _LINE_S:
+                self._said_at = moment
+                note(line)
+            return
+        if moment - self._said_at < 1.0:
+            return
+        self._said_at = moment
+        rows = max(self._live.console.size.height - 6, 3)
+        self._live.update(Group(_rich_table(table(rows)), Text(line)), refresh=True)
 
 
 class Reporter(Progress):

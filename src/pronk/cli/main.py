@@ -56,6 +56,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Evaluate a policy in the training simulator.",
     ),
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
+    "study": ("pronk.cli.study:study", "Train arms from many seeds, try them on many robots."),
     "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
     "deploy": ("pronk.cli.deploy:deploy_command", "Run a policy on a robot or the virtual robot."),
     "policy": ("pronk.cli.policy:policy", "Check a policy that was trained elsewhere."),

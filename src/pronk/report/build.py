@@ -12,9 +12,10 @@ from pathlib import Path
 from pronk.deploy.runtime.deploy_log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
+from pronk.jump.study.study_results import STUDY_FILE
 from pronk.jump.trial.results import SUMMARY
 from pronk.progress import Progress, no_progress
-from pronk.report import deploy_page, match_page, trial_page
+from pronk.report import deploy_page, match_page, study_page, trial_page
 from pronk.report.page import Part, page
 
 PAGE_NAME = "report.html"
@@ -22,6 +23,7 @@ LOGS = "*.mcap"
 PART_MAKERS: dict[str, Callable[[Path], Part]] = {
     "match.npz": match_page.match_part,
     SUMMARY: trial_page.trial_part,
+    STUDY_FILE: study_page.study_part,
     LOGS: deploy_page.deploy_part,
 }
 """How the part of each file is made, in the order of the page."""
@@ -76,8 +78,9 @@ def write_report(root: Path, progress: Progress = no_progress) -> tuple[Path, li
     if not parts:
         raise ArtefactError(
             f"{root}: nothing to report; neither {SUMMARY} (`pronk trial POLICY --out DIR`) nor "
-            "match.npz (`pronk match LOG... --out`) nor the log of a deployment (`pronk deploy "
-            "--log`) is in it or in a folder in it."
+            f"{STUDY_FILE} (`pronk study FILE --out DIR`) nor match.npz (`pronk match LOG... "
+            "--out`) nor the log of a deployment (`pronk deploy --log`) is in it or in a folder in "
+            "it."
         )
     page_path = root.with_suffix(".html") if root.is_file() else root / PAGE_NAME
     title = parts[0].title if len(parts) == 1 else "report"

@@ -39,12 +39,15 @@ def require_extra() -> None:
         )
 
 
-def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[str, ...]:
+def find_devices(
+    requested: str = "auto", gpu_ids: str | None = None, option: str = "--gpu-ids"
+) -> tuple[str, ...]:
     """Find the GPUs to compute on, one a process.
 
     Args:
         requested: `auto`, `cpu` or `cuda`.
         gpu_ids: Numbers of the visible GPUs, as in `0,1`, or `all`; None for the first alone.
+        option: The option that named them, for the messages.
 
     Returns:
         The GPUs as `CUDA_VISIBLE_DEVICES` names them; empty for the CPU.
@@ -60,11 +63,11 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
         are_different = len(set(words)) == len(words)
         if not (are_numbers and are_different):
             raise PronkError(
-                f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all."
+                f"{option} {gpu_ids!r}: expected different numbers, as in 0,1, or all."
             )
     if requested == "cpu":
         if words:
-            raise PronkError(f"--gpu-ids {gpu_ids} goes with a GPU; leave it or --device cpu out.")
+            raise PronkError(f"{option} {gpu_ids} goes with a GPU; leave it or --device cpu out.")
         return ()
     gpus = visible_gpus()
     if not gpus:
@@ -83,7 +86,7 @@ def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[s
     for word in words:
         if int(word) >= len(gpus):
             raise PronkError(
-                f"--gpu-ids {gpu_ids}: this host has {len(gpus)} visible GPU(s), numbered 0 to "
+                f"{option} {gpu_ids}: this host has {len(gpus)} visible GPU(s), numbered 0 to "
                 f"{len(gpus) - 1}."
             )
         chosen_gpus.append(gpus[int(word)])

@@ -7,6 +7,7 @@ recipe.yaml                          copy of the recipe, where the run has one
 model_*.pt, PHASE.pt                 checkpoints
 events.out.*                         TensorBoard
 train.log                            what mjlab, Warp and rsl_rl print
+progress.json                        how far it is, with rate and reward of the last iteration
 walk.onnx, policy.onnx               the policy after phase 1 and the last one
 """
 
@@ -117,6 +118,9 @@ def new_session() -> dict[str, Any]:
 
 def changed_versions(record: dict[str, Any]) -> list[str]:
     """List packages in other versions than when the run was last started, as text."""
+    if not record["sessions"]:
+        # The run was killed before its first session began.
+        return []
     versions_before = record["sessions"][-1]["versions"]
     changes = []
     for name, version in package_versions().items():

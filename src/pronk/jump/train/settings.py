@@ -74,7 +74,8 @@ class TrainSettings:
     """Folder of the run, new or empty."""
     robot: str | None = None
     """Name or robot.yaml of a robot with a task; mini_cheetah."""
-    gains: str | None = None
+    # The command line has this option beside these settings, since it may be repeated there.
+    gains: Annotated[str | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
     """gains.yaml of `pronk match`, or naive: the nominal gains of the real drives."""
     ranges_from: Path | None = None
     """With naive gains: the gains.yaml whose ranges and delay are used."""

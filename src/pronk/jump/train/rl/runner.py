@@ -30,6 +30,7 @@ from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
+from pronk.jump.train.training_progress import TrainingProgress, write_progress
 
 KEPT_CHECKPOINTS = 3
 """Numbered checkpoints that are kept."""
@@ -37,6 +38,8 @@ COMPARED_OBSERVATIONS = 4096
 """Observations that an exported policy is compared on."""
 PROGRESS_S = 10.0
 """Shortest time between two lines of progress [s]."""
+PROGRESS_FILE_S = 2.0
+"""Shortest time between two writings of `progress.json` [s]."""
 
 
 @dataclass
@@ -95,6 +98,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         self._steps_per_iteration = steps * env.num_envs * self.gpu_world_size
         self._seconds = 0.0
         self._shown_at = -math.inf
+        self._wrote_progress_at = -math.inf
         self._jumping = False
 
     @property
@@ -203,6 +207,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         next_phase_name, done = phase_at(self.curriculum.iterations, self.iteration)
         if next_phase_name != phase_name or done == 1.0:
             self._finish_phase(phase_name)
+        self._write_progress(phase_name, seconds)
         if self.cfg.get("show_progress"):
             self._show_progress(phase_name, seconds)
 
@@ -217,6 +222,32 @@ class PronkRunner(MjlabOnPolicyRunner):
             torch.distributed.all_reduce(any_stops, op=torch.distributed.ReduceOp.MAX)
             stops = bool(any_stops)
         return stops
+
+    def _write_progress(self, phase: str, seconds: float) -> None:
+        """Write `progress.json`, unless that was done a moment ago and this is not the end."""
+        if self.folder is None or self.gpu_global_rank != 0:
+            return
+        total = self.curriculum.total
+        now = time.monotonic()
+        if now - self._wrote_progress_at < PROGRESS_FILE_S and self.iteration < total:
+            return
+        self._wrote_progress_at = now
+        reward = None
+        episode_steps = None
+        if self.logger.rewbuffer:
+            reward = float(statistics.mean(self.logger.rewbuffer))
+            episode_steps = float(statistics.mean(self.logger.lenbuffer))
+        progress = TrainingProgress(
+            phase=phase,
+            iteration=self.iteration,
+            iterations=total,
+            steps_per_second=self._steps_per_iteration / seconds,
+            seconds_left=seconds * (total - self.iteration),
+            reward=reward,
+            episode_steps=episode_steps,
+            speed_range=float(motion_command(self.env.unwrapped).ranges.fraction),
+        )
+        write_progress(self.folder, progress)
 
     def _show_progress(self, phase: str, seconds: float) -> None:
         """Print a line about the progress, unless another was printed a moment ago."""

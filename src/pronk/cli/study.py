@@ -1,0 +1,254 @@
+"""`pronk study`: arms, seeds, robots and comparisons of one file, trained, tried and compared."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from pronk.cli import console
+from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
+from pronk.jump.study.place import StudyPlace
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pronk.jump.study.config import StudyConfig
+    from pronk.jump.study.place import ChosenPlace
+    from pronk.jump.study.schedule import TaskStatus
+    from pronk.jump.study.study import StudyPlan
+    from pronk.jump.study.tasks import StudyTask
+    from pronk.jump.study.trainings import TrainingArm
+    from pronk.tables import Table
+
+
+def study(
+    study_file: tyro.conf.Positional[Path],
+    place: Annotated[StudyPlace, tyro.conf.arg(name="")],
+    out: Path = Path("out/study"),
+    plan: bool = False,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> console.Outcome:
+    """Train every arm from every seed, try every policy on every robot, compare.
+
+    The file names arms, seeds, robots, outcomes and comparisons (docs/study.md). The same command
+    goes on where it was interrupted, and does only what is new.
+
+    Example:
+        pronk study study.yaml --plan
+        pronk study study.yaml --out runs/study
+
+    Args:
+        study_file: The file of the study, YAML.
+        place: Where trainings and trials run.
+        out: Folder of the study: trainings, trials, tables and the page.
+        plan: Print trainings, GPU hours, cores and comparisons, and stop.
+        device: Device of trainings. auto: GPUs if there are any. The CPU is for tests.
+    """
+    from pronk.jump.study.config import load_study
+    from pronk.jump.study.place import choose_place
+    from pronk.jump.study.study import collect_results, plan_figures, plan_study, study_tasks
+    from pronk.jump.study.study_results import RUNS_FILE, STUDY_FILE, STUDY_TABLE, study_tables
+    from pronk.jump.study.tasks import study_folder
+    from pronk.jump.study.trainings import check_arm
+    from pronk.report.study_page import write_study_page
+
+    config = load_study(study_file)
+    folder = study_file.parent
+    arms = _training_arms(config, folder, study_file)
+    try:
+        study_plan = plan_study(config, folder, arms)
+    except PronkError as error:
+        raise PronkError(f"{study_file}: {error}") from None
+    for name, arm in arms.items():
+        try:
+            check_arm(arm)
+        except PronkError as error:
+            raise PronkError(f"{study_file}: arms.{name}: {error}") from None
+    if plan:
+        tables = _plan_tables(study_plan)
+        for table in tables:
+            console.show(table)
+        following = shlex.join(["pronk", "study", str(study_file), "--out", str(out)])
+        return console.Outcome(
+            figures={**plan_figures(study_plan), "tables": tables}, following=[following]
+        )
+    chosen = choose_place(place, "cpu" if not arms and device == "auto" else device)
+    console.say(
+        f"{config.title}: {study_plan.trainings} trainings, {study_plan.trials} trials of "
+        f"{study_plan.jumps} jumps in all, on {chosen.words}; folder {out}"
+    )
+    with study_folder(out):
+        tasks = study_tasks(study_plan, out, chosen.training)
+        statuses = run_shown(tasks, chosen, out)
+        results = collect_results(study_plan, out, statuses)
+        page = write_study_page(out)
+    result_tables = study_tables(results)
+    for table in result_tables:
+        console.show(table)
+    return console.Outcome(
+        figures={
+            "virtual": results.virtual,
+            "tables": result_tables,
+            "cells": results.cells,
+            "comparisons": results.comparisons,
+            "missing": results.missing,
+            "page": page,
+        },
+        wrote=[out / STUDY_TABLE, out / STUDY_FILE, out / RUNS_FILE, page],
+        following=[f"open {page} in a browser"],
+        status=failure_status(statuses),
+    )
+
+
+def _training_arms(config: StudyConfig, folder: Path, study_file: Path) -> dict[str, TrainingArm]:
+    """Return the settings of the arms that are trained, read as `pronk train` reads its options."""
+    from pronk.cli.main import parsed_command
+    from pronk.jump.study.trainings import TrainingArm
+
+    training = config.training
+    robot = str(folder / training.robot) if (folder / training.robot).is_file() else training.robot
+    arms = {}
+    for name, arm in config.arms.items():
+        if arm.policies:
+            continue
+        words = ["train", training.task, "--robot", robot, "--envs", str(training.envs)]
+        words += ["--save-interval", str(training.save_interval), "--out", "trainings"]
+        for phase, iterations in training.phases.items():
+            words += ["--phase", f"{phase}={iterations}"]
+        gains = "naive" if arm.gains == "naive" else str(folder / str(arm.gains))
+        words += ["--gains", gains]
+        if arm.ranges_from is not None:
+            words += ["--ranges-from", str(folder / arm.ranges_from)]
+        options = [*shlex.split(training.options), *shlex.split(arm.options)]
+        for word in options:
+            option = word.partition("=")[0]
+            if option in _NAMED_ELSEWHERE:
+                raise PronkError(
+                    f"{study_file}: arms.{name}: {option} is no option of an arm; "
+                    f"{_NAMED_ELSEWHERE[option]}."
+                )
+        try:
+            values = parsed_command([*words, *options])
+            settings = replace(values["settings"], gains=gains).completed()
+        except PronkError as error:
+            raise PronkError(f"{study_file}: arms.{name}: {error}") from None
+        if arm.randomization is not None and (settings.draws.ellipsoid or settings.draws.by_joint):
+            raise PronkError(
+                f"{study_file}: arms.{name}: randomization changes the box of each group's gains, "
+                "and --ellipsoid and --by-joint do not draw from it; leave one of them out."
+            )
+        arms[name] = TrainingArm(name=name, settings=settings)
+    return arms
+
+
+_NAMED_ELSEWHERE = {
+    "--gains": "its gains are gains",
+    "--ranges-from": "it is ranges_from",
+    "--robot": "the robot is training.robot",
+    "--envs": "their number is training.envs",
+    "--seed": "seeds are seeds",
+    "--seeds": "seeds are seeds",
+    "--out": "--out of `pronk study` is the folder",
+    "--resume": "the same command goes on",
+    "--minutes": "a study stops by Ctrl-C",
+    "--device": "it is an option of `pronk study`",
+    "--gpu-ids": "give --gpus to `pronk study`",
+    "--gpus": "give it to `pronk study`",
+    "--per-gpu": "give it to `pronk study`",
+    "--jobs": "give it to `pronk study`",
+    "--cluster": "give it to `pronk study`",
+}
+"""Options of `pronk train` that a study has elsewhere, and where."""
+
+
+def _plan_tables(plan: StudyPlan) -> list[Table]:
+    """Return what a study runs and asks, and what that takes."""
+    from pronk.tables import Column, Table
+
+    config = plan.config
+    amounts = Table(
+        title=config.title,
+        columns=(Column(heading="what"), Column(heading="how much")),
+        rows=(
+            ("arms", ", ".join(config.arms)),
+            ("seeds", ", ".join(map(str, config.seed_numbers))),
+            ("robots", ", ".join(robot.name for robot in plan.robots)),
+            ("commands", ", ".join(case.name for case in config.trial.cases())),
+            ("trainings", plan.trainings),
+            ("environment steps", f"{plan.env_steps:,}"),
+            ("GPU hours", f"{plan.gpu_hours:.2f}"),
+            ("trials (policy on robot)", plan.trials),
+            ("jumps", plan.jumps),
+            ("core hours of trials", f"{plan.core_hours:.2f}"),
+        ),
+        notes=(
+            "GPU hours: at 340,000 steps/s of four trainings of 4,096 robots on one H200 under "
+            "MPS; 16 trainings of the recipe take four GPUs about 22 minutes. Core hours: at 3 s a "
+            "jump. A training needs one core beside its share of a GPU.",
+        ),
+    )
+    rows = []
+    for name, comparison in config.comparisons.items():
+        robots = ", ".join(comparison.robots) or "all"
+        rows.append(
+            (name, comparison.outcome, f"{comparison.arm} less {comparison.against}", robots)
+        )
+    comparisons = Table(
+        title="Comparisons",
+        columns=(
+            Column(heading="comparison"),
+            Column(heading="outcome"),
+            Column(heading="difference of"),
+            Column(heading="robots"),
+        ),
+        rows=tuple(rows),
+    )
+    return [amounts, comparisons] if rows else [amounts]
+
+
+# ---- shared with `pronk train` ----
+
+
+def run_shown(
+    tasks: Sequence[StudyTask], place: ChosenPlace, root: Path
+) -> Mapping[str, TaskStatus]:
+    """Run tasks and show their progress; say how to go on if that is interrupted."""
+    from pronk.jump.study.place import open_executor
+    from pronk.jump.study.schedule import run_tasks
+    from pronk.jump.study.show import progress_line, progress_table
+
+    try:
+        with open_executor(place, root, console.note) as executor, console.LiveTable() as live:
+            statuses = run_tasks(
+                tasks,
+                executor,
+                root,
+                report=lambda progress: live.update(
+                    progress_line(progress), lambda rows: progress_table(progress, rows)
+                ),
+            )
+    except KeyboardInterrupt:
+        console.following(shlex.join(["pronk", *sys.argv[1:]]))
+        raise
+    kept = 0
+    for status in statuses.values():
+        kept += status.state == "kept"
+        if status.state in ("failed", "skipped"):
+            console.warn(f"{status.name}: {status.state}: {status.reason}")
+    if kept:
+        console.say(f"{kept} of {len(statuses)} tasks were done before")
+    return statuses
+
+
+def failure_status(statuses: Mapping[str, TaskStatus]) -> ExitStatus:
+    """Return the exit status of a study: the machine could not do all of it, if a task failed."""
+    if any(status.state in ("failed", "skipped") for status in statuses.values()):
+        return ExitStatus.REFUSED
+    return ExitStatus.DONE

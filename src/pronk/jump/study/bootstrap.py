@@ -1,0 +1,207 @@
+"""Intervals over seeds and jumps: the hierarchical bootstrap, widened for few seeds.
+
+Policies of one arm differ by the seed of their training, jumps of one policy by their start and
+noise. A resample draws seeds with replacement, and for each drawn seed its jumps with replacement,
+command by command. Its distribution has the skewness of the data, but is too narrow for few seeds:
+the variance of n values about their own mean is (n - 1) / n of the true one, and a normal quantile
+stands where one of Student's t with n - 1 degrees of freedom belongs. Deviations from the estimate
+are therefore stretched by sqrt(n / (n - 1)) t / z (after Hesterberg, "What Teachers Should Know
+About the Bootstrap", 2015, who moves the quantile instead, which the smallest and largest seed
+bound). Jumps are in the distribution twice, in the scatter of seeds and by themselves, so intervals
+are a little too wide rather than too narrow where seeds do not differ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm, t
+
+from pronk.arrays import Array
+from pronk.jump.trial.results import share_interval
+
+RESAMPLES = 1999
+"""Number of resamples; the ends of an interval are the 50th from each end."""
+LEVEL = 0.95
+"""Coverage of the intervals [1]."""
+
+SeedValues = Sequence[Array]
+"""Values of the jumps of one seed, an array (n,) for each command; NaN where there is no value."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedEstimate:
+    """A mean over seeds, or a difference of two, with its 95 % interval."""
+
+    value: float
+    """NaN if no seed has a value."""
+    low: float
+    """NaN with fewer than two seeds that have a value."""
+    high: float
+    seeds: tuple[int, ...]
+    """Number of seeds with a value, of each arm."""
+
+
+def finite_seeds(seeds: Sequence[SeedValues]) -> list[list[Array]]:
+    """Return the finite values of each seed by command; empty ones are left out."""
+    kept = []
+    for commands in seeds:
+        strata = []
+        for values in commands:
+            numbers = np.asarray(values, dtype=float)
+            numbers = numbers[np.isfinite(numbers)]
+            if len(numbers):
+                strata.append(numbers)
+        if strata:
+            kept.append(strata)
+    return kept
+
+
+def seed_mean(commands: SeedValues) -> float:
+    """Return the mean of all finite values of one seed; NaN without any."""
+    strata = finite_seeds([commands])
+    if not strata:
+        return math.nan
+    return float(np.concatenate(strata[0]).mean())
+
+
+def hierarchical_draws(
+    seeds: Sequence[SeedValues], rng: np.random.Generator, resamples: int = RESAMPLES
+) -> Array:
+    """Draw means over seeds of the hierarchical bootstrap. (resamples,).
+
+    Args:
+        seeds: Finite values of each seed, by command.
+        rng: Generator of all draws.
+        resamples: Number of resamples.
+    """
+    count = len(seeds)
+    drawn_seed = rng.integers(count, size=(resamples, count))
+    means = np.empty((resamples, count))
+    for index, commands in enumerate(seeds):
+        slots = drawn_seed == index
+        draws = int(slots.sum())
+        total = np.zeros(draws)
+        number = 0
+        for values in commands:
+            picked = rng.integers(len(values), size=(draws, len(values)))
+            total += values[picked].sum(axis=1)
+            number += len(values)
+        means[slots] = total / number
+    drawn: Array = means.mean(axis=1)
+    return drawn
+
+
+def mean_interval(
+    seeds: Sequence[SeedValues], *, is_share: bool, rng_seed: int = 0, resamples: int = RESAMPLES
+) -> SeedEstimate:
+    """Return the mean over seeds with its interval.
+
+    Args:
+        seeds: Values of the jumps of each seed, by command; of a share 1 and 0.
+        is_share: True for a share. Its interval is at least Wilson's over all jumps, which is not
+            empty where all jumps ended alike, and stays within 0 and 1.
+        rng_seed: Seed of the resamples.
+        resamples: Number of resamples.
+    """
+    kept = finite_seeds(seeds)
+    count = len(kept)
+    if not count:
+        return SeedEstimate(value=math.nan, low=math.nan, high=math.nan, seeds=(0,))
+    value = float(np.mean([seed_mean(commands) for commands in kept]))
+    if count < 2:
+        return SeedEstimate(value=value, low=math.nan, high=math.nan, seeds=(count,))
+    drawn = hierarchical_draws(kept, np.random.default_rng(rng_seed), resamples)
+    low, high = _stretched(drawn, value, math.sqrt(count / (count - 1)), count - 1.0)
+    if is_share:
+        wilson_low, wilson_high = _wilson(kept)
+        low = max(min(low, wilson_low), 0.0)
+        high = min(max(high, wilson_high), 1.0)
+    return SeedEstimate(value=value, low=low, high=high, seeds=(count,))
+
+
+def difference_interval(
+    seeds: Sequence[SeedValues],
+    other_seeds: Sequence[SeedValues],
+    *,
+    is_share: bool,
+    rng_seed: int = 0,
+    resamples: int = RESAMPLES,
+) -> SeedEstimate:
+    """Return the mean over some seeds less that over others, with its interval.
+
+    The two are independent: a seed of one arm has nothing in common with that of another but its
+    number. The degrees of freedom are Welch's.
+
+    Args:
+        seeds: Values of the jumps of each seed, by command.
+        other_seeds: The same of the arm that is subtracted.
+        is_share: True for a share. The interval is at least Newcombe's over all jumps.
+        rng_seed: Seed of the resamples.
+        resamples: Number of resamples.
+    """
+    arms = [finite_seeds(seeds), finite_seeds(other_seeds)]
+    counts = (len(arms[0]), len(arms[1]))
+    rng = np.random.default_rng(rng_seed)
+    values = []
+    deviations = []
+    variances = []
+    for arm in arms:
+        if not arm:
+            return SeedEstimate(value=math.nan, low=math.nan, high=math.nan, seeds=counts)
+        means = np.array([seed_mean(commands) for commands in arm])
+        values.append(float(means.mean()))
+        if len(arm) > 1:
+            drawn = hierarchical_draws(arm, rng, resamples)
+            deviations.append((drawn - values[-1]) * math.sqrt(len(arm) / (len(arm) - 1)))
+            variances.append(float(means.var(ddof=1)) / len(arm))
+    value = values[0] - values[1]
+    if min(counts) < 2:
+        return SeedEstimate(value=value, low=math.nan, high=math.nan, seeds=counts)
+    freedom = _welch(variances, counts)
+    low, high = _stretched(value + deviations[0] - deviations[1], value, 1.0, freedom)
+    if is_share:
+        first_low, first_high = _wilson(arms[0])
+        other_low, other_high = _wilson(arms[1])
+        first = _pooled_share(arms[0])
+        other = _pooled_share(arms[1])
+        newcombe_low = value - math.hypot(first - first_low, other_high - other)
+        newcombe_high = value + math.hypot(first_high - first, other - other_low)
+        low = max(min(low, newcombe_low), -1.0)
+        high = min(max(high, newcombe_high), 1.0)
+    return SeedEstimate(value=value, low=low, high=high, seeds=counts)
+
+
+def _stretched(drawn: Array, value: float, factor: float, freedom: float) -> tuple[float, float]:
+    """Return the quantiles of a distribution, their distance from the estimate stretched."""
+    tail = 0.5 * (1.0 - LEVEL)
+    stretch = factor * float(t.ppf(1.0 - tail, freedom) / norm.ppf(1.0 - tail))
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return value + stretch * (float(low) - value), value + stretch * (float(high) - value)
+
+
+def _welch(variances: Sequence[float], counts: Sequence[int]) -> float:
+    """Return Welch's degrees of freedom, of the variances of two means."""
+    total = math.fsum(variances)
+    smallest = float(min(counts) - 1)
+    if total <= 0.0:
+        return smallest
+    parts = 0.0
+    for variance, count in zip(variances, counts, strict=True):
+        parts += variance**2 / (count - 1)
+    return max(total**2 / parts, smallest)
+
+
+def _pooled_share(seeds: Sequence[SeedValues]) -> float:
+    """Return the share of all jumps of all seeds."""
+    jumps = np.concatenate([np.concatenate(commands) for commands in seeds])
+    return float(jumps.mean())
+
+
+def _wilson(seeds: Sequence[SeedValues]) -> tuple[float, float]:
+    """Return Wilson's interval of the share of all jumps of all seeds."""
+    jumps = np.concatenate([np.concatenate(commands) for commands in seeds])
+    return share_interval(round(float(jumps.sum())), len(jumps))

@@ -1,0 +1,263 @@
+"""The file of a study: arms, seeds, robots, outcomes, and comparisons named before the runs.
+
+    schema: pronk/study/1
+    title: What a match is worth
+    seeds: 1-5
+    arms:
+      nominal: {gains: naive, ranges_from: gains.yaml}
+      matched: {gains: gains.yaml}
+    robots:
+      shipped: {}
+      weak: {changes: [{parameters: [joints.torque_scale], factor: 0.7}]}
+    outcomes: [landed, height, distance]
+    comparisons:
+      a match: {outcome: landed, arm: matched, against: nominal, robots: [shipped]}
+
+Paths are relative to the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.files import converted, read_yaml
+from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.study.trainings import parse_seeds
+from pronk.jump.train.phases import TASKS
+from pronk.jump.trial.conditions import Change
+from pronk.jump.trial.protocol import Case, parse_cases
+from pronk.names import check_names
+
+SCHEMA = "pronk/study/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfig:
+    """Half-widths of the range of each joint group's gains, relative to the middle [1]."""
+
+    stiffness: float
+    damping: float
+
+    def __post_init__(self) -> None:
+        """Refuse a range that is negative or reaches zero."""
+        for name, share in (("stiffness", self.stiffness), ("damping", self.damping)):
+            if not 0.0 <= share < 1.0:
+                raise PronkError(
+                    f"randomization.{name} is {share:g}; expected 0 or more and less than 1, as in "
+                    "0.3 for plus or minus 30 %."
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmConfig:
+    """A way to train, or policies that are there already."""
+
+    gains: str | None = None
+    """A gains.yaml, or naive for the nominal gains."""
+    ranges_from: str | None = None
+    """With naive: the gains.yaml whose ranges and delay are used."""
+    randomization: RandomizationConfig | None = None
+    """Other half-widths of the gains' ranges than those of the file."""
+    options: str = ""
+    """Further options of `pronk train`, as on the command line."""
+    policies: tuple[str, ...] = ()
+    """Files of finished policies instead of gains, one for each seed."""
+
+    def __post_init__(self) -> None:
+        """Refuse an arm that is neither or both."""
+        if self.policies and (self.gains or self.ranges_from or self.options or self.randomization):
+            raise PronkError(
+                "policies are finished; leave gains, ranges_from, randomization and options out."
+            )
+        if not self.policies and self.gains is None:
+            raise PronkError(
+                "gains are missing; give a gains.yaml or naive, or policies that are finished."
+            )
+        if self.ranges_from is not None and self.gains != "naive":
+            raise PronkError(f"ranges_from goes with gains: naive; {self.gains} has its own.")
+        if self.randomization is not None and self.gains == "naive" and self.ranges_from is None:
+            raise PronkError("randomization of naive gains needs ranges_from, a gains.yaml.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig:
+    """A virtual robot, or several."""
+
+    sim_params: str | None = None
+    """File of its parameters; those that ship with pronk if left out."""
+    changes: tuple[Change, ...] = ()
+    """Changes of the parameters, as in a file of conditions."""
+    conditions: str | None = None
+    """A file of conditions, tolerance or bodies: a robot for each of them."""
+
+    def __post_init__(self) -> None:
+        """Refuse changes beside conditions."""
+        if self.changes and self.conditions is not None:
+            raise PronkError("changes and conditions are both given; give one of them.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonConfig:
+    """A difference of two arms that is asked for before the runs."""
+
+    outcome: str
+    arm: str
+    against: str
+    """Arm that is subtracted."""
+    robots: tuple[str, ...] = ()
+    """Robots over which the outcome is averaged; all if empty."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """What all trainings have in common."""
+
+    task: str = "all"
+    robot: str = "mini_cheetah"
+    envs: int = 4096
+    phases: dict[str, int] = field(default_factory=dict)
+    """Iterations of phases that differ from the recipe's."""
+    save_interval: int = 50
+    """Iterations between checkpoints."""
+    options: str = ""
+    """Further options of `pronk train`, as on the command line."""
+
+    def __post_init__(self) -> None:
+        """Refuse a task that cannot jump."""
+        tasks = [name for name in TASKS if name != "walk"]
+        if self.task not in tasks:
+            raise PronkError(f"training.task is {self.task!r}; expected {', '.join(tasks)}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialConfig:
+    """The jumps of every policy on every robot."""
+
+    commands: tuple[str, ...] = ("paper",)
+    """Forward and left velocity in m/s, as "2,0"; paper stands for the paper's five."""
+    jumps: int = 20
+    """Jumps with each command."""
+    seed: int = 0
+    """Seed of all draws, the same for every policy."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range and commands that cannot be read."""
+        if not 1 <= self.jumps <= 10_000:
+            raise PronkError(f"trial.jumps is {self.jumps}; expected 1 to 10000.")
+        if not 0 <= self.seed < 2**31:
+            raise PronkError(f"trial.seed is {self.seed}; expected 0 or more, below 2^31.")
+        if not self.commands:
+            raise PronkError("trial.commands is empty; expected one or more, as in paper or 2,0.")
+        names = [case.name for case in self.cases()]
+        if len(set(names)) != len(names):
+            raise PronkError(f"trial.commands: one is there twice ({', '.join(names)}).")
+
+    def cases(self) -> tuple[Case, ...]:
+        """Return the commands."""
+        return parse_cases(self.commands)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig:
+    """A study, checked when it is built; its messages have the words of the file."""
+
+    schema: str
+    title: str
+    seeds: int | str | tuple[int, ...] = "1-3"
+    """Seeds of every arm, as 1-5, 1,2,5 or a list."""
+    arms: dict[str, ArmConfig]
+    robots: dict[str, RobotConfig] = field(default_factory=lambda: {"shipped": RobotConfig()})
+    outcomes: tuple[str, ...] = ("landed", "height", "distance")
+    comparisons: dict[str, ComparisonConfig] = field(default_factory=dict)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    trial: TrialConfig = field(default_factory=TrialConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse names that do not exist and lists that are empty or have an entry twice."""
+        if self.schema != SCHEMA:
+            raise PronkError(f"schema is {self.schema!r}; expected {SCHEMA!r}.")
+        if not self.arms:
+            raise PronkError("arms is empty; expected one or more.")
+        if not self.robots:
+            raise PronkError("robots is empty; expected one or more, as in shipped: {}.")
+        check_names(self.arms, "arms", PronkError)
+        check_names(self.robots, "robots", PronkError)
+        folders = {name.replace(" ", "_") for name in self.arms}
+        if len(folders) != len(self.arms):
+            raise PronkError("arms: two names differ by spaces and underscores only; change one.")
+        _ = self.seed_numbers
+        _check_known("outcomes", self.outcomes, OUTCOMES)
+        for name, comparison in self.comparisons.items():
+            place = f"comparisons.{name}"
+            _check_known(f"{place}.outcome", [comparison.outcome], OUTCOMES)
+            _check_known(f"{place}.arm", [comparison.arm], self.arms)
+            _check_known(f"{place}.against", [comparison.against], self.arms)
+            if comparison.arm == comparison.against:
+                raise PronkError(f"{place}: arm and against are both {comparison.arm}.")
+
+    @property
+    def seed_numbers(self) -> tuple[int, ...]:
+        """Seeds of every arm that is trained."""
+        seeds = self.seeds
+        if isinstance(seeds, tuple):
+            seeds = ",".join(str(seed) for seed in seeds)
+        return parse_seeds(str(seeds))
+
+    def check_robots(self, names: Sequence[str]) -> None:
+        """Refuse comparisons on robots that the study does not have.
+
+        Args:
+            names: Names of all robots, with one for each condition.
+        """
+        for name, comparison in self.comparisons.items():
+            if comparison.robots:
+                _check_known(f"comparisons.{name}.robots", comparison.robots, names)
+
+
+def _check_known(place: str, names: Sequence[str], known: Any) -> None:
+    """Refuse an empty list, a name twice, or one that is not among those that there are."""
+    if not names:
+        raise PronkError(f"{place} is empty; expected some of {', '.join(known)}.")
+    for name in names:
+        if name not in known:
+            raise PronkError(f"{place}: {name!r}; expected some of {', '.join(known)}.")
+    if len(set(names)) != len(names):
+        raise PronkError(f"{place}: {', '.join(names)}; one is there twice.")
+
+
+def load_study(path: Path) -> StudyConfig:
+    """Read the file of a study.
+
+    Raises:
+        ArtefactError: The file is missing, or something in it is unknown or impossible.
+    """
+    body = read_yaml(path, ArtefactError, "docs/study.md has an example")
+    if not isinstance(body, Mapping):
+        raise ArtefactError(f"{path}: no study; expected schema, title, arms and so on.")
+    _check_parts(path, body)
+    try:
+        return converted(body, StudyConfig, path)
+    except PronkError as error:
+        text = str(error)
+        raise ArtefactError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _check_parts(path: Path, body: Mapping[str, Any]) -> None:
+    """Read each arm and robot by itself, so that a message names it."""
+    for section, kind in (("arms", ArmConfig), ("robots", RobotConfig)):
+        entries = body.get(section)
+        if not isinstance(entries, Mapping):
+            continue
+        for name, entry in entries.items():
+            place = Path(f"{path}: {section}.{name}")
+            try:
+                converted(entry, kind, place)
+            except PronkError as error:
+                text = str(error)
+                if not text.startswith(str(place)):
+                    text = f"{place}: {text}"
+                raise ArtefactError(text) from None

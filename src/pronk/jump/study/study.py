@@ -1,0 +1,547 @@
+"""A study: every arm is trained from every seed, and every policy jumps on every robot.
+
+plan = plan_study(load_study(path), path.parent, arms)
+tasks = study_tasks(plan, root, place)
+statuses = run_tasks(tasks, executor, root, report=show)
+results = collect_results(plan, root, statuses)
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from pronk.arrays import Array
+from pronk.errors import ArtefactError, PronkError
+from pronk.files import sha256, write_text
+from pronk.identify.match.gains import MatchedGains, load_gains, save_gains
+from pronk.jump.study.bootstrap import difference_interval, mean_interval, seed_mean
+from pronk.jump.study.config import ComparisonConfig, RandomizationConfig, StudyConfig
+from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.study.schedule import TaskStatus
+from pronk.jump.study.study_results import (
+    RUNS_FILE,
+    STUDY_FILE,
+    ComparedArms,
+    OutcomeCell,
+    StudyResults,
+    save_study,
+)
+from pronk.jump.study.tasks import INPUTS, StudyTask, copied_input, written_input
+from pronk.jump.study.trainings import (
+    TrainingArm,
+    TrainingPlace,
+    training_folder,
+    training_name,
+    training_tasks,
+)
+from pronk.jump.trial.condition_trial import (
+    CELLS,
+    SUMMARY,
+    TABLE,
+    load_cell,
+    save_sim_params,
+)
+from pronk.jump.trial.condition_trial import SCHEMA as CONDITION_TRIAL_SCHEMA
+from pronk.jump.trial.conditions import Condition, changed_params, load_conditions
+from pronk.jump.trial.results import TrialRun, load_json
+from pronk.jump.trial.trial import software_versions
+from pronk.jump.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
+from pronk.names import file_name
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+
+TRIALS = "trials"
+NOMINAL_CONDITION = b"schema: pronk/conditions/1\nconditions:\n- name: nominal\n"
+"""File of conditions of a trial whose robot is in its `--sim-params`."""
+STEPS_PER_SECOND_AND_GPU = 340_000
+"""Rate at which `--plan` counts: four trainings of 4,096 robots on one H200 under MPS."""
+SECONDS_A_JUMP = 3.0
+"""Time of a jump on one core by which `--plan` counts [s]; docs/try.md."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudiedRobot:
+    """A virtual robot of a study."""
+
+    name: str
+    sim_params: SimParams
+    series: str = ""
+    """Series of conditions that it is a point of; empty for a robot by itself."""
+    place: float | None = None
+    """Place in its series, in the unit of the series."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyArm:
+    """An arm: a way to train, or policies that are there already."""
+
+    name: str
+    training: TrainingArm | None = None
+    randomization: RandomizationConfig | None = None
+    policies: tuple[Path, ...] = ()
+
+    @property
+    def folder_name(self) -> str:
+        """Name of the arm as that of a folder."""
+        return file_name(self.name).replace(" ", "_")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyPlan:
+    """All that a study runs."""
+
+    config: StudyConfig
+    arms: tuple[StudyArm, ...]
+    robots: tuple[StudiedRobot, ...]
+    robot: RobotSpec
+
+    def seeds(self, arm: StudyArm) -> tuple[int, ...]:
+        """Return the seeds of an arm; finished policies are numbered from 1."""
+        if arm.policies:
+            return tuple(range(1, len(arm.policies) + 1))
+        return self.config.seed_numbers
+
+    @property
+    def trainings(self) -> int:
+        """Number of trainings."""
+        return sum(len(self.seeds(arm)) for arm in self.arms if not arm.policies)
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps of all trainings."""
+        steps = 0
+        for arm in self.arms:
+            if arm.training is not None:
+                steps += arm.training.env_steps * len(self.seeds(arm))
+        return steps
+
+    @property
+    def trials(self) -> int:
+        """Number of pairs of policy and robot."""
+        policies = sum(len(self.seeds(arm)) for arm in self.arms)
+        return policies * len(self.robots)
+
+    @property
+    def jumps(self) -> int:
+        """Number of jumps of all trials."""
+        trial = self.config.trial
+        return self.trials * trial.jumps * len(trial.cases())
+
+    @property
+    def gpu_hours(self) -> float:
+        """Estimated time on one GPU with four trainings side by side [h]."""
+        return self.env_steps / STEPS_PER_SECOND_AND_GPU / 3600.0
+
+    @property
+    def core_hours(self) -> float:
+        """Estimated time of all trials on one core [h]."""
+        return self.jumps * SECONDS_A_JUMP / 3600.0
+
+
+def plan_study(config: StudyConfig, folder: Path, arms: Mapping[str, TrainingArm]) -> StudyPlan:
+    """Read all that a study names; nothing is written.
+
+    Args:
+        config: The study.
+        folder: Folder of its file, to which its paths are relative.
+        arms: Settings of the arms that are trained, by name.
+
+    Raises:
+        PronkError: A file is missing, or an arm or robot is impossible.
+    """
+    spec = load_robot(_robot_name(config, folder))
+    robots = []
+    for name, robot_config in config.robots.items():
+        try:
+            path = robot_config.sim_params
+            base = _sim_params(None if path is None else folder / path, spec)
+            if robot_config.conditions is None:
+                condition = Condition(name=name, changes=robot_config.changes)
+                params = changed_params(condition, base, spec)
+                robots.append(StudiedRobot(name=name, sim_params=params))
+                continue
+            text = robot_config.conditions
+            if (folder / text).is_file():
+                text = str(folder / text)
+            for condition in load_conditions(text, base, spec, seed=config.trial.seed):
+                robots.append(
+                    StudiedRobot(
+                        name=f"{name}: {condition.name}",
+                        sim_params=changed_params(condition, base, spec),
+                        series=condition.series,
+                        place=condition.place,
+                    )
+                )
+        except PronkError as error:
+            raise PronkError(f"robots.{name}: {error}") from None
+    config.check_robots([robot.name for robot in robots])
+    study_arms = []
+    for name, arm_config in config.arms.items():
+        policies = tuple(folder / path for path in arm_config.policies)
+        try:
+            _check_policies(policies)
+        except PronkError as error:
+            raise PronkError(f"arms.{name}: {error}") from None
+        study_arms.append(
+            StudyArm(
+                name=name,
+                training=None if policies else arms[name],
+                randomization=arm_config.randomization,
+                policies=policies,
+            )
+        )
+    return StudyPlan(config=config, arms=tuple(study_arms), robots=tuple(robots), robot=spec)
+
+
+def _robot_name(config: StudyConfig, folder: Path) -> str:
+    """Return name or path of the robot that is trained and tried."""
+    name = config.training.robot
+    return str(folder / name) if (folder / name).is_file() else name
+
+
+def _sim_params(path: Path | None, spec: RobotSpec) -> SimParams:
+    """Return the parameters of a file, the shipped ones, or those derived from the robot."""
+    if path is None and spec.name == SHIPPED_ROBOT:
+        path = SHIPPED
+    return load_sim_params(path, spec)
+
+
+def _check_policies(paths: Sequence[Path]) -> None:
+    """Refuse policies that are missing, or there twice."""
+    hashes = []
+    for path in paths:
+        if not path.is_file():
+            raise ArtefactError(f"{path}: no such file; expected the policy.onnx of a training.")
+        hashes.append(sha256(path))
+    if len(set(hashes)) != len(hashes):
+        raise PronkError("one policy is there twice; give each once.")
+
+
+# ---- tasks ----
+
+
+def study_tasks(plan: StudyPlan, root: Path, place: TrainingPlace) -> list[StudyTask]:
+    """Return the trainings and behind them the trials, and write their inputs.
+
+    Args:
+        plan: The study.
+        root: Its folder.
+        place: The devices of trainings.
+    """
+    trained = []
+    for arm in plan.arms:
+        if arm.training is not None:
+            trained.append(_with_randomization(arm, arm.training, root))
+    tasks = training_tasks(trained, plan.config.seed_numbers, root, place)
+    nominal = written_input(root, NOMINAL_CONDITION, "nominal", ".yaml")
+    params_by_robot = {}
+    for robot in plan.robots:
+        params_by_robot[robot.name] = _params_input(root, robot)
+    most_seeds = max(len(plan.seeds(arm)) for arm in plan.arms)
+    for index in range(most_seeds):
+        for arm in plan.arms:
+            seeds = plan.seeds(arm)
+            if index >= len(seeds):
+                continue
+            policy = ""
+            needs: tuple[str, ...] = ()
+            if arm.training is not None:
+                policy = f"{training_folder(arm.training, seeds[index])}/policy.onnx"
+                needs = (training_name(arm.name, seeds[index]),)
+            else:
+                policy = copied_input(root, arm.policies[index], "policy")
+            for robot in plan.robots:
+                inputs = (policy, params_by_robot[robot.name], nominal)
+                tasks.append(_trial_task(plan, arm, seeds[index], robot, inputs, needs))
+    return tasks
+
+
+def trial_name(arm: str, seed: int, robot: str) -> str:
+    """Return the name of a trial's task."""
+    return f"{arm}, seed {seed}, on {robot}"
+
+
+def trial_folder(arm: StudyArm, seed: int, robot: StudiedRobot) -> str:
+    """Return the folder of a trial, relative to that of the study."""
+    robot_folder = file_name(robot.name).replace(" ", "_")
+    return f"{TRIALS}/{arm.folder_name}/seed-{seed}/{robot_folder}"
+
+
+def _trial_task(
+    plan: StudyPlan,
+    arm: StudyArm,
+    seed: int,
+    robot: StudiedRobot,
+    inputs: tuple[str, str, str],
+    needs: tuple[str, ...],
+) -> StudyTask:
+    trial = plan.config.trial
+    policy, params, nominal = inputs
+    folder = trial_folder(arm, seed, robot)
+    words = ["trial", policy, "--sim-params", params, "--conditions", nominal]
+    words += ["--jumps", str(trial.jumps), "--seed", str(trial.seed), "--processes", "1"]
+    for command in trial.commands:
+        words.append(f"--commands={command}")
+    if plan.robot.source != plan.robot.name:
+        words += ["--robot", str(Path(plan.robot.source).resolve())]
+    words += ["--out", folder]
+    settings = {"commands": list(trial.commands), "jumps": trial.jumps, "seed": trial.seed}
+    return StudyTask(
+        name=trial_name(arm.name, seed, robot.name),
+        kind="trial",
+        folder=folder,
+        command=tuple(words),
+        settings=settings,
+        inputs=inputs,
+        outputs=(f"{folder}/{SUMMARY}", f"{folder}/{TABLE}"),
+        needs=needs,
+    )
+
+
+def _params_input(root: Path, robot: StudiedRobot) -> str:
+    """Write the parameters of a robot to the inputs; return the path relative to the study."""
+    stem = file_name(robot.name).replace(" ", "_")
+    draft = root / INPUTS / f".{stem}.draft.yaml"
+    save_sim_params(draft, robot.sim_params, comment=f"Robot {robot.name!r} of a study.")
+    content = draft.read_bytes()
+    draft.unlink()
+    return written_input(root, content, stem, ".yaml")
+
+
+def _with_randomization(arm: StudyArm, training: TrainingArm, root: Path) -> TrainingArm:
+    """Return an arm whose gains have the ranges that the study asks for."""
+    if arm.randomization is None:
+        return training
+    settings = training.settings
+    source = settings.gains_file
+    assert source is not None
+    gains = load_gains(source)
+    changed = randomized_gains(
+        gains, arm.randomization, load_robot(str(settings.robot)) if settings.ranges_from else None
+    )
+    draft = root / INPUTS / f".{arm.folder_name}.draft.yaml"
+    save_gains(draft, changed)
+    path = root / written_input(root, draft.read_bytes(), f"gains-{arm.folder_name}", ".yaml")
+    draft.unlink()
+    if settings.ranges_from is not None:
+        return replace(training, settings=replace(settings, ranges_from=path))
+    return replace(training, settings=replace(settings, gains=str(path)))
+
+
+def randomized_gains(
+    gains: MatchedGains, randomization: RandomizationConfig, robot: RobotSpec | None
+) -> MatchedGains:
+    """Return gains with other half-widths of the ranges of each joint group.
+
+    Args:
+        gains: The gains.
+        randomization: Half-widths relative to the middle of the range.
+        robot: Robot about whose nominal gains training draws; None for those of the file.
+    """
+    groups = {}
+    for name, group in gains.groups.items():
+        stiffness = group.stiffness
+        damping = group.damping
+        if robot is not None:
+            joint = robot.group(name)[0]
+            stiffness = joint.stiffness
+            damping = joint.damping
+        groups[name] = replace(
+            group,
+            stiffness_range=randomization.stiffness * stiffness,
+            damping_range=randomization.damping * damping,
+        )
+    return replace(gains, groups=groups)
+
+
+# ---- results ----
+
+
+Jumps = dict[tuple[str, str], dict[int, list[TrialRun]]]
+"""Jumps by arm and robot, then by seed."""
+
+
+def collect_results(
+    plan: StudyPlan, root: Path, statuses: Mapping[str, TaskStatus]
+) -> StudyResults:
+    """Read every trial that is done, compute outcomes and comparisons, and write them.
+
+    Args:
+        plan: The study.
+        root: Its folder.
+        statuses: How its tasks ended, by name.
+
+    Returns:
+        The results, which are in `study.json` and `study.csv`, with every jump in `runs.csv`.
+    """
+    jumps, missing = _read_jumps(plan, root, statuses)
+    cells = []
+    for arm in plan.arms:
+        for robot in plan.robots:
+            for outcome_name in plan.config.outcomes:
+                cells.append(_outcome_cell(jumps, arm.name, robot, outcome_name))
+    robot_names = [robot.name for robot in plan.robots]
+    comparisons = []
+    for name, comparison in plan.config.comparisons.items():
+        comparisons.append(_compared(jumps, name, comparison, robot_names))
+    trial = plan.config.trial
+    failed = []
+    for status in statuses.values():
+        if status.kind == "training" and status.state == "failed":
+            failed.append(f"{status.name}: {status.reason}")
+    results = StudyResults(
+        title=plan.config.title,
+        robot=plan.robot.name,
+        arms=tuple(plan.config.arms),
+        robots=tuple(robot_names),
+        outcomes=plan.config.outcomes,
+        commands=tuple(case.name for case in trial.cases()),
+        jumps=trial.jumps,
+        trial_seed=trial.seed,
+        cells=tuple(cells),
+        comparisons=tuple(comparisons),
+        missing=tuple(missing),
+        failed=tuple(failed),
+        versions=software_versions(),
+    )
+    write_text(root / RUNS_FILE, runs_csv(plan, jumps))
+    save_study(root / STUDY_FILE, results)
+    return results
+
+
+def _read_jumps(
+    plan: StudyPlan, root: Path, statuses: Mapping[str, TaskStatus]
+) -> tuple[Jumps, list[str]]:
+    """Return the jumps of all trials that are done, and the names of the others."""
+    jumps: Jumps = {}
+    missing = []
+    for arm in plan.arms:
+        for robot in plan.robots:
+            by_seed: dict[int, list[TrialRun]] = {}
+            for seed in plan.seeds(arm):
+                name = trial_name(arm.name, seed, robot.name)
+                if statuses[name].state not in ("done", "kept"):
+                    missing.append(name)
+                    continue
+                by_seed[seed] = read_trial(root / trial_folder(arm, seed, robot))
+            jumps[arm.name, robot.name] = by_seed
+    return jumps, missing
+
+
+def read_trial(folder: Path) -> list[TrialRun]:
+    """Return the jumps of the trial in a folder of a study."""
+    with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, "pronk study STUDY.yaml") as body:
+        (cell,) = body["cells"]
+        key = cell["key"]
+    return load_cell(folder / CELLS / f"{key}.json", key)
+
+
+def values_by_command(runs: Sequence[TrialRun], outcome: str) -> list[Array]:
+    """Return an outcome of the jumps of one seed, an array (n,) for each command."""
+    values: dict[str, list[float]] = {}
+    for run in runs:
+        values.setdefault(run.case, []).append(OUTCOMES[outcome].value(run))
+    return [np.array(numbers) for numbers in values.values()]
+
+
+def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str) -> OutcomeCell:
+    by_seed = jumps[arm, robot.name]
+    seeds = []
+    means: dict[str, float | None] = {}
+    count = 0
+    for seed, runs in by_seed.items():
+        strata = values_by_command(runs, outcome_name)
+        seeds.append(strata)
+        means[str(seed)] = seed_mean(strata)
+        count += len(runs)
+    estimate = mean_interval(seeds, is_share=OUTCOMES[outcome_name].is_share)
+    return OutcomeCell(
+        arm=arm,
+        robot=robot.name,
+        series=robot.series,
+        place=robot.place,
+        outcome=outcome_name,
+        value=estimate.value,
+        low=estimate.low,
+        high=estimate.high,
+        by_seed=means,
+        jumps=count,
+    )
+
+
+def _compared(
+    jumps: Jumps, name: str, comparison: ComparisonConfig, robot_names: Sequence[str]
+) -> ComparedArms:
+    """Return the difference of two arms, over the seeds that were tried on all of the robots."""
+    robots = comparison.robots or tuple(robot_names)
+    arms = []
+    for arm in (comparison.arm, comparison.against):
+        complete = set(jumps[arm, robots[0]])
+        for robot in robots[1:]:
+            complete &= set(jumps[arm, robot])
+        seeds = []
+        for seed in sorted(complete):
+            strata: list[Array] = []
+            for robot in robots:
+                strata += values_by_command(jumps[arm, robot][seed], comparison.outcome)
+            seeds.append(strata)
+        arms.append(seeds)
+    is_share = OUTCOMES[comparison.outcome].is_share
+    estimate = difference_interval(arms[0], arms[1], is_share=is_share)
+    return ComparedArms(
+        name=name,
+        outcome=comparison.outcome,
+        arm=comparison.arm,
+        against=comparison.against,
+        robots=tuple(robots),
+        value=estimate.value,
+        low=estimate.low,
+        high=estimate.high,
+        seeds=estimate.seeds,
+    )
+
+
+def runs_csv(plan: StudyPlan, jumps: Jumps) -> str:
+    """Return one row a jump with every outcome that there is; unknown ones are empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["arm", "seed", "robot", "command", "number", *OUTCOMES])
+    for arm in plan.arms:
+        for robot in plan.robots:
+            for seed, runs in jumps[arm.name, robot.name].items():
+                for run in runs:
+                    row: list[Any] = [arm.name, seed, robot.name, run.case, run.number]
+                    for outcome in OUTCOMES.values():
+                        value = outcome.value(run)
+                        if not math.isfinite(value):
+                            row.append("")
+                        elif outcome.is_share:
+                            row.append(int(value))
+                        else:
+                            row.append(value)
+                    writer.writerow(row)
+    return text.getvalue()
+
+
+def plan_figures(plan: StudyPlan) -> dict[str, Any]:
+    """Return the figures of a plan for `--json`."""
+    return {
+        "trainings": plan.trainings,
+        "env_steps": plan.env_steps,
+        "gpu_hours": plan.gpu_hours,
+        "trials": plan.trials,
+        "jumps": plan.jumps,
+        "core_hours": plan.core_hours,
+        "arms": list(plan.config.arms),
+        "robots": [robot.name for robot in plan.robots],
+        "comparisons": msgspec.to_builtins(plan.config.comparisons),
+    }

@@ -1,0 +1,272 @@
+"""The results of a study: outcomes of every arm on every robot, and the comparisons.
+
+study.json, study.csv    estimates with intervals; the page is made of the first
+runs.csv                 every jump
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pronk.files import write_text
+from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.trial.results import load_json, save_json
+from pronk.tables import Cell, Column, Table, number
+
+STUDY_FILE = "study.json"
+STUDY_TABLE = "study.csv"
+RUNS_FILE = "runs.csv"
+SCHEMA = "pronk/study-results/1"
+WRITER = "pronk study STUDY.yaml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutcomeCell:
+    """One outcome of one arm on one robot, mean over seeds."""
+
+    arm: str
+    robot: str
+    series: str = ""
+    """Series of conditions that the robot is a point of; empty for a robot by itself."""
+    place: float | None = None
+    """Place of the robot in its series, in the unit of the series."""
+    outcome: str
+    value: float = math.nan
+    """Mean over seeds of the means over jumps, in the unit of the outcome; of a share 0 to 1."""
+    low: float = math.nan
+    """Lower end of the 95 % interval; NaN with fewer than two seeds."""
+    high: float = math.nan
+    by_seed: dict[str, float | None] = field(default_factory=dict)
+    """Mean over the jumps of each seed."""
+    jumps: int
+    """Number of commanded jumps of all seeds."""
+
+    @property
+    def seeds(self) -> int:
+        """Number of seeds with a value."""
+        values = [value for value in self.by_seed.values() if value is not None]
+        return sum(math.isfinite(value) for value in values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedArms:
+    """The difference of two arms in one outcome, as the study's file asked for it."""
+
+    name: str
+    outcome: str
+    arm: str
+    against: str
+    robots: tuple[str, ...]
+    value: float = math.nan
+    """Mean of the arm less that of the other, in the unit of the outcome; of a share -1 to 1."""
+    low: float = math.nan
+    high: float = math.nan
+    seeds: tuple[int, ...] = ()
+    """Number of seeds of the arm and of the other."""
+
+    @property
+    def verdict(self) -> str:
+        """What the interval allows to say."""
+        if not math.isfinite(self.low):
+            return "too few seeds"
+        if self.low > 0.0:
+            return "more"
+        if self.high < 0.0:
+            return "less"
+        return "no clear difference"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyResults:
+    """Estimates of a study, and what they rest on."""
+
+    title: str
+    robot: str
+    virtual: bool = True
+    """Measured on pronk's virtual robot."""
+    arms: tuple[str, ...]
+    robots: tuple[str, ...]
+    outcomes: tuple[str, ...]
+    commands: tuple[str, ...]
+    jumps: int
+    """Number of jumps with each command, of each policy on each robot."""
+    trial_seed: int
+    """Seed of the draws of all trials."""
+    cells: tuple[OutcomeCell, ...]
+    comparisons: tuple[ComparedArms, ...] = ()
+    missing: tuple[str, ...] = ()
+    """Names of trials that are not in the results."""
+    failed: tuple[str, ...] = ()
+    """Trainings that failed, with the reasons."""
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def cell(self, arm: str, robot: str, outcome: str) -> OutcomeCell:
+        """Return one outcome of one arm on one robot."""
+        for cell in self.cells:
+            if (cell.arm, cell.robot, cell.outcome) == (arm, robot, outcome):
+                return cell
+        raise KeyError(f"{arm}, {robot}, {outcome}")
+
+
+def save_study(path: Path, results: StudyResults) -> None:
+    """Write the results as JSON, and beside them a table of all cells."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        ["arm", "robot", "series", "place", "outcome", "value", "low", "high", "seeds", "jumps"]
+    )
+    for cell in results.cells:
+        row: list[Any] = [cell.arm, cell.robot, cell.series]
+        row.append("" if cell.place is None else cell.place)
+        row.append(cell.outcome)
+        for value in (cell.value, cell.low, cell.high):
+            row.append(value if math.isfinite(value) else "")
+        row += [cell.seeds, cell.jumps]
+        writer.writerow(row)
+    write_text(path.with_name(STUDY_TABLE), text.getvalue())
+    save_json(path, SCHEMA, msgspec.to_builtins(results))
+
+
+def load_study_results(path: Path) -> StudyResults:
+    """Read what `save_study` wrote.
+
+    Raises:
+        ArtefactError: The file is missing, damaged or of another schema.
+    """
+    with load_json(path, SCHEMA, WRITER) as body:
+        del body["schema"]
+        for section in ("cells", "comparisons"):
+            for entry in body[section]:
+                for name in ("value", "low", "high"):
+                    if entry[name] is None:
+                        entry[name] = math.nan
+        # msgspec takes no NaN for a number of JSON, but it does in Python's own values.
+        return msgspec.convert(body, StudyResults)
+
+
+# ---- tables ----
+
+
+def estimate_text(value: float, low: float, high: float, outcome: str, *, signed: bool) -> str:
+    """Return an estimate with its interval in the unit of tables."""
+    definition = OUTCOMES[outcome]
+    if not math.isfinite(value):
+        return "-"
+    texts = []
+    for edge in (value, low, high):
+        text = number(definition.scale * edge, definition.digits)
+        texts.append(f"+{text}" if signed and edge > 0.0 else text)
+    if not math.isfinite(low):
+        return texts[0]
+    return f"{texts[0]} ({texts[1]} to {texts[2]})"
+
+
+def outcome_table(results: StudyResults, outcome: str) -> Table:
+    """Return one outcome, a row a robot and a column an arm."""
+    definition = OUTCOMES[outcome]
+    columns = [Column(heading="robot")]
+    for arm in results.arms:
+        columns.append(Column(heading=arm))
+    rows: list[tuple[Cell, ...]] = []
+    for robot in results.robots:
+        row: list[Cell] = [robot]
+        for arm in results.arms:
+            cell = results.cell(arm, robot, outcome)
+            text = estimate_text(cell.value, cell.low, cell.high, outcome, signed=False)
+            row.append(f"{text}, {_seeds_text(cell.seeds)}")
+        rows.append(tuple(row))
+    return Table(
+        title=f"{definition.label}: mean over seeds (95 % interval)",
+        columns=tuple(columns),
+        rows=tuple(rows),
+        notes=(f"{outcome.replace('_', ' ')}: {definition.meaning}.",),
+    )
+
+
+def _seeds_text(count: int) -> str:
+    return f"{count} seed" if count == 1 else f"{count} seeds"
+
+
+def comparison_table(results: StudyResults) -> Table:
+    """Return the comparisons that the study's file asked for."""
+    rows: list[tuple[Cell, ...]] = []
+    for comparison in results.comparisons:
+        robots = ", ".join(comparison.robots)
+        if comparison.robots == results.robots and len(results.robots) > 1:
+            robots = "all"
+        rows.append(
+            (
+                comparison.name,
+                OUTCOMES[comparison.outcome].label,
+                f"{comparison.arm} less {comparison.against}",
+                robots,
+                estimate_text(
+                    comparison.value,
+                    comparison.low,
+                    comparison.high,
+                    comparison.outcome,
+                    signed=True,
+                ),
+                " and ".join(map(str, comparison.seeds)),
+                comparison.verdict,
+            )
+        )
+    notes = [
+        "Intervals: hierarchical bootstrap over seeds and jumps, widened for few seeds; of shares "
+        "at least as wide as the jumps alone make them."
+    ]
+    if len(results.comparisons) > 1:
+        notes.append(
+            f"Each of the {len(results.comparisons)} intervals covers the truth with 95 % by "
+            "itself, all of them together less often."
+        )
+    return Table(
+        title="Comparisons named before the runs",
+        columns=(
+            Column(heading="comparison"),
+            Column(heading="outcome"),
+            Column(heading="difference of"),
+            Column(heading="robots"),
+            Column(heading="difference (95 % interval)"),
+            Column(heading="seeds"),
+            Column(heading="verdict"),
+        ),
+        rows=tuple(rows),
+        notes=tuple(notes),
+    )
+
+
+def seed_table(results: StudyResults, outcome: str) -> Table:
+    """Return the mean of one outcome by seed, a row an arm and robot."""
+    definition = OUTCOMES[outcome]
+    rows: list[tuple[Cell, ...]] = []
+    for cell in results.cells:
+        if cell.outcome != outcome:
+            continue
+        texts = []
+        for value in cell.by_seed.values():
+            shown = math.nan if value is None else definition.scale * value
+            texts.append(number(shown, definition.digits))
+        rows.append((f"{cell.robot}: {cell.arm}", ", ".join(texts)))
+    return Table(
+        title=f"{definition.label} of each seed",
+        columns=(Column(heading="robot: arm"), Column(heading="seed by seed")),
+        rows=tuple(rows),
+    )
+
+
+def study_tables(results: StudyResults) -> list[Table]:
+    """Return the comparisons, if any, and a table of each outcome."""
+    tables = []
+    if results.comparisons:
+        tables.append(comparison_table(results))
+    for outcome in results.outcomes:
+        tables.append(outcome_table(results, outcome))
+    return tables

@@ -1,0 +1,233 @@
+"""`pronk study` with finished policies: trials, table, page; and options of several trainings."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("onnxruntime")
+from command_line import accepted, invoke, refused
+from pronk.cli.main import parsed_command
+from pronk.identify.match.gains import load_gains
+from pronk.jump.study.config import RandomizationConfig
+from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.study.study import randomized_gains, read_trial
+from pronk.jump.study.study_results import load_study_results
+from pronk.jump.study.trainings import spread_over_seeds, training_words
+from pronk.jump.train.settings import DrawSettings, TrainSettings
+from pronk.jump.trial.condition_trial import run_conditions
+from pronk.jump.trial.conditions import Condition
+from pronk.jump.trial.protocol import parse_cases
+from pronk.jump.trial.trial import TrialPlan, setup_of
+from pronk.robots import load_robot
+from study_cases import GAINS, POLICIES, cell_files, write_study
+
+of_one_study = pytest.mark.xdist_group("study")
+"""Mark of the tests that share `study`: one process has them all."""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a study of two arms of one policy on two robots, with the study's file."""
+    folder = tmp_path_factory.mktemp("study")
+    path = write_study(
+        folder / "study.yaml",
+        arms={
+            "nominal": {"policies": [str(POLICIES / "naive" / "policy.onnx")]},
+            "matched": {"policies": [str(POLICIES / "matched" / "policy.onnx")]},
+        },
+        robots={
+            "shipped": {},
+            "weak": {"changes": [{"parameters": ["joints.torque_scale"], "factor": 0.7}]},
+        },
+        outcomes=["landed", "height", "energy"],
+        comparisons={
+            "a match": {
+                "outcome": "height",
+                "arm": "matched",
+                "against": "nominal",
+                "robots": ["shipped"],
+            }
+        },
+    )
+    accepted("study", path, "--out", folder / "out")
+    return folder
+
+
+@pytest.mark.slow
+@of_one_study
+def test_every_policy_jumps_on_every_robot(study: Path) -> None:
+    results = load_study_results(study / "out" / "study.json")
+    assert not results.missing
+    assert len(results.cells) == 2 * 2 * 3
+    with (study / "out" / "runs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4
+    assert set(OUTCOMES) <= set(rows[0])
+    for row in rows:
+        cell = results.cell(row["arm"], row["robot"], "landed")
+        assert cell.value == float(row["landed"])
+        assert (cell.seeds, cell.jumps) == (1, 1)
+    (comparison,) = results.comparisons
+    heights = {row["arm"]: row["height"] for row in rows if row["robot"] == "shipped"}
+    assert comparison.value == float(heights["matched"]) - float(heights["nominal"])
+    assert comparison.verdict == "too few seeds"
+    page = (study / "out" / "report.html").read_text()
+    assert "a match" in page
+    assert "virtual robot" in page
+
+
+@pytest.mark.slow
+@of_one_study
+def test_its_trials_are_those_of_a_trial_by_itself(study: Path, tmp_path: Path) -> None:
+    policy = POLICIES / "matched" / "policy.onnx"
+    setup = setup_of(policy, tmp_path, processes=1)
+    plan = TrialPlan(cases=parse_cases(["1,0"]), jumps=1)
+    run_conditions([policy], [Condition(name="nominal")], plan, setup)
+    (path,) = (tmp_path / "cells").glob("*.json")
+    stored = cell_files(study / "out")
+    assert path.read_bytes() in stored.values()
+    (run,) = read_trial(study / "out" / "trials" / "matched" / "seed-1" / "shipped")
+    assert OUTCOMES["height"].value(run) > 0.2
+
+
+@pytest.mark.slow
+@of_one_study
+def test_run_again_it_does_nothing_and_a_new_robot_only(study: Path) -> None:
+    out = study / "out"
+    before = cell_files(out)
+    assert "4 of 4 tasks were done before" in accepted("study", study / "study.yaml", "--out", out)
+    assert cell_files(out) == before
+    text = (study / "study.yaml").read_text()
+    more = study / "more.yaml"
+    more.write_text(text.replace("robots:\n", "robots:\n  second: {}\n", 1))
+    assert "4 of 6 tasks were done before" in accepted("study", more, "--out", out)
+    after = cell_files(out)
+    for path, content in before.items():
+        assert after[path] == content
+    second = out / "trials" / "matched" / "seed-1" / "second"
+    first = out / "trials" / "matched" / "seed-1" / "shipped"
+    assert read_trial(second) == read_trial(first)
+
+
+@pytest.mark.slow
+@of_one_study
+def test_a_policy_that_fails_is_named_and_the_rest_is_there(study: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "policy.onnx"
+    broken.write_bytes(b"no policy")
+    path = write_study(
+        tmp_path / "study.yaml",
+        arms={
+            "broken": {"policies": [str(broken)]},
+            "matched": {"policies": [str(POLICIES / "matched" / "policy.onnx")]},
+        },
+        comparisons={"c": {"outcome": "landed", "arm": "matched", "against": "broken"}},
+    )
+    command = invoke(["study", path, "--out", tmp_path / "out"])
+    assert command.exit_code == 2
+    assert "broken, seed 1, on shipped" in command.stderr
+    results = load_study_results(tmp_path / "out" / "study.json")
+    assert results.missing == ("broken, seed 1, on shipped",)
+    assert results.cell("matched", "shipped", "landed").seeds == 1
+    assert results.comparisons[0].verdict == "too few seeds"
+
+
+# --- Several trainings ---------------------------------------------------------------------------
+
+NAIVE = ("--gains", "naive")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("all", "--seeds", "1-2"), "--gains"),
+        (("all", *NAIVE, "--seeds", "2-1"), "2-1"),
+        (("all", *NAIVE, "--seeds", "1-2", "--seed", "4"), "--seed|--seeds"),
+        (("all", *NAIVE, *NAIVE), "naive|twice"),
+        (("all", *NAIVE, "--gains", "nowhere.yaml"), "nowhere.yaml"),
+        (("all", *NAIVE, "--seeds", "1", "--jobs", "0"), "--jobs is 0"),
+        (("all", *NAIVE, "--jobs", "2", "--gpus", "all"), "--jobs|--per-gpu"),
+        (("all", *NAIVE, "--gpus", "0,0"), "--gpus"),
+        (("all", *NAIVE, "--gpus", "all", "--device", "cpu"), "--gpus all"),
+        (("all", *NAIVE, "--per-gpu", "2", "--device", "cpu"), "--per-gpu|--jobs"),
+        (("all", *NAIVE, "--seeds", "1", "--gpu-ids", "0"), "--gpu-ids|--gpus"),
+        (("all", *NAIVE, "--seeds", "1", "--minutes", "3"), "--minutes"),
+        (("all", *NAIVE, "--seeds", "1", "--resume"), "--resume"),
+        (("all", *NAIVE, "--cluster", "http://x"), "--cluster 'http://x'|ray://HOST:PORT"),
+        (("all", *NAIVE, "--cluster", "local", "--jobs", "2"), "--cluster|--jobs"),
+        (("all", *NAIVE, "--seeds", "1", "--phase", "run=3"), "'run'"),
+        (("jump", *NAIVE, "--seeds", "1-2"), "--init-checkpoint"),
+        (("all", "--gains", str(GAINS), "--seeds", "1", "--ranges-from", "x"), "--ranges-from x"),
+    ],
+)
+def test_bad_input_to_several_trainings(
+    tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    pytest.importorskip("torch")
+    pytest.importorskip("mjlab")
+    out = tmp_path / "runs"
+    text = refused("train", *arguments, "--out", out)
+    for word in words.split("|"):
+        assert word in text, (word, text)
+    assert not out.exists()
+
+
+def test_the_words_of_a_training_give_its_settings_again(tmp_path: Path) -> None:
+    examples = (
+        TrainSettings(task="all", out=tmp_path, gains="naive", seed=4),
+        TrainSettings(
+            task="all", out=tmp_path, gains="g.yaml", draws=DrawSettings(ellipsoid=True), envs=8
+        ),
+        TrainSettings(
+            task="all",
+            out=tmp_path,
+            gains="g.yaml",
+            draws=DrawSettings(by_joint=True, weakest_drive=0.7),
+            recipe=Path("r.yaml"),
+        ),
+        TrainSettings(
+            task="all",
+            out=tmp_path,
+            gains="naive",
+            ranges_from=Path("a.yaml"),
+            phase=("walk=3", "jump_a=2"),
+            allow_unmatched=True,
+        ),
+        TrainSettings(task="jump", out=tmp_path, gains="naive", init_checkpoint=Path("walk.pt")),
+    )
+    for settings in examples:
+        completed = settings.completed()
+        values = parsed_command(training_words(completed))
+        stored = values["settings"].stored_values() | {"gains": values["gains"][0]}
+        assert stored == completed.stored_values()
+        assert len(values["gains"]) == 1
+
+
+def test_the_spread_over_seeds_leaves_out_what_is_missing() -> None:
+    runs = [{"reward": 1.0}, {"reward": None}, {"reward": 3.0}]
+    assert spread_over_seeds(runs, "reward") == {
+        "mean": 2.0,
+        "std": pytest.approx(2.0**0.5),
+        "min": 1.0,
+        "max": 3.0,
+        "n": 2,
+    }
+    assert spread_over_seeds([{"reward": None}], "reward")["mean"] is None
+
+
+def test_randomization_is_about_the_gains_that_are_trained_with() -> None:
+    gains = load_gains(GAINS)
+    robot = load_robot("mini_cheetah")
+    wide = RandomizationConfig(stiffness=0.3, damping=0.2)
+    matched = randomized_gains(gains, wide, None)
+    nominal = randomized_gains(gains, wide, robot)
+    for name, group in gains.groups.items():
+        assert matched.groups[name].stiffness == group.stiffness
+        assert matched.groups[name].stiffness_range == pytest.approx(0.3 * group.stiffness)
+        assert matched.groups[name].damping_range == pytest.approx(0.2 * group.damping)
+        joint = robot.group(name)[0]
+        assert nominal.groups[name].stiffness_range == pytest.approx(0.3 * joint.stiffness)
+    assert json.dumps(sorted(nominal.groups)) == json.dumps(sorted(gains.groups))

@@ -1,0 +1,145 @@
+"""Tasks of a study as processes of this host: order, failures, what is done, interruption."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pronk.errors import PronkError
+from pronk.jump.study.local import LocalExecutor
+from pronk.jump.study.schedule import run_tasks
+from pronk.jump.study.tasks import StudyState, copied_input, study_folder
+from study_cases import GAINS, Watched, export_task, finished, study_root
+
+
+def test_a_task_that_fails_is_started_once_more_and_named_while_others_go_on(
+    tmp_path: Path,
+) -> None:
+    root = study_root(tmp_path)
+    tasks = [
+        export_task("bad", "inputs/bad.yaml"),
+        export_task("good"),
+        export_task("behind good", needs=("good",)),
+        export_task("behind bad", needs=("bad",)),
+        export_task("far behind bad", needs=("behind bad",)),
+    ]
+    statuses = finished(tasks, LocalExecutor(root, cores=2.0), root)
+    assert {name: status.state for name, status in statuses.items()} == {
+        "bad": "failed",
+        "good": "done",
+        "behind good": "done",
+        "behind bad": "skipped",
+        "far behind bad": "skipped",
+    }
+    assert statuses["bad"].attempts == 2
+    assert "bad.yaml" in statuses["bad"].reason
+    log = (root / tasks[0].log()).read_text()
+    assert log.count("$ pronk export") == 2
+    record = StudyState(root).records["bad"]
+    assert (record.status, record.attempts) == ("failed", 2)
+
+
+def test_a_study_that_is_run_again_does_only_what_is_new(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    tasks = [export_task("first"), export_task("second", needs=("first",))]
+    assert finished(tasks, LocalExecutor(root, cores=2.0), root)["second"].state == "done"
+    stamp = (root / tasks[0].outputs[0]).stat().st_mtime_ns
+
+    tasks.append(export_task("third"))
+    states = [status.state for status in finished(tasks, LocalExecutor(root), root).values()]
+    assert states == ["kept", "kept", "done"]
+    assert (root / tasks[0].outputs[0]).stat().st_mtime_ns == stamp
+
+    # An output that was changed, one that is gone, an input that was changed: those run again.
+    (root / tasks[0].outputs[0]).write_text("changed")
+    (root / tasks[1].outputs[0]).unlink()
+    assert [StudyState(root).is_done(task) for task in tasks] == [False, False, True]
+    (root / "inputs" / "gains.yaml").write_bytes(GAINS.read_bytes() + b"# another\n")
+    states = [status.state for status in finished(tasks, LocalExecutor(root), root).values()]
+    assert states == ["done"] * 3
+
+
+def test_no_more_tasks_run_at_once_than_there_are_cores(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    for task_cores, at_once in ((0.5, 2), (8.0, 1)):
+        shutil.rmtree(root / "work", ignore_errors=True)
+        tasks = [export_task(str(number), cores=task_cores) for number in range(3)]
+        watched = Watched()
+        run_tasks(tasks, LocalExecutor(root, cores=1.0), root, report=watched)
+        assert watched.most_running == at_once
+        assert watched.last is not None
+        assert watched.last.count("done") == 3
+        assert watched.last.seconds_left == 0.0
+
+
+def test_a_command_that_ends_without_its_output_has_failed(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    task = export_task("short", outputs=("work/short/actuators.py", "work/short/policy.onnx"))
+    status = finished([task], LocalExecutor(root), root)["short"]
+    assert status.state == "failed"
+    assert "policy.onnx" in status.reason
+
+
+def test_an_interrupted_study_leaves_no_process_behind(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    # `simulate` runs until it is ended.
+    task = export_task("endless", command=("simulate", "--link", "lcm", "--robot", "mini_cheetah"))
+
+    def interrupt(progress: object) -> None:
+        if (root / task.log()).exists():
+            raise KeyboardInterrupt
+
+    executor = LocalExecutor(root)
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks([task], executor, root, report=interrupt)
+    assert executor.poll() == []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        assert str(os.getpid()).encode() not in words[2:5], words
+    assert StudyState(root).records["endless"].status == "started"
+
+
+def test_trainings_of_other_settings_are_not_mixed(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    task = export_task("run", kind="training", resume_marker="work/run/actuators.py")
+    finished([task], LocalExecutor(root), root)
+    other = export_task(
+        "run", kind="training", resume_marker="work/run/actuators.py", settings={"seed": 2}
+    )
+    with pytest.raises(PronkError, match="run was begun there with other settings"):
+        finished([other], LocalExecutor(root), root)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema": "x"}'])
+def test_a_damaged_state_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "state.json").write_text(content)
+    with pytest.raises(PronkError, match=r"state\.json"):
+        StudyState(tmp_path)
+
+
+def test_inputs_are_named_by_their_content(tmp_path: Path) -> None:
+    first = copied_input(tmp_path, GAINS, "gains")
+    assert copied_input(tmp_path, GAINS, "gains") == first
+    other = tmp_path / "other.yaml"
+    other.write_bytes(GAINS.read_bytes() + b"\n")
+    assert copied_input(tmp_path, other, "gains") != first
+    assert (tmp_path / first).read_bytes() == GAINS.read_bytes()
+    with pytest.raises(PronkError, match=r"nowhere\.yaml"):
+        copied_input(tmp_path, tmp_path / "nowhere.yaml", "gains")
+
+
+def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("kept")
+    with pytest.raises(PronkError, match=r"notes\.txt"), study_folder(tmp_path):
+        pass
+    with pytest.raises(PronkError, match="a file"), study_folder(tmp_path / "notes.txt"):
+        pass
+    root = tmp_path / "new"
+    with study_folder(root), pytest.raises(PronkError, match="another command"), study_folder(root):
+        pass

@@ -1,0 +1,124 @@
+"""A study on a Ray cluster of two nodes, one of them killed; trials as on one host."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+ray = pytest.importorskip("ray")
+from ray.cluster_utils import Cluster
+
+import pronk
+from pronk.jump.study.config import load_study
+from pronk.jump.study.local import LocalExecutor
+from pronk.jump.study.ray_cluster import ray_executor
+from pronk.jump.study.schedule import StudyProgress, run_tasks
+from pronk.jump.study.study import collect_results, plan_study, study_tasks
+from pronk.jump.study.trainings import TrainingArm, TrainingPlace
+from pronk.jump.train.settings import SessionSettings, TrainSettings
+from study_cases import cell_files, export_task, finished, study_root, write_study
+
+pytestmark = [pytest.mark.train, pytest.mark.xdist_group("ray")]
+
+SETTINGS = TrainSettings(
+    task="all",
+    out=Path("trainings"),
+    gains="naive",
+    envs=4,
+    phase=("walk=2", "jump_a=1", "jump_b=1"),
+    session=SessionSettings(save_interval=1),
+)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one core each, the first of them the head."""
+    source = str(Path(pronk.__file__).resolve().parents[1])
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "0")
+    monkeypatch.setenv("RAY_DISABLE_IMPORT_WARNING", "1")
+    nodes = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 1, "include_dashboard": False},
+    )
+    nodes.second = nodes.add_node(num_cpus=1)
+    try:
+        yield nodes
+    finally:
+        ray.shutdown()
+        nodes.shutdown()
+
+
+class NodeKiller:
+    """Kills the second node when both trainings have a checkpoint at home."""
+
+    def __init__(self, root: Path, cluster: Any) -> None:
+        self.root = root
+        self.cluster = cluster
+        self.checkpoints: list[str] = []
+        self.attempts = 0
+
+    def __call__(self, progress: StudyProgress) -> None:
+        for status in progress.tasks:
+            self.attempts = max(self.attempts, status.attempts)
+        folders = {path.parent.name for path in self.root.rglob("model_*.pt")}
+        if self.checkpoints or folders != {"seed-1", "seed-2"}:
+            return
+        self.checkpoints = sorted(folders)
+        self.cluster.remove_node(self.cluster.second, allow_graceful=False)
+
+
+def test_a_study_survives_the_loss_of_a_node(cluster: Any, tmp_path: Path) -> None:
+    path = write_study(tmp_path / "study.yaml", seeds="1-2", arms={"nominal": {"gains": "naive"}})
+    arm = TrainingArm(name="nominal", settings=SETTINGS.completed())
+    plan = plan_study(load_study(path), tmp_path, {"nominal": arm})
+    root = tmp_path / "out"
+    tasks = study_tasks(plan, root, TrainingPlace(device="cpu"))
+    killer = NodeKiller(root, cluster)
+    with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
+        statuses = run_tasks(tasks, executor, root, report=killer)
+    assert killer.checkpoints, "the node was not killed in flight"
+    assert killer.attempts == 2
+    assert {status.state for status in statuses.values()} == {"done"}
+    sessions = []
+    for seed in (1, 2):
+        folder = root / "trainings" / "nominal" / f"seed-{seed}"
+        record = json.loads((folder / "provenance.json").read_text())
+        assert record["finished"]
+        assert record["settings"]["seed"] == seed
+        sessions.append(len(record["sessions"]))
+    # The one that was lost went on from the checkpoint that was at home.
+    assert sorted(sessions) == [1, 2]
+    assert not collect_results(plan, root, statuses).missing
+
+    # The same policies on one host, without Ray: the same jumps to the last digit.
+    policies = []
+    for seed in (1, 2):
+        policies.append(str(root / "trainings" / "nominal" / f"seed-{seed}" / "policy.onnx"))
+    path = write_study(tmp_path / "local.yaml", arms={"nominal": {"policies": policies}})
+    local_plan = plan_study(load_study(path), tmp_path, {})
+    local_root = tmp_path / "local"
+    local_tasks = study_tasks(local_plan, local_root, TrainingPlace(device="cpu"))
+    finished(local_tasks, LocalExecutor(local_root, cores=2.0), local_root)
+    assert cell_files(local_root) == cell_files(root)
+
+
+def test_failures_on_nodes_are_named_with_their_log(cluster: Any, tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    tasks = [export_task("bad", "inputs/bad.yaml"), export_task("good")]
+    with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
+        statuses = finished(tasks, executor, root)
+    assert {name: status.state for name, status in statuses.items()} == {
+        "bad": "failed",
+        "good": "done",
+    }
+    assert "bad.yaml" in statuses["bad"].reason
+    assert (root / tasks[0].log()).exists()
+    assert (root / tasks[1].outputs[0]).exists()
