@@ -28,7 +28,7 @@ from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.deploy_yaml import read_deploy_yaml
-from pronk.policy.foreign import ForeignPolicy, load_network, run_foreign
+from pronk.policy.foreign import ForeignPolicy, load_foreign_network, run_foreign
 from pronk.policy.rollout import projected_gravity
 from pronk.policy.script import Velocity
 from pronk.robots import load_robot
@@ -49,7 +49,7 @@ PATIENT = Freshness(share=0.02, longest_gap_s=10.0)
 
 def policy_of(name: str) -> ForeignPolicy:
     deploy = read_deploy_yaml(FOLDER / name / "deploy.yaml")
-    return ForeignPolicy(load_network(FOLDER / name / "policy.onnx", deploy), deploy)
+    return ForeignPolicy(load_foreign_network(FOLDER / name / "policy.onnx", deploy), deploy)
 
 
 @needs_policies

@@ -74,7 +74,7 @@ def policy(
     )
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.policy.deploy_yaml import read_deploy_yaml
-    from pronk.policy.foreign import ForeignPolicy, deploy_problems, load_network
+    from pronk.policy.foreign import ForeignPolicy, deploy_problems, load_foreign_network
     from pronk.policy.script import parse_velocity
     from pronk.robots import load_robot
 
@@ -84,7 +84,7 @@ def policy(
     robot_spec = load_robot(robot)
     deploy_file = read_deploy_yaml(deploy)
     problems = deploy_problems(deploy_file, robot_spec)
-    network = load_network(path, deploy_file)
+    network = load_foreign_network(path, deploy_file)
     params = load_sim_params(sim_params, robot_spec)
 
     def run(changed: DeployFile) -> ForeignRun:

@@ -149,7 +149,7 @@ class ForeignPolicy:
         return relative
 
 
-def load_network(path: Path, deploy: DeployFile) -> Callable[[Array], Array]:
+def load_foreign_network(path: Path, deploy: DeployFile) -> Callable[[Array], Array]:
     """Open the network of a policy that was trained elsewhere.
 
     Args:
