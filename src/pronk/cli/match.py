@@ -247,7 +247,7 @@ def export_target(result: MatchResult) -> str | None:
     return "mjcf"
 
 
-WITHOUT_RECORDING = {
+REMEDIES = {
     "armature": "set armature of {joints} in {robot}: the rotor inertia of the motor times the "
     "gear ratio squared. Where no data sheet has it, the same command with --mode drive fits it, "
     "if the stiffness on the drive is known. Then match the same log again",
@@ -255,11 +255,13 @@ WITHOUT_RECORDING = {
     "give --simulator isaaclab-implicit, and match the same log again",
     "pose": "check the joint order of the file (--joint-order), the signs and how the base hangs, "
     "for {joints}, and match the same log again",
+    "effort limit": "record {joints} again with the smaller amplitude that its flag names, or "
+    "correct the torque limits in {robot}",
     "compliance": "lower the upper end of band_hz of {joints} in {robot} below the resonance, and "
     "match the same log again",
 }
-"""What to do about a joint that is no match for a reason that another recording does not mend, by
-the first word of the reason."""
+"""What to do about a joint that is no match where the same motion recorded again would be none
+either, by the first words of one of its flags."""
 
 
 def unmatched_commands(result: MatchResult) -> list[str]:
@@ -268,12 +270,15 @@ def unmatched_commands(result: MatchResult) -> list[str]:
     Args:
         result: The match.
     """
+    from pronk.identify.match.result import NO_MATCH
+
     joints_by_remedy: dict[str, list[str]] = {}
-    for name, reasons in result.gains.unmatched.items():
+    for name in result.gains.unmatched:
+        flags = [flag.removeprefix(NO_MATCH) for flag in result.gains.joints[name].flags]
         remedy = "record"
-        for word in WITHOUT_RECORDING:
-            if any(reason.startswith(f"{word}: ") for reason in reasons):
-                remedy = word
+        for words in REMEDIES:
+            if any(flag.startswith(f"{words}: ") for flag in flags):
+                remedy = words
                 break
         joints_by_remedy.setdefault(remedy, []).append(name)
     robot = result.robot_path or f"the robot's file of {result.robot}"
@@ -285,7 +290,7 @@ def unmatched_commands(result: MatchResult) -> list[str]:
         if remedy == "record":
             lines.append(f"record {joints} again")
         else:
-            lines.append(WITHOUT_RECORDING[remedy].format(joints=joints, robot=robot))
+            lines.append(REMEDIES[remedy].format(joints=joints, robot=robot))
     lines[-1] += "; --allow-unmatched exports these gains all the same"
     return lines
 
