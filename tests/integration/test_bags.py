@@ -162,7 +162,7 @@ def test_names_of_the_maker_and_stated_names_become_the_robots(tmp_path: Path) -
     assert_elbow(log, joint="FL_knee")
     assert any("FL_calf_joint" in note for note in log.notes)
     other = write_bag(tmp_path / "other", commanded(("k", "FL_thigh_joint", "fl_hip")))
-    with pytest.raises(PronkError, match="--joint-names THEIRS=OURS"):
+    with pytest.raises(PronkError, match="--joint-names "):
         read(other, GO2)
     assert read(other, GO2, joint_names={"k": "FL_knee"}).joints == log.joints
 

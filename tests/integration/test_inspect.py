@@ -201,6 +201,35 @@ def test_joints_are_those_of_the_robot_or_asked(tmp_path: Path) -> None:
     named = guess(other, GO2, joint_names={"k": "RR_knee"})
     assert named.log is not None
     assert named.log.joints == ("RR_knee",)
+
+
+def test_unknown_joints_are_asked_at_once_with_an_option_that_is_read(tmp_path: Path) -> None:
+    columns = {"t": TIME}
+    for motor in ("m1", "m2", "m3"):
+        columns[f"{motor}_target"] = COMMAND
+        columns[f"{motor}_angle"] = POSITION
+    path = table(tmp_path / "motors.csv", columns)
+    questions = [question for question in guess(path, GO2).questions if "--joint-names" in question]
+    assert len(questions) == 1
+    example = questions[0].split("--joint-names ")[1].split()[0]
+    said = accepted(
+        *(
+            "log",
+            "inspect",
+            path,
+            "--robot",
+            "go2",
+            "--unit",
+            "rad",
+            "--joint-names",
+            example,
+            "--yes",
+        )
+    )
+    assert "wrote" in said
+    log = read_log(path, robot=GO2)
+    assert len(set(log.joints)) == 3
+    assert set(log.joints) <= set(GO2.joint_names)
     # A range of the robot rules radians out.
     far = table(
         tmp_path / "c.csv",

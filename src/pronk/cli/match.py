@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -150,8 +150,11 @@ def match_command(
     figures = summary(result)
     # Where frameworks are named, their gains are wanted, and those of the simulator are an extra.
     named_first = [*frameworks, simulator]
+    common_flags = flags_of_all(results.values()) if frameworks else set()
     for name in named_first:
-        print_summary(results[name], name if frameworks else "")
+        print_summary(results[name], name if frameworks else "", common_flags)
+    for joint_name, flag in sorted(common_flags):
+        console.say(f"{joint_name}: {flag}")
     for note in result.notes:
         console.say(f"note: {note}")
     for name in frameworks or (simulator,):
@@ -319,15 +322,34 @@ def has_compared_responses(result: MatchResult) -> bool:
     return any(joint.responses is not None for joint in result.joints.values())
 
 
-def print_summary(result: MatchResult, framework: str = "") -> None:
+def warnings_of(result: MatchResult) -> list[tuple[str, str]]:
+    """Return the flags of a match, each with its joint, but for those of joints that are none."""
+    from pronk.identify.match.result import NO_MATCH
+
+    pairs = []
+    for name, flags in result.flags.items():
+        for flag in flags:
+            if not flag.startswith(NO_MATCH):
+                pairs.append((name, flag))
+    return pairs
+
+
+def flags_of_all(results: Iterable[MatchResult]) -> set[tuple[str, str]]:
+    """Return the flags that several matches of the same logs have in common."""
+    flag_sets = [set(warnings_of(result)) for result in results]
+    return set.intersection(*flag_sets)
+
+
+def print_summary(
+    result: MatchResult, framework: str = "", printed_elsewhere: Set[tuple[str, str]] = frozenset()
+) -> None:
     """Print how many joints were matched, the errors, and every flag.
 
     Args:
         result: The match.
         framework: What it was matched for, where there are several.
+        printed_elsewhere: Joints and flags that are left out.
     """
-    from pronk.identify.match.result import NO_MATCH
-
     begin = f"{framework}: " if framework else ""
     matched = len(result.matched_joints)
     count = len(result.joints)
@@ -343,10 +365,12 @@ def print_summary(result: MatchResult, framework: str = "") -> None:
         console.say(f"{begin}{matched} of {count} joints matched.")
     for name, reasons in result.gains.unmatched.items():
         console.say(f"{begin}{name} is no match: {'; '.join(reasons)}")
-    for name, flags in result.flags.items():
-        warnings = [flag for flag in flags if not flag.startswith(NO_MATCH)]
-        if warnings:
-            console.say(f"{begin}{name}: {'; '.join(warnings)}")
+    warnings_by_joint: dict[str, list[str]] = {}
+    for name, flag in warnings_of(result):
+        if (name, flag) not in printed_elsewhere:
+            warnings_by_joint.setdefault(name, []).append(flag)
+    for name, warnings in warnings_by_joint.items():
+        console.say(f"{begin}{name}: {'; '.join(warnings)}")
 
 
 def summary(result: MatchResult) -> dict[str, Any]:

@@ -449,6 +449,7 @@ def _names_of_joints(
     if robot is None:
         return names
     matched = robot_names(joints, robot)
+    unknown = []
     for joint in joints:
         if joint in stated or names[joint] in robot.joint_names:
             continue
@@ -457,13 +458,26 @@ def _names_of_joints(
         elif len(robot.joints) == 1 and len(joints) == 1:
             names[joint] = robot.joint_names[0]
         else:
-            similar = [name for name in robot.joint_names if joint.casefold() in name.casefold()]
-            choices = ", ".join(similar or robot.joint_names)
-            questions.append(
-                f"{joint!r} is no joint of {robot.name}; give --joint-names {joint}=NAME (one of "
-                f"{choices})"
-            )
+            unknown.append(joint)
+    if unknown:
+        questions.append(_naming_question(unknown, names, robot))
     return names
+
+
+def _naming_question(unknown: Sequence[str], names: Mapping[str, str], robot: RobotSpec) -> str:
+    """Ask which joints of the robot some joints of a log are, with an example to correct."""
+    free = [name for name in robot.joint_names if name not in names.values()]
+    pairs = []
+    for joint in unknown:
+        similar = [name for name in free if joint.casefold() in name.casefold()]
+        choice = (similar or free or ["NAME"])[0]
+        if choice in free:
+            free.remove(choice)
+        pairs.append(f"{joint}={choice}")
+    return (
+        f"{', '.join(unknown)}: no joint of {robot.name}, which has "
+        f"{', '.join(robot.joint_names)}; say which is which, as in --joint-names {','.join(pairs)}"
+    )
 
 
 # --- Units --------------------------------------------------------------------------------------
