@@ -15,6 +15,7 @@ none. A log counts as
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -53,16 +54,23 @@ HEADS = {
 """Words before the first colon of a flag, and the cause that they name."""
 REFUSALS = {
     "degree": "degrees",
+    "degrees": "degrees",
     "sign": "sign",
     "another joint": "wrong joint",
     "does not move": "standstill",
     "stands still": "standstill",
+    "excites only": "single sine",
     "time": "clock",
+    "timestamp": "clock",
+    "timestamps": "clock",
     "gap": "lost rows",
+    "gaps": "lost rows",
     "rows are missing": "lost rows",
     "jump": "reset",
+    "jumps": "reset",
 }
-"""Words of a refusal, in lower case, and the cause that they name."""
+"""Whole words of a refusal, in lower case, and the cause that they name; those that come first in
+it count. So a position that is so many "times" the command says nothing about time."""
 Change = Callable[[LogCase, np.random.Generator], LogCase]
 
 
@@ -358,8 +366,9 @@ def named_causes(flags: Sequence[str], refusal: str) -> set[str]:
         text = refusal.lower().split(f"{NAME}: ")[-1]
         first = {}
         for words, cause in REFUSALS.items():
-            if words in text:
-                first[text.index(words)] = cause
+            found = re.search(rf"\b{words}\b", text)
+            if found is not None:
+                first[found.start()] = cause
         if first:
             named.add(first[min(first)])
     return named

@@ -219,9 +219,11 @@ def peaks(
         actuator = spec.add_actuator(
             name=f"drive of {name}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
+        # The model's defaults may have other ranges, gears, dynamics, and a constant force.
+        actuator.biasprm = [0.0] * len(actuator.biasprm)
+        actuator.gainprm = [0.0] * len(actuator.gainprm)
         actuator.set_to_position(kp=held.stiffness, kv=held.damping)
         actuator.forcerange = [-held.effort_limit, held.effort_limit]
-        # The model's defaults may have other ranges, gears and dynamics.
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE

@@ -134,6 +134,14 @@ def test_causes_are_named_by_heads_and_not_by_lists() -> None:
     assert named_causes(["no match: compliance: a spring"], "") == {"compliance"}
     assert named_causes(["no match: 6 dB. So would look: backlash, a payload"], "") == set()
     assert named_causes([], "log.csv: joint: a sign is flipped: negate it") == {"sign"}
+    # A factor says nothing about the clock.
+    scaled = "log.csv: joint: the position is 59.1 times the command; degrees are read as radians"
+    assert named_causes([], scaled) == {"degrees"}
+    assert named_causes([], "log.csv: the position is 3 times the command") == set()
+    sine = "log.csv: the command excites only 0.4 Hz (there the position is 1.2 times the command)"
+    assert verdict(FAULT["single sine"], [], sine) == "right"
+    assert verdict(FAULT["compliance"], [], sine) == "wrong"
+    assert named_causes([], "log.csv: time goes back in row 3") == {"clock"}
     assert verdict(FAULT["compliance"], ["no match: 6 dB"], "") == "none"
     assert verdict(FAULT["compliance"], ["backlash: 2 degrees"], "") == "wrong"
     assert verdict(FAULT["compliance"], [], "") == "silent"
