@@ -507,9 +507,9 @@ def test_a_urdf_needs_no_meshes_and_its_limits_are_used(tmp_path: Path) -> None:
     assert joint.range == (-1.0, 2.0)
     assert joint.drive.effort_limit == 9.0
     assert joint.drive.no_load_speed == 3.1
-    # The lower link about its end, and camera and finger at the axis.
-    inertia = 0.004 + 0.8 * 0.2**2 + 0.4 * 0.01 * 0.01**2 + 1e-4
-    assert bench_inertia(robot, "elbow")[0] == pytest.approx(inertia, rel=1e-6)
+    # The lower link about its end, the camera at the axis, and the finger, turning twice as far.
+    inertia = 0.004 + 0.8 * 0.2**2 + 0.4 * 0.01 * 0.01**2 + 2.0**2 * 1e-4
+    assert bench_inertia(robot, "elbow")[0] == pytest.approx(inertia, rel=1e-4)
     content = yaml.safe_load(file.read_text())
     content["drives"]["elbow"]["effort_limit"] = 20.0
     content["drives"]["elbow"]["no_load_speed"] = 1.0
@@ -665,3 +665,152 @@ def test_assumed_gains_are_stiffer_than_a_spring_of_the_joint(tmp_path: Path) ->
     path = tmp_path / "arm.xml"
     path.write_text(REACHING.format(spring=30).replace('"-9 9"', '"-90 90"'))
     assert load_robot(path).joint("shoulder").stiffness >= 60.0
+
+
+FINGER = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="base">
+      <geom type="sphere" size="0.02" mass="1"/>
+      <body name="proximal">
+        <joint name="bend" axis="0 1 0" range="-1 1" armature="{armature}" damping="0.02"
+          frictionloss="0.01"/>
+        <inertial pos="0.03 0 0" mass="0.2" diaginertia="2e-4 2e-4 2e-4"/>
+        <body name="distal" pos="0.06 0 0">
+          <joint name="tip" axis="0 1 0" damping="0.04" frictionloss="0.02"/>
+          <inertial pos="0.02 0 0" mass="0.1" diaginertia="5e-5 5e-5 5e-5"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="cable"{spring}><joint joint="bend" coef="1"/><joint joint="tip" coef="{coef}"/>
+    </fixed>
+  </tendon>
+  {relations}
+  <actuator><position joint="bend" kp="5" kv="0.2" forcerange="-5 5"/></actuator>
+</mujoco>
+"""
+COUPLINGS = {
+    "joint": '<equality><joint joint1="tip" joint2="bend" polycoef="0 0.5 0 0 0"/></equality>',
+    "tendon": '<equality><tendon tendon1="cable"/></equality>',
+}
+
+
+def finger(folder: Path, relations: str, *, spring: str = "", armature: float = 1e-3) -> Path:
+    path = folder / "finger.xml"
+    path.write_text(FINGER.format(relations=relations, spring=spring, armature=armature, coef="-2"))
+    return path
+
+
+@pytest.mark.parametrize("kind", COUPLINGS)
+def test_what_follows_a_hinge_is_reflected_to_it(kind: str, tmp_path: Path) -> None:
+    """By the acceleration that MuJoCo itself gives the coupled finger, and by the ratio."""
+    path = finger(tmp_path, COUPLINGS[kind])
+    accepted("robot", "new", path)
+    robot = load_robot(tmp_path / "robot.yaml")
+    assert robot.held_joints == ("tip",)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.eq_solref[:] = (2e-3, 1.0)
+    model.eq_solimp[:, :2] = 0.9999
+    model.dof_damping[:] = 0.0
+    model.dof_frictionloss[:] = 0.0
+    data = mujoco.MjData(model)
+    data.qfrc_applied[0] = 1e-3
+    mujoco.mj_forward(model, data)
+    assert data.qacc[1] == pytest.approx(0.5 * data.qacc[0], rel=0.01)
+    inertia, _ = bench_inertia(robot, "bend")
+    assert inertia == pytest.approx(1e-3 / data.qacc[0], rel=0.01)
+    drive = robot.joint("bend").drive
+    assert drive.viscous_damping == pytest.approx(0.02 + 0.25 * 0.04)
+    assert drive.frictionloss == pytest.approx(0.01 + 0.5 * 0.02)
+    text = (tmp_path / "robot.yaml").read_text()
+    assert any("tip" in line and "bend" in line for line in text.splitlines() if "CHECK" in line)
+
+
+def test_a_mimic_of_a_urdf_is_reflected_to_its_leader(tmp_path: Path) -> None:
+    """The finger of the arm turns with the elbow, by two radians for one."""
+    path = urdf(tmp_path)
+    robot = load_robot(str(path))
+    lower = 0.004 + 0.8 * 0.2**2 + 0.4 * 0.01 * 0.01**2
+    assert bench_inertia(robot, "elbow")[0] == pytest.approx(lower + 4.0 * 1e-4, rel=1e-4)
+    text = path.read_text().replace('<mimic joint="elbow"/>', '<mimic joint="elbow" {}/>')
+    path.write_text(text.format('multiplier="-1"'))
+    description = describe_model(path)
+    # The finger keeps its direction; it adds nothing, and no armature takes away what it has.
+    assert description.file.drives["elbow"].armature == 0.0
+
+
+@pytest.mark.parametrize(
+    ("spring", "word"),
+    [
+        (' stiffness="3"', "3 N m/rad"),
+        (' damping="0.1"', "damp"),
+        (' frictionloss="0.1"', "friction"),
+        (' limited="true" range="-1 1"', "limits"),
+        ("", ""),
+    ],
+)
+def test_what_tendons_do_to_a_driven_hinge_is_said(spring: str, word: str, tmp_path: Path) -> None:
+    notes = describe_model(finger(tmp_path, "", spring=spring)).notes
+    about_tendons = [note for note in notes if "tendon" in note]
+    assert len(about_tendons) == (1 if word else 0)
+    for note in about_tendons:
+        assert word in note
+        assert "bend" in note
+
+
+def test_a_coupling_of_two_drives_is_said(tmp_path: Path) -> None:
+    path = finger(tmp_path, COUPLINGS["tendon"])
+    second = '<position joint="tip" kp="5" kv="0.2" forcerange="-5 5"/></actuator>'
+    path.write_text(path.read_text().replace("</actuator>", second))
+    description = describe_model(path)
+    assert set(description.file.drives) == {"bend", "tip"}
+    assert description.file.drives["bend"].armature == pytest.approx(1e-3)
+    assert any("bend" in note and "drives" in note for note in description.notes)
+
+
+def test_servos_whose_control_is_no_angle_are_named(tmp_path: Path) -> None:
+    servo = (
+        '<general joint="j" biastype="affine" gainprm="{gain}" biasprm="{force} -60 -2" '
+        'forcerange="-7 7"/>'
+    )
+    text = ACTUATED.format(actuators=servo, joint="", tendon="")
+    path = tmp_path / "actuated.xml"
+    for gain, force, is_named in ((60, 0, False), (45, 0, True), (60, 0.75, True)):
+        path.write_text(text.replace("{gain}", str(gain)).replace("{force}", str(force)))
+        notes = describe_model(path).notes
+        assert any("no angles" in note for note in notes) == is_named
+
+
+@pytest.mark.parametrize(
+    ("joint", "word"), [("shut", "range"), ("loose", "actuator"), ("lift", "slide")]
+)
+def test_why_a_joint_is_held_is_said_when_it_is_asked_for(
+    joint: str, word: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "held.xml"
+    body = ""
+    for name, attributes in (
+        ("bend", 'range="-1 1"'),
+        ("shut", 'range="-0.005 0.005"'),
+        ("loose", 'range="-1 1"'),
+        ("lift", 'type="slide" range="0 1"'),
+    ):
+        body = (
+            f'<body name="{name} link"><joint name="{name}" axis="0 1 0" {attributes}/>'
+            f'<inertial pos=".1 0 0" mass="1" diaginertia=".01 .01 .01"/>{body}</body>'
+        )
+    servos = ""
+    for name in ("bend", "shut", "lift"):
+        servos += f'<position joint="{name}" kp="50" kv="1" forcerange="-90 90"/>'
+    path.write_text(
+        '<mujoco><compiler angle="radian" autolimits="true"/><option gravity="0 0 0"/>'
+        f"<worldbody>{body}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+    robot = load_robot(str(path))
+    assert robot.joint_names == ("bend",)
+    with pytest.raises(RobotError, match=word):
+        robot.joint(joint)

@@ -290,3 +290,43 @@ def test_where_a_held_joint_rests_is_no_effect_of_the_excitation(tmp_path: Path)
     assert held_at_stop.range[1] == 2.5
     farther = replace(held_at_stop, lowest=held_at_stop.range[0] - 1e-3)
     assert "below its range" in next(farther.breaches())
+
+
+def with_drive(robot: RobotSpec, **drive: float) -> RobotSpec:
+    """Return the robot with other numbers of its drives."""
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, **drive)))
+    return replace(robot, joints=tuple(joints))
+
+
+def test_a_plan_leaves_room_below_the_no_load_speed(tmp_path: Path) -> None:
+    """A sweep ends where a measured speed, which has noise, exceeds it."""
+    size = replace(SIZES["servo"], effort_limit=100.0)
+    robot = with_drive(sized_robot(size, tmp_path), no_load_speed=1.0, stall_torque=1e4)
+    plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.25,), repeats=1)
+    fitting = plan.fitting_amplitude(JOINT)
+    (row,) = make_plan(robot, [JOINT], SHORT, amplitudes=(fitting,), repeats=1).rows()
+    assert 0.85 < float(row["speed_rad_s"]) < 0.96
+
+
+def test_a_joint_that_nothing_damps_is_refused_with_the_cause(tmp_path: Path) -> None:
+    undamped = Size(mass=0.06, length=0.1, stiffness=8.0, damping=0.0, effort_limit=20.0)
+    robot = with_range(sized_robot(undamped, tmp_path), JOINT, 0.288, 0.312)
+    plan = make_plan(robot, [JOINT], SHORT, amplitudes=(0.25,), repeats=1)
+    with pytest.raises(PlanError, match="damp"):
+        plan.check()
+    damped = replace(undamped, damping=0.12)
+    robot = with_range(sized_robot(damped, tmp_path), JOINT, 0.288, 0.312)
+    with pytest.raises(PlanError, match="rad fits") as caught:
+        make_plan(robot, [JOINT], SHORT, amplitudes=(0.25,), repeats=1).check()
+    assert "damp" not in str(caught.value)
+
+
+def test_a_plan_that_dry_friction_stops_is_warned_of(tmp_path: Path) -> None:
+    size = replace(SIZES["servo"], frictionloss=0.2, effort_limit=30.0)
+    robot = sized_robot(size, tmp_path)
+    for amplitude, count in ((0.25, 0), (0.04, 1)):
+        plan = make_plan(robot, [JOINT], SHORT, amplitudes=(amplitude,), repeats=1)
+        plan.check()
+        assert len(plan.warnings()) == count

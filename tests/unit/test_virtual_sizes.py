@@ -147,3 +147,84 @@ def test_a_light_link_on_a_motor_of_a_large_joint_is_stable_at_the_bus_voltage(
     positions = np.array([state.position for state in rest])
     assert np.abs(positions.mean(axis=0) - target).max() < 0.25
     assert np.std(positions, axis=0).max() < 5e-3
+
+
+SPRING = """\
+<mujoco model="spring">
+  <worldbody>
+    <body name="link">
+      <inertial pos="0 0 0" mass="1" diaginertia="0.05 0.05 0.05"/>
+      <joint name="bend" axis="0 1 0" range="-90 90" limited="true" stiffness="20" damping="0.5"
+        armature="0.01" springref="0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="bend" kp="40" kv="2" forcerange="-40 40"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_a_spring_of_the_models_joint_stays_with_the_virtual_robot(tmp_path: Path) -> None:
+    """Of a command that stands still a joint on a spring takes k / (k + k_spring)."""
+    path = tmp_path / "spring.xml"
+    path.write_text(SPRING)
+    robot = load_robot(str(path))
+    params = load_sim_params(None, robot)
+    machine = VirtualRobot(robot, exact(params))
+    machine.connect()
+    hold = hold_of(robot)
+    machine.send(replace(hold, position=np.array([0.3])))
+    states = machine.wait(3.0)[-100:]
+    stiffness = 40.0 * params.joints["bend"].torque_scale
+    position = np.mean([state.position[0] for state in states])
+    assert position == pytest.approx(0.3 * stiffness / (stiffness + 20.0), abs=0.004)
+    # A fixture holds the link against its spring, and releases it.
+    machine.clamp(("bend",))
+    machine.send(replace(hold, position=np.array([0.0])))
+    clamped = np.mean([state.position[0] for state in machine.wait(4.0)[-100:]])
+    assert clamped == pytest.approx(position, abs=0.01)
+    machine.clamp(())
+    released = np.mean([state.position[0] for state in machine.wait(6.0)[-100:]])
+    assert released == pytest.approx(0.0, abs=0.004)
+
+
+# Arms as URDFs state them: a large motor, a low speed limit, and no rotor.
+ARMS = {
+    "shoulder": Size(mass=4.0, length=0.28, stiffness=345.0, damping=21.0, effort_limit=330.0),
+    "hobby servo": Size(mass=0.05, length=0.4, stiffness=1.77, damping=0.131, effort_limit=30.0),
+}
+
+
+@pytest.mark.parametrize(("name", "speed"), [("shoulder", 2.16), ("hobby servo", 1.0)])
+def test_a_sweep_that_fits_the_plan_does_not_end_at_the_speed_limit(
+    name: str, speed: float, tmp_path: Path
+) -> None:
+    robot = sized_robot(ARMS[name], tmp_path)
+    joints = []
+    for joint in robot.joints:
+        joints.append(replace(joint, drive=replace(joint.drive, no_load_speed=speed)))
+    robot = replace(robot, joints=tuple(joints))
+    signal = Chirp(length_s=6.0, start_hz=1.0, stop_hz=10.0)
+    plan = make_plan(robot, [JOINT], signal, amplitudes=(0.25,), repeats=1)
+    amplitude = plan.fitting_amplitude(JOINT)
+    assert amplitude < 0.25
+    machine = VirtualRobot(robot, load_sim_params(None, robot))
+    machine.connect()
+    hold = hold_of(robot)
+    speeds = []
+    for tick, offset in enumerate(replace(signal, amplitude=amplitude).samples(50.0)):
+        machine.send(replace(hold, position=np.array(hold.position) + offset))
+        for state in machine.wait((tick + 1) / 50.0):
+            speeds.append(abs(float(state.velocity[0])))
+    assert 0.6 * speed < max(speeds) < speed
+
+
+@pytest.mark.parametrize("stiffness", [2.5e-11, 0.05, 9000.0])
+def test_friction_leaves_a_small_sweep_to_the_drive(stiffness: float, tmp_path: Path) -> None:
+    """Dry friction that no file states is a few percent of the torque of 0.04 rad."""
+    size = Size(mass=0.02, length=0.05, stiffness=stiffness, damping=0.0, effort_limit=1e4)
+    robot = sized_robot(size, tmp_path)
+    joint = load_sim_params(None, robot).joints[JOINT]
+    assert 0.0 < joint.breakaway <= 0.05 * 0.04 * stiffness
+    assert joint.presliding_stiffness > 0.0

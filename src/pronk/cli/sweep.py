@@ -97,6 +97,8 @@ def sweep(
         report("forecast", 1.0)
     console.show(plan_table(plan), wide=wide)
     plan.check()
+    for sentence in plan.warnings():
+        console.warn(sentence)
     figures: dict[str, Any] = {
         "robot": spec.name,
         "link": str(address),

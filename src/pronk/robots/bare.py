@@ -19,6 +19,8 @@ import yaml
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
+from pronk.robots.couplings import Followers, couplings_of
+from pronk.robots.held_reasons import held_reasons
 from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, HeldPosition, RobotFile
 from pronk.robots.servos import JointServo, joint_servos
 from pronk.robots.source_model import SourceModel, read_source
@@ -46,8 +48,6 @@ RELIEF_ROUNDS = 2
 """Times each joint is turned to relieve the drives of gravity."""
 RELIEF_ANGLES = 9
 """Angles at which each is tried."""
-SMALLEST_RANGE = 0.02
-"""Range of a hinge below which it is held: a sweep has no room [rad]."""
 STOP_DISTANCE = 0.4
 """Distance of the pose from a stop, for a sweep of 0.25 rad and its overshoot [rad]."""
 STOP_SHARE = 0.4
@@ -115,7 +115,7 @@ def describe_model(path: Path) -> ModelDescription:
         )
     qpos, moves = _default_pose(source)
     servos = joint_servos(model, qpos)
-    held_joints = _held_joints(source, servos)
+    held_joints = held_reasons(source, servos)
     hinges = [index for index in source.hinges if source.joint_names[index] not in held_joints]
     if not hinges:
         raise RobotError(
@@ -129,7 +129,10 @@ def describe_model(path: Path) -> ModelDescription:
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     gravity = np.abs(data.qfrc_bias - data.qfrc_passive)
+    couplings = couplings_of(source, hinges, held_joints, qpos)
+    notes = [*source.notes, *couplings.notes]
 
+    scaled = []
     drives = {}
     groups = {}
     pose = {}
@@ -144,8 +147,10 @@ def describe_model(path: Path) -> ModelDescription:
                 "positive number. Check its axis and the masses behind it."
             )
         servo = servos[hinge]
+        if servo.control_scale:
+            scaled.append(servo.control_scale)
         group, drive, joint_remarks = _joint_entries(
-            source, hinge, servo, inertia, float(gravity[dof])
+            source, hinge, servo, inertia, float(gravity[dof]), couplings.followers.get(hinge)
         )
         groups[name] = group
         drives[name] = drive
@@ -153,6 +158,11 @@ def describe_model(path: Path) -> ModelDescription:
             remarks[name, number] = remark
         pose[name] = _short(float(qpos[model.jnt_qposadr[hinge]]))
         remarks[name, "pose"] = moves[hinge]
+    if scaled:
+        notes.append(
+            f"the controls of {len(scaled)} position servos are no angles, as their constant force "
+            f"or gain says ({scaled[0]}); commands of pronk are angles"
+        )
     decimation = _stable_decimation(model, hinges, mass, groups, source.joint_names)
     held_positions = {}
     for name in held_joints:
@@ -171,7 +181,7 @@ def describe_model(path: Path) -> ModelDescription:
             decimation=decimation,
         ),
         remarks=remarks,
-        notes=source.notes,
+        notes=tuple(notes),
         held_joints=held_joints,
     )
 
@@ -277,42 +287,6 @@ def _relieve(
             )
 
 
-def _held_joints(source: SourceModel, servos: tuple[JointServo, ...]) -> dict[str, str]:
-    """Return which joints are held at the pose, with the reason."""
-    model = source.model
-    has_actuators = any(servos[index].actuators for index in source.hinges)
-    held_joints = {}
-    for index, name in enumerate(source.joint_names):
-        joint_type = mujoco.mjtJoint(model.jnt_type[index])
-        servo = servos[index]
-        if joint_type == mujoco.mjtJoint.mjJNT_FREE:
-            if index != source.base_joint:
-                held_joints[name] = "a body of its own"
-        elif joint_type == mujoco.mjtJoint.mjJNT_SLIDE:
-            low, high = model.jnt_range[index]
-            held_joints[name] = "slide joint [m]"
-            if model.jnt_limited[index]:
-                held_joints[name] += f", range {low:.4g} to {high:.4g} m"
-            if math.isfinite(servo.effort_limit):
-                held_joints[name] += f", at most {servo.effort_limit:.4g} N"
-        elif joint_type == mujoco.mjtJoint.mjJNT_BALL:
-            held_joints[name] = "ball joint, a quaternion"
-        elif name in source.mimics:
-            held_joints[name] = f"follows {source.mimics[name]} in the URDF"
-        elif model.jnt_limited[index] and np.ptp(model.jnt_range[index]) < SMALLEST_RANGE:
-            held_joints[name] = f"hinge with a range of {np.ptp(model.jnt_range[index]):.2g} rad"
-        elif not source.has_mass(index):
-            held_joints[name] = "hinge with no mass behind it [rad]"
-        elif servo.servo_type == "velocity":
-            held_joints[name] = (
-                f"velocity servo {', '.join(servo.actuators)} of {servo.damping:.4g} N m s/rad, "
-                "which holds no position [rad]"
-            )
-        elif has_actuators and not servo.actuators and not model.jnt_actfrclimited[index]:
-            held_joints[name] = "hinge without an actuator [rad]"
-    return held_joints
-
-
 def _held_position(source: SourceModel, index: int, qpos: Array) -> HeldPosition:
     """Return the position at which a joint is held: a number, or the list of a quaternion."""
     model = source.model
@@ -326,13 +300,29 @@ def _held_position(source: SourceModel, index: int, qpos: Array) -> HeldPosition
 
 
 def _joint_entries(
-    source: SourceModel, hinge: int, servo: JointServo, inertia: float, gravity: float
+    source: SourceModel,
+    hinge: int,
+    servo: JointServo,
+    inertia: float,
+    gravity: float,
+    followers: Followers | None,
 ) -> tuple[GroupEntry, DriveEntry, dict[str, Remark]]:
-    """Return the entries of a joint, and the remarks on their numbers.
+    """Make the entries of a joint.
 
-    `inertia` is that about the joint [kg m^2], `gravity` the torque that holds the pose [N m].
+    Args:
+        source: The model.
+        hinge: Index of the joint.
+        servo: What drives it.
+        inertia: Inertia about it [kg m^2], without its followers.
+        gravity: Torque that holds the pose [N m].
+        followers: The joints that follow it, if there are any.
+
+    Returns:
+        Its group and its drive, and the remarks on their numbers.
     """
     model = source.model
+    if followers:
+        inertia += followers.inertia
     name = source.joint_names[hinge]
     dof = model.jnt_dofadr[hinge]
     remarks = {}
@@ -411,6 +401,13 @@ def _joint_entries(
         "frictionloss": float(model.dof_frictionloss[dof]),
         "viscous_damping": float(model.dof_damping[dof]),
     }
+    followed = {}
+    if followers:
+        followed = {
+            "armature": followers.inertia,
+            "frictionloss": followers.frictionloss,
+            "viscous_damping": followers.viscous_damping,
+        }
     missing = {
         "armature": "0 in the model; a real rotor has inertia",
         "frictionloss": "0 in the model; a real gear has dry friction",
@@ -419,6 +416,14 @@ def _joint_entries(
         remarks[number] = Remark(mark="read", text="the joint")
         if not value and number in missing:
             remarks[number] = Remark(mark="CHECK", text=missing[number])
+        if followers and followed[number]:
+            # Followers that turn against the hinge make it lighter, which no armature can.
+            passive[number] = _short(max(0.0, value + followed[number]))
+            names_of_followers = ", ".join(followers.names)
+            remarks[number] = Remark(
+                mark="derived",
+                text=f"the joint's {value:.4g} and the share of {names_of_followers}",
+            )
     for number in ("bus_voltage", "gear_ratio"):
         remarks[number] = Remark(mark="CHECK", text="assumed; a model does not say it")
     remarks["band_hz"] = Remark(mark="CHECK", text="assumed")

@@ -24,8 +24,10 @@ from msgspec import Meta
 from pronk.errors import RobotError
 from pronk.files import converted, read_yaml
 from pronk.robots.held_model import POSITIONS, held_mjcf
+from pronk.robots.held_reasons import held_reasons
 from pronk.robots.limits import OperatingLimits
 from pronk.robots.robot import Drive, Joint, RobotSpec, ServoKind
+from pronk.robots.servos import joint_servos
 from pronk.robots.source_model import MUJOCO_ERRORS, SourceModel, read_source
 
 T = TypeVar("T")
@@ -302,12 +304,14 @@ def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> Robot
     for name, limb in limbs.items():
         limb_joints = [other for other in limbs if limbs[other] == limb]
         joints.append(_joint(file, model, name, groups[name], limb_joints, source))
+    servos = joint_servos(source_model.model, source_model.model.qpos0)
     robot = RobotSpec(
         name=file.name,
         joints=tuple(joints),
         build_spec=build,
         base_body=base_body,
         held_joints=tuple(source_model.joint_names[index] for index in held_joints),
+        held_reasons=held_reasons(source_model, servos),
         legs=file.legs,
         policy_rate_hz=file.policy_rate_hz,
         timestep_s=file.timestep_s,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -168,6 +168,8 @@ class RobotSpec:
     held_joints: tuple[str, ...] = ()
     """Joints of the model that stand still and are none of `joints`: slides, ball joints, followers
     and hinges that nothing drives."""
+    held_reasons: Mapping[str, str] = field(default_factory=dict)
+    """Why some of them are held, where their model says why."""
     legs: tuple[str, ...] = ()
     """Prefixes of the joints of each leg, from the hip down; empty for a robot without legs."""
     source: str = ""
@@ -223,12 +225,12 @@ class RobotSpec:
             if joint.name == name:
                 return joint
         if name in self.held_joints:
+            reason = self.held_reasons.get(name, "its robot.yaml names it under `held`")
             raise RobotError(
-                f"{name} of {self.name} is held and not driven: it is no hinge, has no actuator or "
-                "a velocity servo, follows another joint, or has no range to speak of (`held` in "
-                "its robot.yaml says which). To drive a hinge to a position all the same, take it "
-                "out of `held`, and state its drive, a group with its stiffness and damping, and "
-                "its pose."
+                f"{name} of {self.name} is held at a position and not driven ({reason}). To drive "
+                "a hinge to a position all the same, take it out of `held` in its robot.yaml, and "
+                "state its drive, a group with its stiffness and damping, and its pose; the joints "
+                f"that are driven are {', '.join(self.joint_names)}."
             )
         raise RobotError(
             f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."

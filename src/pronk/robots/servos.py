@@ -54,6 +54,9 @@ class JointServo:
     """Whether the limit of the other direction is larger."""
     has_damper: bool = False
     """Whether the damping is in part that of a damper at its full control."""
+    control_scale: str = ""
+    """How the control of a position servo differs from the length that it holds, in words; empty
+    where it does not."""
 
 
 def joint_servos(model: mujoco.MjModel, qpos: Array) -> tuple[JointServo, ...]:
@@ -97,6 +100,7 @@ def _joint_servo(model: mujoco.MjModel, joint: int, moments: Array) -> JointServ
     is_shared = False
     is_uneven = False
     has_damper = False
+    control_scale = ""
     for index in np.flatnonzero(moments[:, dof]):
         moment = abs(float(moments[index, dof]))
         name = model.actuator(int(index)).name or f"actuator {index}"
@@ -118,6 +122,11 @@ def _joint_servo(model: mujoco.MjModel, joint: int, moments: Array) -> JointServ
             damping += -float(bias[2]) * moment**2
             if bias[1] < 0.0:
                 servo_type = "position"
+                if not math.isclose(gain[0], -bias[1], rel_tol=1e-6) or bias[0]:
+                    control_scale = (
+                        f"{name} has the gain {gain[0]:.4g} beside the stiffness {-bias[1]:.4g}, "
+                        f"and a constant force of {bias[0]:.4g}"
+                    )
             elif bias[2] < 0.0:
                 servo_type = "velocity"
         servo_types.append(servo_type)
@@ -149,6 +158,7 @@ def _joint_servo(model: mujoco.MjModel, joint: int, moments: Array) -> JointServ
         is_shared=is_shared,
         is_uneven=is_uneven,
         has_damper=has_damper,
+        control_scale=control_scale,
     )
 
 

@@ -71,6 +71,8 @@ class SourceModel:
     """Joint to the speed limit that a URDF states [rad/s]."""
     mimics: Mapping[str, str] = field(default_factory=dict)
     """Joint to the joint that it follows."""
+    mimic_ratios: Mapping[str, float] = field(default_factory=dict)
+    """Joint to how far it moves for each radian of the joint that it follows."""
     notes: tuple[str, ...] = ()
     """Sentences on what was left out or replaced."""
     is_urdf: bool = False
@@ -199,6 +201,7 @@ def _source(
         body_names=tuple(body_names),
         speed_limits=urdf.speed_limits if urdf else {},
         mimics=urdf.mimics if urdf else {},
+        mimic_ratios=urdf.mimic_ratios if urdf else {},
         notes=notes,
         is_urdf=urdf is not None,
     )

@@ -37,6 +37,8 @@ class PlainUrdf:
     """Joint to the `velocity` of its limit, where it is positive and finite [rad/s, or m/s]."""
     mimics: dict[str, str]
     """Joint to the joint that it follows (`mimic`)."""
+    mimic_ratios: dict[str, float]
+    """Joint to how far it moves for each radian of the joint that it follows."""
     notes: tuple[str, ...]
     """Sentences on what was left out and matters."""
 
@@ -79,6 +81,7 @@ def plain_urdf(path: Path, *, with_meshes: bool = True) -> PlainUrdf:
             notes.append(note)
     speed_limits = {}
     mimics = {}
+    mimic_ratios = {}
     for element in root.iter():
         for attribute in ("xyz", "rpy"):
             if attribute in element.attrib:
@@ -94,6 +97,7 @@ def plain_urdf(path: Path, *, with_meshes: bool = True) -> PlainUrdf:
         mimic = joint.find("mimic")
         if mimic is not None:
             mimics[name] = mimic.get("joint", "")
+            mimic_ratios[name] = _number(mimic.get("multiplier", "1"))
     extension = root.find("mujoco")
     if extension is None:
         extension = ET.SubElement(root, "mujoco")
@@ -107,6 +111,7 @@ def plain_urdf(path: Path, *, with_meshes: bool = True) -> PlainUrdf:
         text=ET.tostring(root, encoding="unicode"),
         speed_limits=speed_limits,
         mimics=mimics,
+        mimic_ratios=mimic_ratios,
         notes=tuple(notes),
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import PlanError
 from pronk.identify.excitation.signals import Chirp, Signal
-from pronk.identify.excitation.worst_case import Forecast, Uncertainty, forecast
+from pronk.identify.excitation.worst_case import SPEED_SHARE, Forecast, Uncertainty, forecast
 from pronk.robots.robot import RobotSpec
 
 POSE_RAMP_S = 2.0
@@ -31,6 +31,16 @@ goes halfway to one that fits."""
 RESOLVED_RAD = 1e-4
 """Smallest amplitude of a sweep: about one count of an encoder of 16 bits at the joint, 2 pi / 2^16
 [rad]. What moves less, no encoder of a robot's joint measures."""
+SWINGING_RAD = 1e-3
+"""Smallest amplitude that is offered for a joint that swings undamped [rad]: below its resonance
+the joint moves by that amplitude alone, ten counts of such an encoder."""
+SWINGING = 3.0
+"""Reach over the amplitude of the command, in the worst case, from which on a joint is said to
+swing undamped; a joint that is damped at a sixth of critical has it in resonance."""
+RESONANT = 1.5
+"""The same of the model as it is, of a joint that is damped at a third of critical."""
+FRICTION_SHARE = 0.5
+"""Share of the planned torque that dry friction may take before a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,21 +156,55 @@ class SweepPlan:
                 continue
             loudest = self._loudest(worst.excited)
             fitting_rad = self.fitting_amplitude(worst.excited)
-            if 0.0 < fitting_rad < RESOLVED_RAD:
+            swing = self._swing(worst.excited)
+            least_rad = SWINGING_RAD if swing > SWINGING else RESOLVED_RAD
+            if 0.0 < fitting_rad < least_rad:
                 way_out = (
-                    f"only amplitudes below {RESOLVED_RAD:g} rad would fit, which no encoder "
+                    f"only amplitudes below {least_rad:g} rad would fit, which no encoder "
                     "resolves, so choose other joints, another pose or other gains"
                 )
             elif fitting_rad > 0.0:
                 way_out = f"an amplitude of {fitting_rad:.3g} rad fits"
             else:
                 way_out = "no amplitude fits, so choose other joints or another pose"
+            if swing > SWINGING:
+                way_out += (
+                    f"; it swings by {swing:.0f} times its command, as its gains hardly damp it: "
+                    "state the damping of the drive, or the viscous friction of the joint"
+                )
             raise PlanError(
                 f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
                 f"could {breach} (inertia, gains and friction uncertain by "
                 f"{100 * self.uncertainty.inertia:.0f}, {100 * self.uncertainty.stiffness:.0f} and "
                 f"{100 * self.uncertainty.friction:.0f} %); {way_out}."
             )
+
+    def warnings(self) -> list[str]:
+        """Return sentences on what will keep a sweep of this plan from showing the gains."""
+        sentences = []
+        for worst in self.forecasts:
+            friction = self.robot.joint(worst.joint).drive.frictionloss
+            nominal = worst.nominal or worst
+            if worst.amplitude > 0.0 and friction > FRICTION_SHARE * nominal.torque:
+                sentences.append(
+                    f"{worst.joint}: the dry friction of its robot.yaml ({friction:.3g} N m) takes "
+                    f"{100 * min(1.0, friction / nominal.torque):.0f} % of the planned torque "
+                    f"({nominal.torque:.3g} N m), so that a match will find friction and little "
+                    "else; take a larger amplitude or other gains, or check the friction"
+                )
+        return sentences
+
+    def _swing(self, joint: str) -> float:
+        """Return how far an excited joint moves, over the amplitude of its command."""
+        swing = 0.0
+        for worst in self.forecasts:
+            if worst.joint == joint and worst.amplitude > 0.0:
+                nominal = worst.nominal or worst
+                # Between its ends, so that where it sags to is no part of it. The worst case has
+                # where it sags to in every corner, so that it alone tells nothing.
+                if (nominal.highest - nominal.lowest) / (2.0 * worst.amplitude) > RESONANT:
+                    swing = (worst.highest - worst.lowest) / (2.0 * worst.amplitude)
+        return swing
 
     def fitting_amplitude(self, joint: str) -> float:
         """Find the largest amplitude of a joint's signal that exceeds no limit.
@@ -281,7 +325,8 @@ def _exceeds(forecasts: Sequence[Forecast]) -> bool:
 
 def _linear_share(worst: Forecast) -> float:
     """Return the share of the limits of torque and speed that a joint uses, at standstill."""
-    return max(worst.torque / worst.effort_limit, worst.speed / worst.no_load_speed, 1e-9)
+    speed_share = worst.speed / (SPEED_SHARE * worst.no_load_speed)
+    return max(worst.torque / worst.effort_limit, speed_share, 1e-9)
 
 
 def make_plan(

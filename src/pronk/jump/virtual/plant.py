@@ -152,6 +152,9 @@ class Plant:
         """Places of the links in qvel."""
         self.link_qpos = _ids(model.jnt_qposadr[links])
         """Places of the links in qpos."""
+        # Stiffness [N m/rad] and angle [rad] of the springs of the model's own joints.
+        self._spring = model.jnt_stiffness[links].copy()
+        self._spring_angle = model.qpos_spring[self.link_qpos].copy()
         self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])
         """Places of the motors in ctrl."""
         # Places of the currents in act. LuGre's bristle comes first among a motor's states, its
@@ -319,7 +322,8 @@ class Plant:
     ) -> None:
         """Hold some links where they are; release all others.
 
-        A spring and damper between link and body cost no solver iterations.
+        A spring and damper between link and body cost no solver iterations. They take the place of
+        the joint's own spring, beside which a fixture is stiff.
 
         Args:
             joints: Joints whose links are held.
@@ -327,11 +331,14 @@ class Plant:
             stiffness: Stiffness of the spring [N m/rad].
             damping: Damping of the damper [N m s/rad].
         """
-        for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
+        for k, name in enumerate(self.joints):
+            dof = self.link[k]
+            index = self.link_qpos[k]
             is_clamped = name in joints
-            self.model.jnt_stiffness[self.model.dof_jntid[dof]] = stiffness if is_clamped else 0.0
+            link_joint = self.model.dof_jntid[dof]
+            self.model.jnt_stiffness[link_joint] = stiffness if is_clamped else self._spring[k]
             self.model.dof_damping[dof] = damping if is_clamped else 0.0
-            self.model.qpos_spring[index] = q[index] if is_clamped else 0.0
+            self.model.qpos_spring[index] = q[index] if is_clamped else self._spring_angle[k]
 
 
 def legs_of(robot: RobotSpec) -> tuple[str, ...]:
@@ -438,11 +445,10 @@ def _add_rotor(spec: Any, name: str, drive: Drive, params: JointParams, lag_s: f
         damping=[params.viscous, 0, 0],
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
     )
-    # Nothing of the training model's joint remains but its axis and its stops.
+    # Of the training model's joint its axis, its stops and its spring remain.
     link.armature = 0.0
     link.frictionloss = 0.0
     link.damping = [0.0, 0.0, 0.0]
-    link.stiffness = [0.0, 0.0, 0.0]
     # A mechanical stop is hard: the model's gives way by 0.4 rad under the weight of the trunk.
     link.solref_limit = [_STOP_S, 1.0]
     belt = spec.add_tendon(

@@ -33,8 +33,9 @@ SHIPPED_FILES = {SHIPPED_ROBOT: SHIPPED, "go2": Path(__file__).with_name("go2_si
 """Files of parameters of the robots that have one."""
 
 # Bounds exclude errors by a factor of ten or more in a file. Those of joints hold for every size,
-# from a finger of grams to a leg of fifty kilograms; `Plant` refuses what does not suit the links.
-_Spring = Annotated[float, Meta(ge=1e-6, le=1e8)]
+# from the whisker of a rodent to a leg of fifty kilograms, so that what must not be 0 has no other
+# lower bound; `Plant` refuses what does not suit the links.
+_Spring = Annotated[float, Meta(gt=0.0, le=1e11)]
 _Torque = Annotated[float, Meta(ge=0.0, le=1e5)]
 _Share = Annotated[float, Meta(ge=0.1, le=10.0)]
 _UpTo10 = Annotated[float, Meta(ge=0.0, le=10.0)]
@@ -55,7 +56,7 @@ class JointParams(Bounded):
     """Torque that the motor gives per torque that its drive computes [1]."""
     link_inertia_scale: _Share
     """Mass and inertia of the link this joint moves, relative to the model's [1]."""
-    rotor_inertia: Annotated[float, Meta(ge=1e-15, le=1e3)]
+    rotor_inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
     """Inertia of the rotor about its own axis, motor side [kg m^2]."""
     belt_stiffness: _Spring
     """Stiffness of the belt between rotor (reflected) and link [N m/rad]."""
@@ -67,7 +68,7 @@ class JointParams(Bounded):
     """Dry friction at the onset of slip; the Stribeck peak, not below `coulomb` [N m]."""
     stribeck_speed: Annotated[float, Meta(ge=1e-6, le=100.0)]
     """Speed at which the peak has fallen to 1/e of its height over `coulomb` [rad/s]."""
-    presliding_stiffness: Annotated[float, Meta(ge=1e-9, le=1e9)]
+    presliding_stiffness: Annotated[float, Meta(gt=0.0, le=1e9)]
     """Stiffness of the bristles before slip, LuGre sigma_0 [N m/rad]."""
     presliding_damping: _Torque
     """Damping of the bristles, LuGre sigma_1 [N m s/rad]."""
@@ -303,6 +304,17 @@ _BELT_SHARE = 25.0
 """Stiffness of the belt over that of the drive, at least, for the share of the inertia that the
 belt carries: the link swings on its belt at five times the frequency of the joint on its drive, or
 more. That of the shipped robots is 90 to 650."""
+_BELT_S = 0.7e-3
+"""Damping of a drive over the stiffness of the belt, at most, for the share of the inertia that the
+belt carries [s]: the time for which a step of the command turns a light rotor ahead of its link, at
+a speed that the plan of a rigid joint does not have. That of the shipped robots is below 0.3 ms."""
+_LIGHT = 8.0
+"""Stiffness of the belt over that of the drive, times the inertia of the rotor over that of the
+link, at least: of a step of the command the rotor then runs ahead of its link no faster than the
+joint itself turns."""
+_STIFFEST = 100.0
+"""Largest stiffness of the belt over that of the drive that is taken for this, so that the physics
+step need not follow rotors far lighter than any motor's."""
 _ROTOR_S = 0.25e-3
 """Least inertia of a rotor over the damping of its drive [s]. A drive stops a lighter rotor within
 less than its own lag, which no real drive can. At 25 Hz the inertia that this adds to a joint takes
@@ -312,9 +324,11 @@ _FASTEST_RAD_S = 1e3
 sweep: below it, inertia is added to the rotor."""
 _PRESLIDING_RAD = 1e-3
 """Deflection at which dry friction breaks away [rad]."""
-_FRICTION_RAD = 0.005
+_FRICTION_RAD = 0.001
 """Angle at which the spring of the drive has the dry friction of a joint, at most, where the
-robot's file has no friction [rad]."""
+robot's file has no friction [rad]: a fortieth of the smaller amplitude of a sweep that the speed
+limit of an arm keeps small. With five times as much, dry friction and its Stribeck peak are what
+such a sweep shows, and no gains fit it."""
 _SPEED_NOISE = 0.004
 """Noise of the speed over the lowest no-load speed, at most: a sweep ends where a measured speed
 exceeds it, and a plan may use all of it."""
@@ -413,7 +427,9 @@ def _default_joint(joint: Joint, link: float) -> JointParams:
     rotor = max(rotor, _ROTOR_S * joint.damping, joint.stiffness / _FASTEST_RAD_S**2 - link)
     reduced = rotor * link / (rotor + link)
     belt = (2.0 * math.pi * _RING_HZ) ** 2 * reduced
-    belt = max(belt, _BELT_SHARE * joint.stiffness * link / (rotor + link))
+    carried = link / (rotor + link)
+    share = max(_BELT_SHARE, min(_STIFFEST, _LIGHT * link / rotor))
+    belt = max(belt, share * joint.stiffness * carried, joint.damping / _BELT_S * carried)
     coulomb = min(0.002 * joint.drive.effort_limit, _FRICTION_RAD * joint.stiffness)
     coulomb = max(0.8 * joint.drive.frictionloss, coulomb)
     # No stiffer than the belt's ring allows a light rotor to be simulated.
