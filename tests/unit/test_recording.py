@@ -113,6 +113,27 @@ def test_a_recording_gives_the_gains_of_the_log(tmp_path: Path) -> None:
     assert recorded.delay_s.value == pytest.approx(direct.delay_s.value, abs=1e-3)
 
 
+def test_a_recorder_that_stood_still_and_a_clock_that_was_set(tmp_path: Path) -> None:
+    """Times of sending count through a pause of the recorder, those of arrival where they jump."""
+    path = tmp_path / "recording.mcap"
+    for clock_set_s, recorder_pause_s in ((0.0, 5.0), (30.0, 0.0), (-30.0, 0.0)):
+        writer = RecordingWriter(path, HEADER)
+        for tick in range(6000):
+            instant = 0.002 * tick
+            paused = 4.0 < instant < 4.0 + recorder_pause_s
+            arrived = 4.0 + recorder_pause_s if paused else instant + 1e-4
+            sent = instant + (clock_set_s if instant > 7.0 else 0.0)
+            position = 0.1 * np.sin(instant) * ONE
+            drive = (17.0 * ONE, 0.4 * ONE, 0.0 * ONE)
+            writer.command(arrived, sent, (position, 0.0 * ONE), drive)
+            writer.state(arrived, sent, position, 0.0 * ONE, 0.0 * ONE)
+        writer.end()
+        log = read_log(path, robot=PENDULUM)
+        assert len(log.time) == 6000
+        np.testing.assert_allclose(np.diff(log.time), 0.002, atol=1e-4)
+        np.testing.assert_allclose(log.command, log.position, atol=1e-3)
+
+
 def test_a_recording_that_was_cut_is_read_to_there(tmp_path: Path) -> None:
     log = chirps()
     path = tmp_path / "recording.mcap"

@@ -11,6 +11,9 @@ from pronk.cli import console
 from pronk.cli.link_options import Layout
 from pronk.errors import LogError, PronkError
 
+_PRIORITY = 20
+"""Priority of SCHED_FIFO: below the servo's and the virtual robot's, which must not wait."""
+
 
 def record(
     robot: tyro.conf.Positional[str],
@@ -22,6 +25,7 @@ def record(
     layout: Layout | None = None,
     port: int | None = None,
     domain: int | None = None,
+    real_time: bool = True,
     overwrite: bool = False,
 ) -> console.Outcome:
     """Listen to states and commands under another program, and write a log that match reads.
@@ -42,13 +46,14 @@ def record(
         layout: Messages on LCM; cheetah if left out.
         port: UDP port of LCM.
         domain: Domain of DDS.
+        real_time: Request real-time scheduling, below that of what commands.
         overwrite: Replace a log that exists.
     """
     from dataclasses import asdict
 
     from pronk.deploy.links.address import Address
     from pronk.deploy.links.listener import find_listener
-    from pronk.deploy.links.realtime import Interrupts
+    from pronk.deploy.links.realtime import Interrupts, RealTimeSettings, enter
     from pronk.deploy.runtime.recorder import record_passively
     from pronk.files import require_place
     from pronk.identify.logs.mcap_reader import read_mcap
@@ -66,6 +71,10 @@ def record(
     robot_spec = load_robot(robot)
     address = Address.parse(link, interface, layout=layout, port=port, domain=domain)
     listener = find_listener(address, robot_spec)
+    if real_time:
+        # Before the wire is open, so that its threads are scheduled alike.
+        for line in enter(RealTimeSettings(priority=_PRIORITY, lock=False)):
+            console.note(line)
     console.note(
         f"listening to {listener.state_topic} and {listener.command_topic}; nothing is sent, "
         "Ctrl-C ends it"

@@ -89,8 +89,13 @@ _DRIFTING_S = 6.0
 by 50 millionths, 0.3 ms in this time, which is what the least lateness is known to."""
 _LARGEST_DRIFT = 2e-4
 """Largest relative drift between two quartz clocks."""
-_LARGEST_LATENESS_S = 0.2
-"""Median lateness over the least one above which a clock was set meanwhile [s]."""
+_CLOCK_SET_S = 0.2
+"""Change of the least lateness between the halves of a recording, or step back of the times of
+sending, from which on a clock was set meanwhile or two senders have two clocks [s]. A recorder that
+stood still is no such change: what it hears afterwards was sent in order."""
+_LATE_S = 0.02
+"""Median lateness of the messages from which on the log says so [s]: ten times what a network and a
+computer that is not busy take."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,6 +276,16 @@ def read_recording(path: Path, messages: Sequence[Record], damage: str) -> Joint
     except ValueError as error:
         raise LogError(f"{path}: damaged: {error}; record again.") from None
     times = _sent_times([state.t for state in states], [state.sent for state in states])
+    late_s = max(
+        float(np.median(np.array([state.t for state in states]) - times)),
+        float(np.median(np.sort([command.t for command in sent]) - commands.time)),
+    )
+    if late_s > _LATE_S:
+        notes.append(
+            f"half of the messages came {1e3 * late_s:.0f} ms late or more: the computer that "
+            "recorded was busy, and commands and states may be apart by as much; record again on a "
+            "quiet computer if the delay matters"
+        )
     increasing = _increasing(times)
     rows = np.flatnonzero(increasing)
     if len(rows) < len(states):
@@ -352,8 +367,8 @@ def _commands(messages: Sequence[_CommandMessage], width: int) -> _Commands:
 def _sent_times(arrived: Sequence[float], sent: Sequence[float | None]) -> Array:
     """Return when messages were sent, on the recorder's clock [s], shape (n,).
 
-    The least lateness of the messages is taken for none. Where the sender's clock is not known, or
-    was set meanwhile, messages count as sent when they arrived.
+    The least lateness in each half of the recording is taken for none. Where the sender's clock is
+    not known, or was set meanwhile, messages count as sent when they arrived.
 
     Args:
         arrived: When each came, on the recorder's clock [s].
@@ -364,18 +379,19 @@ def _sent_times(arrived: Sequence[float], sent: Sequence[float | None]) -> Array
         return arrivals
     stamps = np.array(sent, dtype=np.float64)
     lateness = arrivals - stamps
-    least = np.full(len(arrivals), lateness.min())
-    duration_s = arrivals[-1] - arrivals[0]
-    third = len(lateness) // 3
-    if duration_s > _DRIFTING_S and third > 0:
-        first = int(np.argmin(lateness[:third]))
-        last = 2 * third + int(np.argmin(lateness[2 * third :]))
-        drift = (lateness[last] - lateness[first]) / (arrivals[last] - arrivals[first])
-        if abs(drift) < _LARGEST_DRIFT:
-            least = lateness[first] + drift * (arrivals - arrivals[first])
-    if np.median(lateness - least) > _LARGEST_LATENESS_S:
+    in_first_half = stamps <= 0.5 * (stamps[0] + stamps[-1])
+    if np.diff(stamps).min() < -_CLOCK_SET_S or in_first_half.all() or not in_first_half.any():
         return arrivals
-    return np.asarray(stamps + least)
+    first = int(np.argmin(np.where(in_first_half, lateness, np.inf)))
+    last = int(np.argmin(np.where(in_first_half, np.inf, lateness)))
+    change = float(lateness[last] - lateness[first])
+    if abs(change) > _CLOCK_SET_S:
+        return arrivals
+    between_s = float(stamps[last] - stamps[first])
+    if stamps[-1] - stamps[0] < _DRIFTING_S or abs(change) > _LARGEST_DRIFT * between_s:
+        return np.asarray(stamps + lateness.min())
+    drift = change / between_s
+    return np.asarray(stamps + lateness[first] + drift * (stamps - stamps[first]))
 
 
 def _increasing(times: Array) -> Mask:
