@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from pronk.jump.study.local import LocalExecutor
 from pronk.jump.study.mps import LOG, PIPE, mps_daemon
 from pronk.jump.study.packing import GpuRates, free_memory_mib, packing_text
 from pronk.jump.study.schedule import time_left
+from study_cases import export_task, study_root
 
 # Steps/s of each of one to four trainings of 4,096 robots on one H200 under MPS.
 MEASURED = {1: 164_000.0, 2: 124_000.0, 3: 99_000.0, 4: 86_000.0}
@@ -161,3 +163,16 @@ def test_mps_that_runs_already_is_left_as_it_is(
         assert variables == {}
     assert not calls.exists()
     assert "/tmp/theirs" in lines[0]
+
+
+def test_trainings_are_added_to_gpus_as_they_show_their_rates(tmp_path: Path) -> None:
+    """Tasks that end at once fill the GPUs in turn; none waits while a GPU is empty."""
+    executor = LocalExecutor(study_root(tmp_path), gpus=("0", "1"), cores=8.0)
+    places = []
+    for number in range(3):
+        task = export_task(str(number), kind="training", gpu=True)
+        places.append(executor.try_start(task))
+    executor.stop()
+    # The third one would share a GPU with a training that has not shown its rate.
+    assert places == ["GPU 0", "GPU 1", ""]
+    assert executor.rooms() >= 2

@@ -23,6 +23,8 @@ CHECKPOINT_S = 120.0
 SETTLE_S = 8.0
 """Time from which all trainings on a GPU step until their rates count [s]: the first iterations are
 slower."""
+MEASURE_S = 5.0
+"""Time between two looks at the rates of trainings when none waits [s]."""
 _MEMORY_S = 2.0
 """Shortest time between two readings of the memory of the GPUs [s]."""
 
@@ -77,6 +79,7 @@ class LocalExecutor:
         self._processes: list[_Process] = []
         self._memory: Mapping[str, float] = {}
         self._memory_read_at = -_MEMORY_S
+        self._measured_at = -MEASURE_S
         self._training_cores = 1.0
 
     def try_start(self, task: StudyTask) -> str:
@@ -163,7 +166,9 @@ class LocalExecutor:
         if gpu is not None and not gpu.trainings:
             gpu.free_at_first_mib = self._free_memory(gpu.name)
         words = task.words(self.root)
-        log = (self.root / task.log()).open("ab")
+        log_file = self.root / task.log()
+        log_file.parent.mkdir(parents=True, exist_ok=True)
+        log = log_file.open("ab")
         log.write(f"$ pronk {' '.join(words)}\n".encode())
         log.flush()
         process = subprocess.Popen(
@@ -190,6 +195,10 @@ class LocalExecutor:
 
     def poll(self) -> list[TaskEnd]:
         """Return the tasks that have ended since the last call."""
+        if time.monotonic() - self._measured_at > MEASURE_S:
+            self._measured_at = time.monotonic()
+            for gpu in self._gpus:
+                self._measured(gpu)
         ends = []
         for process in list(self._processes):
             status = process.process.poll()

@@ -342,7 +342,8 @@ def summarize_trainings(
             status = statuses[training_name(arm.name, seed)]
             figures = training_figures(root, status, training_folder(arm, seed))
             runs.append({"seed": seed, **figures})
-        spreads = {figure: spread_over_seeds(runs, figure) for figure in SPREADS}
+        finished = [run for run in runs if run["policy_sha256"]]
+        spreads = {figure: spread_over_seeds(finished, figure) for figure in SPREADS}
         entries.append({"name": arm.name, "trainings": runs, "spread_over_seeds": spreads})
     body = {"schema": SCHEMA, "seeds": list(seeds), "seconds": seconds, "arms": entries}
     write_text(root / TRAININGS_FILE, json.dumps(body, indent=2, allow_nan=False) + "\n")

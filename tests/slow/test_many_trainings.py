@@ -1,0 +1,79 @@
+"""Several trainings at once on Warp's CPU device: interrupted, gone on with, one of them broken."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.rl import checkpoint
+from pronk.policy.runtime import load_policy
+
+pytestmark = pytest.mark.train
+
+WORDS = (
+    *("train", "all", "--gains", "naive", "--seeds", "1-2", "--device", "cpu", "--jobs", "2"),
+    *("--envs", "4", "--save-interval", "1"),
+    *("--phase", "walk=2", "--phase", "jump_a=1", "--phase", "jump_b=1"),
+)
+CODE = "import sys; from pronk.cli.main import main; main()"
+
+
+def started(out: Path) -> subprocess.Popen[str]:
+    """Start `pronk train` of two seeds side by side."""
+    return subprocess.Popen(
+        [sys.executable, "-c", CODE, *WORDS, "--out", str(out)],
+        env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_interrupted_trainings_go_on_and_a_broken_one_is_named(tmp_path: Path) -> None:
+    out = tmp_path / "runs"
+    first = RunFolder(out / "trainings" / "naive" / "seed-1")
+    second = RunFolder(out / "trainings" / "naive" / "seed-2")
+    process = started(out)
+    while process.poll() is None:
+        if checkpoint.latest_checkpoint(first.path) and checkpoint.latest_checkpoint(second.path):
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate()
+    assert process.returncode == 130, output
+    assert "next:" in output
+    for folder in (first, second):
+        assert folder.read()["sessions"][-1]["stopped"] == "SIGTERM"
+
+    # The second one cannot go on; the first one can.
+    second.checkpoint().write_bytes(b"no checkpoint")
+    process = started(out)
+    output, _ = process.communicate()
+    assert process.returncode == 2, output
+    assert "naive, seed 2: failed" in output
+    assert "not a checkpoint" in output
+    record = first.read()
+    assert record["finished"]
+    assert record["settings"]["seed"] == 1
+    assert len(record["sessions"]) == 2
+    policy = load_policy(first.path / "policy.onnx")
+    summary = json.loads((out / "trainings.json").read_text())
+    assert summary["schema"] == "pronk/trainings/1"
+    (arm,) = summary["arms"]
+    done, broken = arm["trainings"]
+    assert (done["seed"], done["state"]) == (1, "done")
+    assert done["policy_sha256"] == policy.sha256
+    assert done["steps_per_second"] > 0.0
+    assert (broken["seed"], broken["state"], broken["attempts"]) == (2, "failed", 2)
+    assert arm["spread_over_seeds"]["seconds"]["n"] == 1
+    assert arm["spread_over_seeds"]["steps_per_second"]["mean"] > 0.0
