@@ -246,17 +246,20 @@ def _total(trial: TrialResults, policy: str) -> dict[str, float]:
     jumped = 0
     landed = 0
     fell = 0
+    touched = 0
     for cell in trial.cells_of(policy):
         commanded += cell.n
         jumped += cell.found
         landed += cell.succeeded
         fell += cell.fell
+        touched += cell.non_foot_contact
     low, high = share_interval(landed, commanded)
     return {
         "n": commanded,
         "found": jumped,
         "fell": fell,
         "landed": landed,
+        "touched": touched,
         "share": 100.0 * landed / commanded,
         "low": 100.0 * low,
         "high": 100.0 * high,
