@@ -75,6 +75,8 @@ PARSED = {
     "chirp_sweep": "needs recordings that are not in the repository",
     "step_response": "needs recordings that are not in the repository",
     "menagerie:NAME": "needs a robot that is downloaded",
+    "traj_0.pt": "needs a recording that is not in the repository",
+    "--deploy": "needs a policy that was trained elsewhere",
     "OLD.yaml": "needs an earlier match",
     "NET.pt": "needs an actuator network",
 }

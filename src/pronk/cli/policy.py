@@ -64,7 +64,7 @@ def policy(
         seconds: How long it runs, in s.
         seed: Of all noise.
         sim_params: Parameters of the virtual robot, instead of the shipped ones.
-        wide: Print every change that was tried.
+        wide: Print every column, and every change that was tried.
     """
     from pronk.jump.trial.foreign_check import (
         remedies,
@@ -93,7 +93,7 @@ def policy(
             robot_spec, params, foreign, velocity, seconds=seconds, seed=seed
         )
 
-    console.show(_file_table(deploy_file, robot_spec))
+    console.show(_file_table(deploy_file, robot_spec), wide=wide)
     for problem in problems:
         console.warn(problem)
     for name, value in zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), velocity, strict=True):
@@ -140,11 +140,11 @@ def _file_table(deploy: DeployFile, robot: RobotSpec) -> Table:
     """Make the table of what deploy.yaml says of each joint."""
     columns = (
         Column(heading="network"),
-        Column(heading="message"),
+        Column(heading="message", is_detail=True),
         Column(heading="joint"),
         Column(heading="maker's name"),
         Column(heading="pose", unit="rad", digits=2),
-        Column(heading="scale", unit="rad", digits=3),
+        Column(heading="scale", unit="rad", digits=3, is_detail=True),
         Column(heading="stiffness", unit="N m/rad", digits=1),
         Column(heading="damping", unit="N m s/rad", digits=2),
     )
