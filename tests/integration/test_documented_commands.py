@@ -115,7 +115,8 @@ class Workspace:
     def run(self, words: Sequence[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Run a command and all that it names as next; fail where one does not run."""
         line = " ".join(words)
-        key = (folder, tuple(words))
+        bounded_words = bounded(words, folder)
+        key = (folder, tuple(bounded_words))
         if key in self.finished:
             return
         if any(word in line.split() or word in line for word in PARSED):
@@ -133,7 +134,7 @@ class Workspace:
         described = robot_file.read_bytes() if robot_file.exists() else b""
         with monkeypatch.context() as patch:
             patch.setattr(console, "show", show_and_keep)
-            command = invoke(bounded(words, folder)[1:])
+            command = invoke(bounded_words[1:])
         if described:  # That of a new robot has values to be checked by a person.
             robot_file.write_bytes(described)
         self.finished[key] = command
@@ -144,7 +145,7 @@ class Workspace:
                 check_width(table, monkeypatch)
         for following in following_commands(command.stdout):
             # A log of the same kind stands for a fresh one.
-            self.follow(following.replace("FRESH_LOG", words[2]), folder, monkeypatch)
+            self.follow(following.replace("FRESH_LOG", bounded_words[2]), folder, monkeypatch)
         for page in re.findall(r"^wrote (\S+\.html)$", command.stdout, re.MULTILINE):
             path = (folder / page).resolve()
             for usage in usage_of_page(path):
