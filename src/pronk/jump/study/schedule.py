@@ -187,7 +187,7 @@ class _Loop:
         )
 
     def _seconds_left(self) -> float:
-        """SeedEstimate when all is done, trainings first and the trials of the last one behind."""
+        """Estimate when all is done, trainings first and the trials of the last one behind."""
         left = 0.0
         for kind in ("training", "trial"):
             remaining = []
