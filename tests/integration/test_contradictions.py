@@ -168,9 +168,17 @@ def test_gains_that_the_drive_law_cannot_have_are_no_silent_match(tmp_path: Path
     gains = result.gains.joints[JOINT]
     assert not gains.matched
     assert any(reason.startswith("stability") for reason in gains.reasons)
-    # An implicit drive has no such limit.
+    # No torque limit is blamed for what the law does.
+    assert not flags_of(result, JOINT, "effort limit")
+    # An implicit drive has no such limit, and its step leaves the size of the gains open.
     result = match([log], robot, "isaaclab-implicit", drive_gains="default")
+    gains = result.gains.joints[JOINT]
     assert not flags_of(result, JOINT, "stability")
+    assert flags_of(result, JOINT, "step")
+    ratio = gains.damping.value / gains.stiffness.value
+    assert ratio == pytest.approx(joint.damping / joint.stiffness, rel=0.1)
+    low, high = gains.stiffness.total95
+    assert low < joint.stiffness < high
 
 
 # ---- torque ----

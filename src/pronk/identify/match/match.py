@@ -114,6 +114,9 @@ open of others: a limited joint shows its gains between two limits alone. Measur
 NEAR_LIMIT = 0.5
 """Share of the limit of stability from which on a search may have ended at it: finite differences
 and longer steps of the search diverge well below."""
+OPEN_STEP = 1.7
+"""`damping timestep / (2 inertia)` from which on the step leaves gains open by a factor of two or
+more (`uncertainty.STEP_SHARE`). Explicit drives are not stable from 1 on."""
 NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 
@@ -233,11 +236,15 @@ def match(
                     raise IdentifiabilityError(
                         f"{error}{wrong_stiffness(replay, parameters, nominal[name])}"
                     ) from error
-                if rigs.sets_effort_limit:
+                is_stable = not simulation.uses_mujoco or (
+                    joint_stability_share(rigs.robot, name, nominal[name]) < 1.0
+                )
+                # A limit holds an unstable simulation back, and would be taken for a cause.
+                if rigs.sets_effort_limit and is_stable:
                     fit = fit_torque_limit(
                         replay, excitations, rigs.robot, fit, parameters, nominal[name]
                     )
-                if simulation.uses_mujoco:
+                if simulation.uses_mujoco and is_stable:
                     fit = without_speed_line(
                         fit, simulation, settings, excitations, parameters, nominal[name]
                     )
@@ -416,9 +423,19 @@ def with_step_uncertainty(fit: DriveFit, robot: RobotSpec) -> DriveFit:
     """Widen the total intervals of the gains by what the simulator's step leaves open."""
     inertia, _ = bench_inertia(robot, robot.joint(fit.joint).original[0])
     step_share = fit.values["damping"] * robot.timestep_s / (2.0 * inertia)
+    flags = fit.flags
+    if step_share > OPEN_STEP:
+        flags = (
+            *flags,
+            f"step: damping times the step of {1e3 * robot.timestep_s:g} ms is "
+            f"{2.0 * step_share:.2g} times the inertia, so that the response tells the ratio of "
+            "the gains alone; gains of the same ratio follow the command alike and give way to "
+            "loads otherwise. Take a smaller step",
+        )
     if "effort_limit" in fit.sd:
         step_share *= LIMITED_FACTOR
-    return replace(fit, total95=widen_by_step(fit.total95, fit.values, step_share))
+    total95 = widen_by_step(fit.total95, fit.values, step_share)
+    return replace(fit, total95=total95, flags=flags)
 
 
 def check_choices(method: str, mode: str, settings: MatchSettings, simulation: Simulation) -> None:
