@@ -14,12 +14,12 @@ test: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live and not slow"
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live and not slow" --durations=30
 
 # Trainings, whole trials and processes in real time.
 test-slow: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadgroup -m "slow and not live"
-	OMP_NUM_THREADS=1 $(BIN)/pytest -m live
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadgroup -m "slow and not live" --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m live --durations=10
 
 # The documentation site, in build/docs.
 docs: $(VENV)/.docs

@@ -260,7 +260,7 @@ def complete(command: DocumentedCommand) -> bool:
     if not command.is_mention:
         return True
     words = command.words[2:]
-    if command.words[1] in ("robot", "log"):
+    if command.words[1] in ("robot", "log", "policy"):
         words = words[1:]
     return bool(words) and not words[0].startswith("-") and "..." not in command.text
 
