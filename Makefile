@@ -40,7 +40,7 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 # Everything the tests need. PyTorch by itself first, so that its pinned build is taken.
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install torch==2.13.0
-	$(PIP) install -c constraints.txt -e .[train,bench,hardware,video,play,engines,dev]
+	$(PIP) install -c constraints.txt -e .[train,bench,hardware,video,play,engines,cluster,dev]
 	touch $@ $(VENV)/.core
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
