@@ -530,7 +530,8 @@ def supervision(
                 )
             else:
                 flown_s = sum(flight.get("seconds", 0.0) for flight in rows)
-                report("walking and jumping", min(flown_s / (3600.0 * hours), 1.0))
+                share = flown_s / (3600.0 * hours) if hours > 0.0 else 1.0
+                report("walking and jumping", min(share, 1.0))
     tables = []
     command = f"python -m benchmarks supervision POLICY --seed {seed} --sets {sets}"
     flights = [row for row in rows if "flight" in row]
