@@ -18,6 +18,7 @@ from pronk.deploy.links.lcm.messages import (
 )
 from pronk.errors import HardwareError
 from pronk.robots.machine import TorqueKind
+from pronk.robots.robot import RobotSpec
 
 JOINT_COUNT = 12
 KNEE_RATIO = 0.6429
@@ -86,6 +87,25 @@ WTW = LcmLayout(
     torque_kind="measured",
 )
 LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
+
+
+def layout_for(robot: RobotSpec, name: str) -> LcmLayout:
+    """Look the layout of a robot up.
+
+    Args:
+        robot: The robot.
+        name: Name of the layout.
+
+    Raises:
+        HardwareError: The layout is unknown, or its messages are for another number of joints.
+    """
+    layout = find_layout(name)
+    if len(robot.joints) != JOINT_COUNT:
+        raise HardwareError(
+            f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {name} are for "
+            f"{JOINT_COUNT}."
+        )
+    return layout
 
 
 def find_layout(name: str) -> LcmLayout:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from pronk.deploy.links.lcm import codec
-from pronk.deploy.links.lcm.layouts import find_layout
+from pronk.deploy.links.lcm.layouts import layout_for
 from pronk.deploy.links.lcm.messages import (
     BEACON_CHANNEL,
     CONTROL_PARAMETER,
@@ -184,12 +184,7 @@ class LcmMachine(NetworkLink):
             settings: Settings of every link; the usual if None.
         """
         super().__init__(robot, settings)
-        self._layout = find_layout(layout)
-        if len(robot.joints) != 12:
-            raise HardwareError(
-                f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
-                "for twelve."
-            )
+        self._layout = layout_for(robot, layout)
         self.torque_kind = self._layout.torque_kind
         self.state_rate_hz = self._layout.state_rate_hz
         self._command_topic = self._layout.command.channel

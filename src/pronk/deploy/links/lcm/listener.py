@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pronk.deploy.links.lcm.codec import LcmStateDecoder
-from pronk.deploy.links.lcm.layouts import JOINT_COUNT, WTW, LcmLayout, find_layout
+from pronk.deploy.links.lcm.layouts import JOINT_COUNT, WTW, LcmLayout, layout_for
 from pronk.deploy.links.lcm.link import MULTICAST_GROUP, url_of
 from pronk.deploy.links.lcm.messages import BEACON_CHANNEL
 from pronk.deploy.links.listener import HeardMessage, Listener, WireCommand
@@ -92,12 +92,7 @@ class LcmListener(Listener):
             interface: Network interface to a real robot, None for this computer only.
         """
         super().__init__(robot)
-        self._layout = find_layout(layout)
-        if len(robot.joints) != JOINT_COUNT:
-            raise HardwareError(
-                f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
-                f"for {JOINT_COUNT}."
-            )
+        self._layout = layout_for(robot, layout)
         self._url = url_of(port=port, interface=interface)
         self._port = int(self._url.partition("?")[0].rpartition(":")[2])
         self.torque_kind = self._layout.torque_kind
