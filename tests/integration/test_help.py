@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import pytest
 
-from command_line import refused
+from command_line import accepted, refused
 from documented_commands import LABEL, help_of
 from pronk.cli.help_text import WIDTH, examples_of
 from pronk.cli.main import COMMANDS, command_of, parsed_command
@@ -61,3 +63,9 @@ def test_each_listed_option_is_one_that_is_parsed(name: str) -> None:
 
 def test_an_unknown_option_is_named() -> None:
     assert "--nothing" in refused("profiles", "--nothing")
+
+
+def test_module_is_the_command_line() -> None:
+    words = [sys.executable, "-m", "pronk", "profiles"]
+    output = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert output == accepted("profiles")
