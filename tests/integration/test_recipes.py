@@ -113,6 +113,16 @@ def test_the_command_refuses_before_anything_is_written(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_the_plan_of_a_study_refuses_a_recipe_that_does_not_apply(tmp_path: Path) -> None:
+    bad = written(tmp_path, "rewards: {speed: 3}")
+    study = tmp_path / "study.yaml"
+    arm = f'{{gains: naive, options: "--recipe {bad}"}}'
+    study.write_text(f"schema: pronk/study/1\ntitle: speeds\narms: {{faster: {arm}}}\n")
+    text = refused("study", study, "--plan")
+    assert "'speed'" in text
+    assert "arms.faster" in text
+
+
 def test_a_recipe_is_part_of_a_run(tmp_path: Path) -> None:
     path = written(tmp_path, "rewards: {slip: 0}")
     first = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=path)

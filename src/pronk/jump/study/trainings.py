@@ -11,6 +11,7 @@ of a study holds
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import re
@@ -132,16 +133,24 @@ def training_folder(arm: TrainingArm, seed: int) -> str:
 
 
 def check_arm(arm: TrainingArm) -> None:
-    """Refuse gains that cannot be trained with, before anything is written.
+    """Refuse what cannot be trained with, before anything is written.
+
+    A recipe is applied to the robot's task where the libraries of training are installed; on a
+    host that only sends trainings to others its form alone is checked.
 
     Raises:
-        PronkError: The gains, the robot's task or the phases are impossible.
+        PronkError: The gains, the recipe or the phases are impossible.
     """
     from pronk.jump.train.gains import NAIVE, training_gains
     from pronk.jump.train.recipe import load_recipe
     from pronk.robots import load_robot
 
     settings = replace(arm.settings, seed=0).completed()
+    if settings.recipe is not None and importlib.util.find_spec("mjlab") is not None:
+        from pronk.jump.train.run import check_training
+
+        check_training(settings)
+        return
     training_gains(
         settings.gains or NAIVE,
         load_robot(str(settings.robot)),

@@ -71,8 +71,19 @@ def run_training(
     return _train_session(folder, settings, processes=max(len(gpus), 1))
 
 
-def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
-    """Make the folder of a new run; returns its provenance."""
+def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | None]:
+    """Read what a new run trains with, and refuse what cannot be trained with.
+
+    Args:
+        settings: Completed settings.
+
+    Returns:
+        The gains, and the recipe if there is one.
+
+    Raises:
+        PronkError: The robot has no task, the gains are impossible, or the recipe changes what the
+            task does not have.
+    """
     task = load_task(str(settings.robot))
     gains = training_gains(
         settings.gains or NAIVE,
@@ -82,10 +93,16 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
         by_joint=bool(settings.draws.by_joint),
     )
     recipe = None if settings.recipe is None else load_recipe(settings.recipe)
+    _env_cfg(task, gains, settings, recipe)
+    return gains, recipe
+
+
+def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
+    """Make the folder of a new run; returns its provenance."""
+    gains, recipe = check_training(settings)
     start = None
     if settings.init_checkpoint is not None:
         start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
-    _env_cfg(task, gains, settings, recipe)  # refuses impossible gains and recipes
     folder.path.mkdir(parents=True, exist_ok=True)
     gains_file = settings.gains_file
     if gains_file is not None:
