@@ -40,8 +40,13 @@ class BenchTask:
     and the tensors of that mode cannot be stepped outside of it.
     """
 
-    def __init__(self, task: str, *, envs: int, device: str, seed: int = 1) -> None:
-        """Build environment and runner as mjlab's `train` does; PronkError for an unknown task."""
+    def __init__(
+        self, task: str, *, envs: int, device: str, seed: int = 1, compiles: bool = False
+    ) -> None:
+        """Build environment and runner as mjlab's `train` does; PronkError for an unknown task.
+
+        With `compiles` pronk's tasks are compiled, as by `pronk train --compile`.
+        """
         # mjlab reads this when it is imported first.
         os.environ.setdefault("MJLAB_WARP_QUIET", "1")
         import torch
@@ -49,7 +54,7 @@ class BenchTask:
         self.task, self.device, self._trained = task, device, False
         self._folder = tempfile.TemporaryDirectory(prefix="pronk-bench-")
         with redirect_stdout(io.StringIO()):
-            self.env, self.runner = _build(task, envs, device, seed, self._folder.name)
+            self.env, self.runner = _build(task, envs, device, seed, self._folder.name, compiles)
             self.runner.save = lambda *_, **__: None
             self.runner.console = Console(file=io.StringIO())
             shape = (ACTIONS, envs, self.env.action_manager.total_action_dim)
@@ -111,7 +116,9 @@ class BenchTask:
         torch.cuda.empty_cache()  # no-op where CUDA was not used
 
 
-def _build(task: str, envs: int, device: str, seed: int, folder: str) -> tuple[Any, Any]:
+def _build(
+    task: str, envs: int, device: str, seed: int, folder: str, compiles: bool = False
+) -> tuple[Any, Any]:
     import mjlab.tasks  # noqa: F401 - registers mjlab's own
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
@@ -119,6 +126,7 @@ def _build(task: str, envs: int, device: str, seed: int, folder: str) -> tuple[A
     from mjlab.utils.torch import configure_torch_backends
 
     import pronk.jump.train.tasks  # noqa: F401 - registers pronk's
+    from pronk.jump.train.rl.runner import JumpRunnerCfg
 
     if task not in list_tasks():
         raise PronkError(f"mjlab knows no task {task!r}; it knows {', '.join(list_tasks())}.")
@@ -127,6 +135,8 @@ def _build(task: str, envs: int, device: str, seed: int, folder: str) -> tuple[A
     env_cfg.scene.num_envs = envs
     env_cfg.seed = rl_cfg.seed = seed
     rl_cfg.logger, rl_cfg.upload_model = "tensorboard", False
+    if compiles and isinstance(rl_cfg, JumpRunnerCfg):
+        rl_cfg.torch_compile_mode = "default"
     env = ManagerBasedRlEnv(cfg=env_cfg, device=device)
     wrapped = RslRlVecEnvWrapper(env, clip_actions=rl_cfg.clip_actions)
     runner_class = load_runner_cls(task) or MjlabOnPolicyRunner
@@ -143,6 +153,7 @@ def run(
     device: str = "cuda:0",
     gpus: Sequence[str] = (),
     tasks: tuple[str, str] = TASKS,
+    compiles: bool = False,
 ) -> dict[str, Any]:
     """Measure both tasks at every number of environments, in blocks of steps and of iterations.
 
@@ -161,7 +172,7 @@ def run(
     blocks = {"steps": steps, "iterations": iterations, "repeats": repeats}
     pairs = []
     for count in envs:
-        pairs.append(_pair(tasks, count, device, report, **blocks))
+        pairs.append(_pair(tasks, count, device, report, compiles=compiles, **blocks))
         report(f"{count:,} environments: measured")
     scaling = {}
     for count in (1, len(gpus)) if len(gpus) > 1 else ():
@@ -179,6 +190,7 @@ def run(
         "ratios": ratios,
         "scaling": scaling,
         "blocks": blocks,
+        "compiled": compiles,
         "machine": {"device": _device_name(device), **about},
         "seconds": time.perf_counter() - begin,
     }
@@ -193,12 +205,13 @@ def _pair(
     steps: int,
     iterations: int,
     repeats: int,
+    compiles: bool = False,
 ) -> list[dict[str, Any]]:
     """Figures of both tasks at one number of environments."""
     with ExitStack() as stack:
         tasks: list[BenchTask] = []
         for name in names:
-            tasks.append(BenchTask(name, envs=envs, device=device))
+            tasks.append(BenchTask(name, envs=envs, device=device, compiles=compiles))
             stack.callback(tasks[-1].close)
             report(f"{envs:,} environments of {name} built")
         before = [one.physics_steps for one in tasks]
@@ -261,8 +274,10 @@ def rate_table(found: dict[str, Any]) -> Table:
     )
     machine_note = (
         f"{version['device']}, "
-        f"{'with' if captured else 'WITHOUT'} CUDA graphs, mjlab {version['mjlab']}, MuJoCo Warp "
-        f"{version['mujoco-warp']}, rsl_rl {version['rsl-rl-lib']}, PyTorch {version['torch']}; "
+        f"{'with' if captured else 'WITHOUT'} CUDA graphs, pronk's task "
+        f"{'compiled' if found.get('compiled') else 'not compiled'}, mjlab {version['mjlab']}, "
+        f"MuJoCo Warp {version['mujoco-warp']}, rsl_rl {version['rsl-rl-lib']}, "
+        f"PyTorch {version['torch']}; "
         f"{found['seconds']:.0f} s in all."
     )
 
@@ -298,6 +313,7 @@ def train(
     repeats: int = 4,
     device: str = "auto",
     gpu_ids: str = "0",
+    compile: bool = False,
 ) -> console.Outcome:
     """Steps per second of the jump task and of mjlab's own Go1 task.
 
@@ -308,6 +324,7 @@ def train(
         repeats: Blocks of each task, taken in turn.
         device: auto, cuda or cpu (to try it out).
         gpu_ids: GPUs, such as 0,1: training on one and on all of them as well.
+        compile: Compile pronk's task, as `pronk train --compile` does.
     """
     counts, gpus = ([word.strip() for word in text.split(",")] for text in (envs, gpu_ids))
     for option, words in (("--envs", counts), ("--gpu-ids", gpus)):
@@ -331,5 +348,6 @@ def train(
         repeats=repeats,
         device=f"cuda:{gpus[0]}" if on_gpu else "cpu",
         gpus=gpus if on_gpu else (),
+        compiles=compile,
     )
     return finish(found, rate_table(found))

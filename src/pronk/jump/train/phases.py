@@ -227,7 +227,7 @@ class Curriculum:
             if name in phase.jump_scales:
                 term.params["jump_scale"] = _between(phase.jump_scales[name], done)
         command = motion_command(env)
-        command.state.liftoff_std = _between(phase.liftoff_std, done)
+        command.state.set_liftoff_std(_between(phase.liftoff_std, done))
         command.cfg.jump_fraction = 0.5 if phase.jump else 0.0
         start, end = phase.guidance
         command.guidance_scale = end + (start - end) * (1.0 - done) ** 2

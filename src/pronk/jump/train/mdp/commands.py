@@ -6,6 +6,7 @@ last step, and the ranges of the velocities. Masks are used, so that no step wai
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -14,14 +15,18 @@ import tyro
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
+from pronk.jump.train.compiled import compiled_step, ordinary_tensors
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import foot_sweep, guidance
 from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
 from pronk.jump.train.mdp.motion import (
+    RobotFrames,
+    SimulatorState,
     StepMotion,
     measure_motion,
     mirror_joints,
+    simulator_state,
     standing_leg,
 )
 from pronk.jump.train.mdp.speed_ranges import SpeedRanges
@@ -146,9 +151,20 @@ class MotionCommand(CommandTerm):
         geoms, _ = entity.find_geoms(collision_geoms, preserve_order=True)
         self.foot_geoms: Tensor = entity.indexing.geom_ids[geoms].long()
         """Ids of the feet's geoms. (4,)"""
+        self.frames = RobotFrames(
+            body=self.body,
+            feet=self.feet,
+            shanks=env.sim.model.site_bodyid[self.feet],
+            forward=entity.data.forward_vec_b,
+            gravity=entity.data.gravity_vec_w,
+        )
+        """What is needed of the robot's model to measure motion."""
+        self.step_s: float | Tensor = env.step_dt
+        """Duration of the step just simulated [s]; a tensor, (), once `compile` was called."""
         self._motion: StepMotion | None = None
         self._motion_step = -1
         self._jump_scales: dict[float, Tensor] = {}
+        self._is_compiled = False
 
     @property
     def command(self) -> Tensor:
@@ -189,24 +205,48 @@ class MotionCommand(CommandTerm):
     @property
     def motion(self) -> StepMotion:
         """Motion in the step just simulated; measured once a step, on first use."""
+        if torch.compiler.is_compiling():
+            # Rewards that are compiled are computed after the motion was measured.
+            assert self._motion is not None
+            return self._motion
         step = self._env.common_step_counter
         if self._motion is None or self._motion_step != step:
-            self._motion = measure_motion(self._env, self.body, self.feet, self._motion)
             self._motion_step = step
             self._jump_scales.clear()
-            self._advance_state(self._motion)
+            if isinstance(self.step_s, Tensor):
+                self.step_s.fill_(self._env.step_dt)
+            else:
+                self.step_s = self._env.step_dt
+            state = simulator_state(self._env)
+            if not self._is_compiled:
+                self._motion = self._measure(state, self._motion)
+            elif self._motion is not None:
+                self._motion = self._compiled_measure(state, self._motion)
+            else:
+                with ordinary_tensors():
+                    self._motion = self._measure(state, None)
         return self._motion
 
-    def scaled_in_jump_mode(self, value: Tensor, scale: float) -> Tensor:
-        """Multiply a reward of each robot, (N,), by `scale` where it is in jump mode."""
+    def compile(self) -> None:
+        """Compile what is computed in every step, with tensors for the numbers that change."""
+        self._is_compiled = True
+        self.step_s = torch.tensor(self._env.step_dt, device=self.device)
+        self.state.liftoff_std = torch.tensor(self.state.liftoff_std, device=self.device)
+        self._compiled_measure = compiled_step(self._measure)
+
+    def scaled_in_jump_mode(self, value: Tensor, scale: float | Tensor) -> Tensor:
+        """Multiply a reward of each robot, (N,), by `scale`, (), where it is in jump mode."""
+        if isinstance(scale, Tensor):
+            return torch.where(self.state.mode, value * scale, value)
         if scale == 1.0:
             return value
         if scale not in self._jump_scales:
             self._jump_scales[scale] = torch.where(self.state.mode, scale, 1.0)
         return value * self._jump_scales[scale]
 
-    def _advance_state(self, motion: StepMotion) -> None:
-        """Advance the state of the jumps and the ranges of the velocities by a step."""
+    def _measure(self, state: SimulatorState, before: StepMotion | None) -> StepMotion:
+        """Measure the motion in a step; advance the jumps and the ranges of the velocities."""
+        motion = measure_motion(state, self.frames, before)
         trunk = motion.trunk
         horizontal = trunk.velocity_heading
         target = self.target
@@ -230,9 +270,10 @@ class MotionCommand(CommandTerm):
             direction=way / way_norm.clamp_min(1e-6),
             extension=motion.legs.length - self._standing_leg,
         )
-        self.state.advance(inputs, self._env.step_dt)
+        self.state.advance(inputs, self.step_s)
         if not self.scripted:
             self.ranges.advance(horizontal - commanded, ~self.state.mode)
+        return motion
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
         """Draw commands for robots that start a new episode, and clear their jumps."""
@@ -256,6 +297,11 @@ class MotionCommand(CommandTerm):
         self._env.scene["feet"].update(0.0)
         if env_ids is not None:
             return
+        with ordinary_tensors() if self._is_compiled else nullcontext():
+            self._advance_commands(dt)
+
+    def _advance_commands(self, dt: float | Tensor) -> None:
+        """Draw commands anew where an interval is over, and set the guidance."""
         if not self.scripted:
             self.time_left -= dt
             due = self.time_left <= 0.0
@@ -296,7 +342,8 @@ class MotionCommand(CommandTerm):
         uniform = torch.rand(7, count, device=self.device)
         axes = self._axes[torch.bucketize(uniform[3], self._draw_ends)]
         widths = 2.0 * self.ranges.fraction * self._limits
-        velocity = (uniform[:3].T - 0.5) * widths * axes
+        # The first factor decides how the product lies in memory.
+        velocity = axes * ((uniform[:3].T - 0.5) * widths)
         time, on, off = torch.lerp(self._shortest, self._longest, uniform[4:])
         return velocity, time, on, off
 

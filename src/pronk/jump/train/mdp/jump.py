@@ -138,8 +138,9 @@ class JumpState:
             settings: Definition of a good jump.
         """
         self.settings = settings
-        self.liftoff_std = 1.0
-        """Standard deviation of the lift-off kernel [m/s]; a phase sets it."""
+        self.liftoff_std: float | Tensor = 1.0
+        """Standard deviation of the lift-off kernel [m/s], where it is a tensor (); a phase sets
+        it by `set_liftoff_std`."""
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(count, *shape, device=device)
@@ -178,6 +179,13 @@ class JumpState:
         # `prompt_s` on.
         self.similarity = zeros()
 
+    def set_liftoff_std(self, std: float) -> None:
+        """Set the standard deviation of the lift-off kernel [m/s]."""
+        if isinstance(self.liftoff_std, Tensor):
+            self.liftoff_std.fill_(std)
+        else:
+            self.liftoff_std = std
+
     def reset(self, env_ids: Tensor) -> None:
         """Clear the state of some robots, env_ids (n,)."""
         for value in (
@@ -209,7 +217,7 @@ class JumpState:
         ):
             value[env_ids] = 0
 
-    def advance(self, inputs: JumpInputs, dt: float) -> None:
+    def advance(self, inputs: JumpInputs, dt: float | Tensor) -> None:
         """Advance by one policy step.
 
         Args:

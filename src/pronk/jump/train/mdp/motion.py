@@ -123,36 +123,101 @@ def standing_leg(body: Legged) -> float:
     return float(leg_length(body, torch.tensor(body.default_position["knee"]).double()))
 
 
+@dataclass(kw_only=True)
+class SimulatorState:
+    """What the simulator computed in one step, of N robots with L legs, J joints and B bodies.
+
+    The tensors are the simulator's own, which it writes to.
+    """
+
+    qpos: Tensor
+    """Position and quaternion of the trunk, then joint angles. (N, 7 + J)"""
+    qvel: Tensor
+    """Velocity and angular velocity of the trunk, then joint speeds. (N, 6 + J)"""
+    torque: Tensor
+    """Torques of the drives [N m]. (N, J)"""
+    sites: Tensor
+    """Positions of all sites in the world's frame [m]. (N, sites, 3)"""
+    bodies: Tensor
+    """Positions of all bodies in the world's frame [m]. (N, B, 3)"""
+    centre_of_mass: Tensor
+    """Centre of mass of the robot in the world's frame [m]. (N, 3)"""
+    body_velocity: Tensor
+    """Angular and linear velocity of all bodies at the centre of mass. (N, B, 6)"""
+    feet_found: Tensor
+    """Number of contacts of each foot with the ground. (N, L)"""
+    feet_force: Tensor
+    """Force of the ground on each foot [N]. (N, L, 3)"""
+    limbs_found: Tensor
+    """Number of contacts of each other part with the ground. (N, parts)"""
+
+
+def simulator_state(env: ManagerBasedRlEnv) -> SimulatorState:
+    """Return what the simulator computed in the step just simulated."""
+    robot = env.scene["robot"].data
+    physics = env.sim.data
+    ground = env.scene["feet"].data
+    # mjlab's arrays are no tensors; an index makes them tensors without a copy.
+    return SimulatorState(
+        qpos=physics.qpos[:],
+        qvel=physics.qvel[:],
+        torque=robot.actuator_force,
+        sites=physics.site_xpos[:],
+        bodies=physics.xpos[:],
+        centre_of_mass=physics.subtree_com[:, robot.indexing.root_body_id],
+        body_velocity=physics.cvel[:],
+        feet_found=ground.found,
+        feet_force=ground.force,
+        limbs_found=env.scene["limbs"].data.found,
+    )
+
+
+@dataclass(kw_only=True)
+class RobotFrames:
+    """What is needed of a robot's model to measure motion; unit vectors are of all robots."""
+
+    body: Legged
+    """Dimensions of the robot."""
+    feet: Tensor
+    """Ids of the foot sites in the model. (L,)"""
+    shanks: Tensor
+    """Ids of the bodies that the feet belong to. (L,)"""
+    forward: Tensor
+    """Direction that is ahead, in the trunk's frame. (N, 3)"""
+    gravity: Tensor
+    """Direction of gravity in the world's frame. (N, 3)"""
+
+
 def measure_motion(
-    env: ManagerBasedRlEnv, body: Legged, feet: Tensor, before: StepMotion | None
+    state: SimulatorState, frames: RobotFrames, before: StepMotion | None
 ) -> StepMotion:
     """Measure the step just simulated.
 
     Args:
-        env: The environment.
-        body: Dimensions of the robot.
-        feet: Ids of the foot sites in the model, (L,).
+        state: What the simulator computed.
+        frames: The robot's model.
         before: Motion in the step before; None where there is none.
     """
-    robot = env.scene["robot"].data
-    physics = env.sim.data
-    ground = env.scene["feet"].data
+    body = frames.body
+    feet = frames.feet
+    shanks = frames.shanks
     # Copies: a reset writes to the state before `StepMotion.reset` is called.
-    qpos = physics.qpos.clone()
-    qvel = physics.qvel.clone()
+    qpos = state.qpos.clone()
+    qvel = state.qvel.clone()
     velocity = qvel[:, :3]  # of a free joint: of the body's origin, in the world's frame
-    ahead = quat_apply(qpos[:, 3:7], robot.forward_vec_b)[:, :2]
+    ahead = quat_apply(qpos[:, 3:7], frames.forward)[:, :2]
     heading = torch.nn.functional.normalize(ahead, dim=-1)
     forward = (velocity[:, :2] * heading).sum(dim=-1)
     left = velocity[:, 1] * heading[:, 0] - velocity[:, 0] * heading[:, 1]
-    foot = physics.site_xpos[:, feet]
-    com = physics.subtree_com[:, robot.indexing.root_body_id].unsqueeze(1)
-    shanks = env.sim.model.site_bodyid[feet]
-    foot_velocity = compute_velocity_from_cvel(foot, com, physics.cvel[:, shanks])[..., :3]
-    torque = robot.actuator_force
+    foot = state.sites[:, feet]
+    centre = state.centre_of_mass.unsqueeze(1)
+    foot_velocity = compute_velocity_from_cvel(foot, centre, state.body_velocity[:, shanks])[
+        ..., :3
+    ]
+    torque = state.torque
     # A free joint has seven positions; the knee has its place among the joints of each leg.
     knees = qpos[:, 7 + body.leg_joints.index("knee") :: len(body.leg_joints)]
-    limb_contacts = env.scene["limbs"].data.found > 0
+    limb_contacts = state.limbs_found > 0
     return StepMotion(
         joints=JointMotion(
             position=qpos[:, 7:],
@@ -165,17 +230,17 @@ def measure_motion(
             velocity_world=velocity,
             velocity_heading=torch.stack((forward, left), dim=-1),
             angular_velocity=qvel[:, 3:6],
-            gravity=quat_apply_inverse(qpos[:, 3:7], robot.gravity_vec_w),
+            gravity=quat_apply_inverse(qpos[:, 3:7], frames.gravity),
             heading=heading,
         ),
         legs=LegMotion(
-            contact=ground.found > 0,
-            force=torch.linalg.vector_norm(ground.force, dim=-1),
+            contact=state.feet_found > 0,
+            force=torch.linalg.vector_norm(state.feet_force, dim=-1),
             foot_position=foot[..., :2],
             foot_height=foot[..., 2] - body.foot_radius,
             foot_velocity=foot_velocity,
             foot_velocity_change=foot_velocity - (before.legs.foot_velocity if before else 0.0),
-            knee_height=physics.xpos[:, shanks, 2],
+            knee_height=state.bodies[:, shanks, 2],
             length=leg_length(body, knees),
         ),
         non_foot_contacts=limb_contacts.sum(dim=-1, dtype=torch.float32),

@@ -8,12 +8,16 @@ that pronk makes.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import torch
 from mjlab.managers import RewardTermCfg
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
+
+from pronk.jump.train.compiled import compiled_step
+from pronk.jump.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -39,6 +43,17 @@ class StackedRewardManager(RewardManager):
         """Sum of each term and robot in this episode. (terms, N)"""
         self._zero = torch.zeros(self.num_envs, device=self.device)
         self._weights: list[float] = []
+        self._scales: list[float] = []
+        self._calls: list[tuple[Callable[..., Tensor], dict[str, Any], bool]] = []
+        self._compiled_rates: Callable[..., Tensor] | None = None
+
+    def compile(self) -> None:
+        """Compile the terms together.
+
+        Weights and factors in jump mode, which phases change, become tensors; all terms are
+        computed, also those without a weight, so that no phase changes what is compiled.
+        """
+        self._compiled_rates = compiled_step(self._rates)
 
     def compute(self, dt: float) -> Tensor:
         """Compute the reward of a step.
@@ -54,17 +69,41 @@ class StackedRewardManager(RewardManager):
             self._weights = weights
             self._weight_tensor = torch.tensor(weights, device=self.device)[:, None]
         values = []
-        for term in self._term_cfgs:
-            value = term.func(self._env, **term.params) if term.weight else self._zero
-            values.append(value)
-        # A robot whose state is not finite ends its episode; its last reward must be finite.
-        rates = torch.stack(values) * self._weight_tensor
-        rates = torch.nan_to_num(rates, nan=0.0, posinf=0.0, neginf=0.0)
+        if self._compiled_rates is None:
+            for term in self._term_cfgs:
+                value = term.func(self._env, **term.params) if term.weight else self._zero
+                values.append(value)
+            rates = _finite_rates(values, self._weight_tensor)
+        else:
+            _ = motion_command(self._env).motion  # measured before, in a function of its own
+            rates = self._compiled_rates(self._weight_tensor, self._scale_tensor())
         scale = dt if self._scale_by_dt else 1.0
         self._sums.add_(rates, alpha=scale)
         self._step_reward = rates.T
         self._reward_buf = rates.sum(dim=0) * scale
         return self._reward_buf
+
+    def _scale_tensor(self) -> Tensor:
+        """Return the terms' factors in jump mode, (terms,); 1 where a term has none."""
+        scales = [term.params.get("jump_scale", 1.0) for term in self._term_cfgs]
+        if scales != self._scales:
+            self._scales = scales
+            self._calls = []
+            for term in self._term_cfgs:
+                constants = {name: x for name, x in term.params.items() if name != "jump_scale"}
+                self._calls.append((term.func, constants, "jump_scale" in term.params))
+            self._stored_scales = torch.tensor(scales, device=self.device)
+        return self._stored_scales
+
+    def _rates(self, weights: Tensor, scales: Tensor) -> Tensor:
+        """Compute all terms, weighed, with factors in jump mode that are tensors. (terms, N)."""
+        values = []
+        for i, (function, constants, has_scale) in enumerate(self._calls):
+            if has_scale:
+                values.append(function(self._env, jump_scale=scales[i], **constants))
+            else:
+                values.append(function(self._env, **constants))
+        return _finite_rates(values, weights)
 
     def reset(self, env_ids: Tensor | slice | None = None) -> dict[str, Tensor]:
         """Begin new episodes.
@@ -84,3 +123,9 @@ class StackedRewardManager(RewardManager):
         for name, mean in zip(self._term_names, means, strict=True):
             log[f"Episode_Reward/{name}"] = mean
         return log
+
+
+def _finite_rates(values: list[Tensor], weights: Tensor) -> Tensor:
+    """Weigh the terms of a step, (N,) each, with weights (terms, 1). (terms, N)."""
+    # A robot whose state is not finite ends its episode; its last reward must be finite.
+    return torch.nan_to_num(torch.stack(values) * weights, nan=0.0, posinf=0.0, neginf=0.0)

@@ -7,7 +7,8 @@ changes before PPO has used them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,10 +16,12 @@ import torch
 from mjlab.rl import RslRlPpoAlgorithmCfg
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
+from rsl_rl.modules import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
+from pronk.jump.train.compiled import compiled, compiled_step
 from pronk.jump.train.rl.networks import JUMP_WEIGHT, EstimatorActor, JumpCritic, average
 
 TARGET_GROUP = "estimator_target"
@@ -81,6 +84,9 @@ class EstimatorPPO(PPO):
     optimizer: torch.optim.Optimizer
     estimator_cfg: EstimatorTrainingCfg
     estimator_optimizer: torch.optim.Optimizer
+    _compiled_policy: Callable[..., tuple[Tensor, ...]] | None = None
+    _compiled_losses: Callable[..., tuple[Tensor, ...]] | None = None
+    _compiled_estimator_losses: Callable[..., tuple[Tensor, Tensor]] | None = None
 
     @staticmethod
     def construct_algorithm(
@@ -141,6 +147,151 @@ class EstimatorPPO(PPO):
             estimator_parameters, lr=estimator_cfg.learning_rate, **options
         )
 
+    def compile(self, mode: str | None = None) -> None:
+        """Compile the policy's step and the losses with `torch.compile`.
+
+        rsl_rl calls it, and compiles actor and critic alone. Configurations that the functions here
+        do not know are left as they are.
+
+        Args:
+            mode: None for nothing.
+        """
+        is_known = (
+            type(self._raw_actor.distribution) is GaussianDistribution
+            and self._raw_actor.distribution.std_type == "scalar"
+            and not self.use_clipped_value_loss
+            and not self.normalize_advantage_per_mini_batch
+            and self.rnd is None
+            and not (self.symmetry is not None and self.symmetry.use_mirror_loss)
+            and self.schedule == "adaptive"
+        )
+        if mode is None or not is_known:
+            return
+        self._compiled_policy = compiled_step(self._policy_step)
+        self._compiled_losses = compiled(self._losses)
+        self._compiled_estimator_losses = compiled(self._raw_actor.estimator.losses)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Draw actions, (N, 12), and remember what PPO needs of the step.
+
+        Args:
+            obs: Observations by group.
+        """
+        if self._compiled_policy is None:
+            actions: Tensor = super().act(obs)
+            return actions
+        groups = _tensors(obs)
+        noise = torch.randn(len(obs), self.storage.actions.shape[-1], device=self.device)
+        actions, values, log_prob, mean, std = self._compiled_policy(groups, noise)
+        transition = self.transition
+        transition.actions = actions
+        transition.values = values
+        transition.actions_log_prob = log_prob
+        transition.distribution_params = (mean, std)
+        transition.observations = obs
+        # The logger reads the standard deviation.
+        self._raw_actor.distribution.update(mean)
+        return actions
+
+    def _policy_step(self, obs: Mapping[str, Tensor], noise: Tensor) -> tuple[Tensor, ...]:
+        """Compute a step of actor and critic.
+
+        Args:
+            obs: Observations by group, (N, size) each.
+            noise: Numbers drawn from the normal distribution, (N, 12).
+
+        Returns:
+            Actions (N, 12), values (N, 1), log-probabilities of the actions (N,), mean and standard
+            deviation of the distribution (N, 12).
+        """
+        mean, std = self._action_distribution(obs)
+        actions = mean + std * noise
+        return actions, self._raw_critic(obs), _log_prob(actions, mean, std), mean, std
+
+    def _action_distribution(self, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the actions, (N, 12) each."""
+        actor = self._raw_actor
+        mean = actor.mlp(actor.get_latent(obs))
+        std = actor.distribution.std_param.clamp(*actor.distribution.std_range)
+        return mean, std.expand_as(mean)
+
+    def _losses(
+        self, obs: Mapping[str, Tensor], batch: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Compute PPO's losses of a mini-batch.
+
+        Args:
+            obs: Observations by group, (M, size) each: samples and, behind them, mirror images.
+            batch: `actions`, (M, 12); `log_prob`, `advantages`, `returns`, (M, 1); of the n samples
+                alone `mean` and `std`, (n, 12).
+
+        Returns:
+            Surrogate loss, value loss, and of the samples alone entropy [nat] and divergence [nat].
+        """
+        mean, std = self._action_distribution(obs)
+        log_prob = _log_prob(batch["actions"], mean, std)
+        ratio = torch.exp(log_prob - batch["log_prob"].squeeze(-1))
+        advantages = batch["advantages"].squeeze(-1)
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.maximum(-advantages * ratio, -advantages * clipped_ratio).mean()
+        value = (batch["returns"] - self._raw_critic(obs)).square().mean()
+        count = len(batch["mean"])
+        new_std = std[:count]
+        entropy = (0.5 + 0.5 * math.log(2.0 * math.pi) + new_std.log()).sum(dim=-1).mean()
+        divergence = _divergence(
+            batch["mean"], batch["std"], mean[:count].detach(), new_std.detach()
+        )
+        return surrogate, value, entropy, divergence.mean()
+
+    def _update_networks(self) -> dict[str, float]:
+        """Take PPO's steps as rsl_rl does, without waiting for the device.
+
+        The learning rate, which follows the divergence, and the losses stay on the device.
+
+        Returns:
+            Mean losses by name.
+        """
+        assert self._compiled_losses is not None
+        assert self.desired_kl is not None
+        (group,) = self.optimizer.param_groups
+        rate = torch.tensor(self.learning_rate, device=self.device)
+        group["lr"] = rate
+        history = []
+        batches = self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)
+        for samples in batches:
+            old_mean, old_std = samples.old_distribution_params
+            if self.symmetry is not None:
+                self.symmetry.augment_batch(samples, len(old_mean))
+            batch = {
+                "actions": samples.actions,
+                "log_prob": samples.old_actions_log_prob,
+                "advantages": samples.advantages,
+                "returns": samples.returns,
+                "mean": old_mean,
+                "std": old_std,
+            }
+            losses = self._compiled_losses(_tensors(samples.observations), batch)
+            surrogate, value, entropy, divergence = losses
+            loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+            self.optimizer.zero_grad()
+            loss.backward()
+            divergence = average(divergence.detach(), self.gpu_world_size)
+            slower = divergence > 2.0 * self.desired_kl
+            faster = (divergence < 0.5 * self.desired_kl) & (divergence > 0.0)
+            factor = torch.where(slower, 1.0 / 1.5, torch.where(faster, 1.5, 1.0))
+            rate.mul_(factor).clamp_(1e-5, 1e-2)
+            if self.gpu_world_size > 1:
+                self.reduce_parameters()
+            for model in (self._raw_actor, self._raw_critic):
+                nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+            self.optimizer.step()
+            history.append(torch.stack((value, surrogate, entropy)).detach())
+        means = torch.stack(history).mean(dim=0).tolist()
+        self.learning_rate = float(rate)
+        group["lr"] = self.learning_rate
+        self.storage.clear()
+        return dict(zip(("value", "surrogate", "entropy"), means, strict=True))
+
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout.
 
@@ -148,9 +299,13 @@ class EstimatorPPO(PPO):
             Mean losses by name: PPO's, `estimator_contact` [nat] and `estimator_velocity`
             [m^2/s^2].
         """
-        losses: dict[str, float] = super().update()
-        if isinstance(self.symmetry, MirrorAugmentation):
-            del losses["symmetry"]
+        losses: dict[str, float]
+        if self._compiled_losses is None:
+            losses = super().update()
+            if isinstance(self.symmetry, MirrorAugmentation):
+                del losses["symmetry"]
+        else:
+            losses = self._update_networks()
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
         for model in (self._raw_actor, self._raw_critic):
@@ -170,11 +325,12 @@ class EstimatorPPO(PPO):
         coefficients = torch.tensor(
             [cfg.contact_coef, cfg.velocity_coef], device=self.device
         ).unbind()
+        losses = self._compiled_estimator_losses or estimator.losses
         history: list[Tensor] = []
         for _ in range(cfg.epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
             for rows in order.tensor_split(cfg.mini_batches):
-                contact_loss, velocity_loss = estimator.losses(inputs[rows], targets[rows])
+                contact_loss, velocity_loss = losses(inputs[rows], targets[rows])
                 optimizer.zero_grad()
                 torch.autograd.backward((contact_loss, velocity_loss), coefficients)
                 if self.gpu_world_size > 1:
@@ -273,3 +429,21 @@ class EstimatorPPO(PPO):
             moments[place_of[number]] = moment
         wide_group = {**group, "params": list(range(len(parameters)))}
         return {"state": moments, "param_groups": [wide_group]}
+
+
+def _tensors(obs: TensorDict) -> dict[str, Tensor]:
+    """Return groups of observations as a dictionary."""
+    return {str(name): x for name, x in obs.items()}
+
+
+def _log_prob(actions: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Return the log-probability density of actions that are normally distributed. (N,)."""
+    densities = -0.5 * ((actions - mean) / std).square() - std.log() - 0.5 * math.log(2.0 * math.pi)
+    return densities.sum(dim=-1)
+
+
+def _divergence(mean: Tensor, std: Tensor, new_mean: Tensor, new_std: Tensor) -> Tensor:
+    """Return the Kullback-Leibler divergence of new normal distributions from old ones. (N,)."""
+    ratio = (std / new_std).square()
+    distance = ((mean - new_mean) / new_std).square()
+    return 0.5 * (ratio + distance - 1.0 - ratio.log()).sum(dim=-1)

@@ -24,6 +24,7 @@ import torch
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 
 from pronk.errors import ArtefactError, PronkError
+from pronk.jump.train import compiled
 from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
@@ -55,7 +56,8 @@ class JumpRunnerCfg(RslRlOnPolicyRunnerCfg):
     recipe_sha256: str = ""
     """Hash of the recipe, likewise; empty without one."""
     torch_compile_mode: str | None = None
-    """Mode of torch.compile for actor and critic, which rsl_rl reads; None for none."""
+    """`default` to compile the steps of robots and networks (`pronk.jump.train.compiled`), which
+    changes how they round; None for none. The name is rsl_rl's."""
 
 
 class PronkRunner(MjlabOnPolicyRunner):
@@ -86,7 +88,13 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"num_steps_per_env is {steps}, but the curriculum counts "
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
+        compiles = train_cfg.get("torch_compile_mode") is not None
+        if compiles:
+            compiled.prepare(device)
         super().__init__(env, train_cfg, log_dir, device)
+        if compiles:
+            motion_command(env.unwrapped).compile()
+            env.unwrapped.reward_manager.compile()
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
@@ -125,7 +133,9 @@ class PronkRunner(MjlabOnPolicyRunner):
             self.env.episode_length_buf = torch.randint_like(
                 self.env.episode_length_buf, high=int(self.env.max_episode_length)
             )
-        obs = self.env.get_observations().to(self.device)
+        with torch.inference_mode():
+            # Of the kind of all later ones, which compiled functions are compiled for.
+            obs = self.env.get_observations().to(self.device).clone()
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
