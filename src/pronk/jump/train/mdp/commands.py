@@ -159,8 +159,7 @@ class MotionCommand(CommandTerm):
             gravity=entity.data.gravity_vec_w,
         )
         """What is needed of the robot's model to measure motion."""
-        self.step_s: float | Tensor = env.step_dt
-        """Duration of the step just simulated [s]; a tensor, (), once `compile` was called."""
+        self._step_s = torch.tensor(env.step_dt, device=device)
         self._motion: StepMotion | None = None
         self._motion_step = -1
         self._jump_scales: dict[float, Tensor] = {}
@@ -203,6 +202,11 @@ class MotionCommand(CommandTerm):
         return joint_position_action(self._env)._processed_actions
 
     @property
+    def step_s(self) -> float | Tensor:
+        """Duration of the step just simulated [s]; a tensor, (), once `compile` was called."""
+        return self._step_s if self._is_compiled else self._env.step_dt
+
+    @property
     def motion(self) -> StepMotion:
         """Motion in the step just simulated; measured once a step, on first use."""
         if torch.compiler.is_compiling():
@@ -213,14 +217,12 @@ class MotionCommand(CommandTerm):
         if self._motion is None or self._motion_step != step:
             self._motion_step = step
             self._jump_scales.clear()
-            if isinstance(self.step_s, Tensor):
-                self.step_s.fill_(self._env.step_dt)
-            else:
-                self.step_s = self._env.step_dt
             state = simulator_state(self._env)
             if not self._is_compiled:
                 self._motion = self._measure(state, self._motion)
-            elif self._motion is not None:
+                return self._motion
+            self._step_s.fill_(self._env.step_dt)
+            if self._motion is not None:
                 self._motion = self._compiled_measure(state, self._motion)
             else:
                 with ordinary_tensors():
@@ -230,7 +232,6 @@ class MotionCommand(CommandTerm):
     def compile(self) -> None:
         """Compile what is computed in every step, with tensors for the numbers that change."""
         self._is_compiled = True
-        self.step_s = torch.tensor(self._env.step_dt, device=self.device)
         self.state.liftoff_std = torch.tensor(self.state.liftoff_std, device=self.device)
         self._compiled_measure = compiled_step(self._measure)
 
