@@ -82,6 +82,7 @@ class EstimatorPPO(PPO):
     _raw_actor: EstimatorActor
     _raw_critic: JumpCritic
     optimizer: torch.optim.Optimizer
+    learning_rate: float
     estimator_cfg: EstimatorTrainingCfg
     estimator_optimizer: torch.optim.Optimizer
     _compiled_policy: Callable[..., tuple[Tensor, ...]] | None = None
@@ -433,7 +434,8 @@ class EstimatorPPO(PPO):
 
 def _tensors(obs: TensorDict) -> dict[str, Tensor]:
     """Return groups of observations as a dictionary."""
-    return {str(name): x for name, x in obs.items()}
+    groups: dict[str, Tensor] = obs.to_dict()
+    return groups
 
 
 def _log_prob(actions: Tensor, mean: Tensor, std: Tensor) -> Tensor:
