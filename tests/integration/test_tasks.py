@@ -32,7 +32,12 @@ from pronk.robots.model import bench_spec
 from training_env import MATCHED, ROBOT, config, fresh, nominal
 
 pytestmark = pytest.mark.train
-NAMES = {"Pronk-Jump-MiniCheetah": "jump", "Pronk-Walk-MiniCheetah": "walk"}
+NAMES = {
+    "Pronk-Jump-MiniCheetah": "jump",
+    "Pronk-Walk-MiniCheetah": "walk",
+    "Pronk-Jump-Go2": "jump",
+    "Pronk-Walk-Go2": "walk",
+}
 
 
 def test_mjlab_knows_the_tasks_whatever_is_imported_first() -> None:

@@ -4,8 +4,8 @@ mjlab finds this package by its entry point, so its `train`, `play` and `list-en
 `Pronk-Jump-ROBOT` (the whole recipe) and `Pronk-Walk-ROBOT` (phase 1 alone), with nominal gains.
 `pronk train` builds the same configurations with the given gains.
 
-A robot outside this package has a task if `env_cfgs.py` (with `env_cfg`) and, optionally,
-`rl_cfg.py` (with `rl_cfg`) lie beside its `robot.yaml`.
+What differs for a robot lies beside its `robot.yaml`: `env_cfgs.py` (with `env_cfg`) and,
+optionally, `rl_cfg.py` (with `rl_cfg`). With them a robot outside this package has a task, too.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import PronkRunner
 from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
-from pronk.robots import load_robot
+from pronk.robots import load_robot, robot_file_path
 from pronk.robots.robot import RobotSpec
 
-ROBOTS = ("mini_cheetah",)
+ROBOTS = ("mini_cheetah", "go2")
 """Robots of this package with a task."""
 JUMP_TASK = "Pronk-Jump-MiniCheetah"
 """Name of the registered task with all phases."""
@@ -55,12 +55,12 @@ def load_task(robot: str) -> Task:
         PronkError: The robot has no task, or a file of it cannot be used.
     """
     spec = load_robot(robot)
-    if spec.source in ROBOTS:
-        return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
-    folder = Path(spec.source).parent
+    folder = robot_file_path(spec.source).parent
     env_file = folder / "env_cfgs.py"
     rl_file = folder / "rl_cfg.py"
     if not env_file.is_file():
+        if spec.source in ROBOTS:
+            return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
         raise PronkError(
             f"{robot} has no training task: expected {env_file} with a function env_cfg, or one of "
             f"the robots {', '.join(ROBOTS)}."

@@ -37,6 +37,7 @@ from pronk.jump.train.mdp import actions, commands, events, observations, termin
 from pronk.jump.train.mdp.actuators import drive_cfgs
 from pronk.jump.train.mdp.motion import mirror_joints
 from pronk.jump.train.tasks.reward_weights import reward_weights
+from pronk.jump.train.tasks.robot_scale import robot_scale
 from pronk.policy.observation import ACTIONS, HISTORY
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
@@ -97,7 +98,7 @@ def jump_env_cfg(
         },
         commands={commands.NAME: commands.MotionCommandCfg(robot=robot.source, gains=gains)},
         events=_events(robot, gains, gain_shape),
-        rewards=reward_weights(),
+        rewards=reward_weights(robot_scale(legged(robot.source))),
         terminations={
             "time_out": TerminationTermCfg(
                 func=terminations.time_out,

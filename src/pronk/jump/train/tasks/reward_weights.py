@@ -6,6 +6,9 @@ brings returns to the order of ten that PPO's usual settings are made for. Each 
 explained beside its weight. In jump mode a weight is multiplied by the term's `jump_scale`: the
 second column of the paper's table. A phase of training changes weights and jump scales
 (`pronk.jump.train.phases`).
+
+Heights, and weights of terms in metres or newton metres, follow the size of the robot: a robot that
+stands as the Mini Cheetah does, only larger, loses as much by each term.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from mjlab.managers import RewardTermCfg
 from torch import Tensor
 
 from pronk.jump.train.mdp import rewards
+from pronk.jump.train.tasks.robot_scale import MINI_CHEETAH, RobotScale
 
 PAPER_UNIT = 20.0
 """One unit of a weight here is this many of the paper's."""
@@ -26,8 +30,16 @@ def _term(func: Callable[..., Tensor], weight: float, **params: float) -> Reward
     return RewardTermCfg(func=func, weight=weight, params=params)
 
 
-def reward_weights() -> dict[str, RewardTermCfg]:
-    """The terms with the weights of phase 1; the paper's are walking | jumping."""
+def reward_weights(scale: RobotScale = MINI_CHEETAH) -> dict[str, RewardTermCfg]:
+    """Return the terms with the weights of phase 1; the paper's are walking | jumping.
+
+    Args:
+        scale: Size of the robot over that of the Mini Cheetah, which the numbers below are for.
+    """
+    length = scale.length
+    area = length**2
+    torque = scale.torque
+    torque_square = torque**2
     return {
         # Paper 45 | 45.
         "tracking_linear": _term(rewards.tracking_linear, 2.25, variance=0.25),
@@ -44,26 +56,28 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         "vertical_velocity": _term(rewards.vertical_velocity, -2.5, jump_scale=0.0),
         # Paper -0.2 | -0.2, which is -0.01 here: a trot changes its torques by 5 N m a step and
         # joint and would lose 3 of the 5.5 that tracking can earn.
-        "smoothness": _term(rewards.smoothness, -0.0002, jump_scale=0.5),
+        "smoothness": _term(rewards.smoothness, -0.0002 / torque_square, jump_scale=0.5),
         # Paper -20 | -120, -6 here. Half: the highest and furthest jumps pitch up by .3 rad.
         "orientation": _term(rewards.orientation, -1.0, jump_scale=3.0),
         # Paper -50 | -50. Twice as much: at -2.5 a policy set a knee down whenever it stopped.
         "collision": _term(rewards.collision, -5.0, jump_scale=1.0),
         # Paper -900 | -900, -45 here: the drive clips what exceeds the limit, and a position
         # command beyond reach is how a policy commands full torque.
-        "torque_limits": _term(rewards.torque_over_limits, -0.02, jump_scale=0.25),
+        "torque_limits": _term(rewards.torque_over_limits, -0.02 / torque, jump_scale=0.25),
         # Paper -150 | -150.
         "position_limits": _term(rewards.position_over_limits, -7.5),
         # Paper -0.5 | -0.5.
         "foot_acceleration": _term(rewards.foot_acceleration, -0.025),
         # Paper -250 | -250. In a jump feet follow the jump.
-        "foot_clearance": _term(rewards.foot_clearance, -12.5, height=0.09, jump_scale=0.0),
+        "foot_clearance": _term(
+            rewards.foot_clearance, -12.5 / area, height=0.09 * length, jump_scale=0.0
+        ),
         # Paper -500 | -500, for one step of 20 ms: -0.5. More of it, and most where most can be
         # earned by a jump that ends on the side.
         "termination": _term(rewards.fall, -2.0, jump_scale=5.0),
         # Paper -0.08 | -0.08, -0.004 here: running takes 1,000 N^2 m^2 and would lose 4 of the 5.5
         # that tracking can earn.
-        "torque": _term(rewards.joint_torque, -0.0004, jump_scale=0.25),
+        "torque": _term(rewards.joint_torque, -0.0004 / torque_square, jump_scale=0.25),
         # Table II, phase 1.
         "dense_jump": _term(rewards.dense_jump, 0.0),
         "sparse_jump": _term(rewards.sparse_jump, 0.0),  # A6
@@ -77,13 +91,13 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         "roll_pitch_rate": _term(rewards.roll_pitch_rate, -0.02),
         "slip": _term(rewards.slip, -0.1, jump_scale=0.0),
         # Hops without a jump command.
-        "trunk_height": _term(rewards.trunk_height, -1500.0, above=0.0, jump_scale=0.0),
+        "trunk_height": _term(rewards.trunk_height, -1500.0 / area, above=0.0, jump_scale=0.0),
         # A trot dips by 2 cm; waiting for the next jump with bent knees is below that.
-        "crouch": _term(rewards.crouch, -500.0, below=0.02, jump_scale=0.0),
+        "crouch": _term(rewards.crouch, -500.0 / area, below=0.02 * length, jump_scale=0.0),
         # Stopping from -2 m/s, a policy came down on a hind knee, 2 cm thick.
-        "knees": _term(rewards.low_knees, -3.0, height=0.06, jump_scale=1.0),
+        "knees": _term(rewards.low_knees, -3.0, height=0.06 * length, jump_scale=1.0),
         # Jumps alike to 7 mm in the air differed by 25 mm in their landing, .16 to .23 m.
-        "landing": _term(rewards.low_landing, 0.0, height=0.22),
+        "landing": _term(rewards.low_landing, 0.0, height=0.22 * length),
         # A policy trotted on in the air and landed on one foot: 40 ms early, thighs on the ground.
         "stray_foot": _term(rewards.stray_foot, -30.0),
     }
