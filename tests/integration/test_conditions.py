@@ -40,6 +40,7 @@ from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import STILL, Script
 from pronk.report.trial_figures import draw_conditions
+from pronk.robots import load_robot
 from pronk.robots.model import bench_inertia
 
 SIM_PARAMS = load_sim_params()
@@ -240,6 +241,27 @@ def test_draws_stay_within_their_tolerances(seed: int) -> None:
             centre = np.full_like(number, tolerance.centre, dtype=float)
         # Rounded to five digits.
         assert (np.abs(value - centre) <= half_width + 1e-4 * np.abs(value)).all(), drawn
+
+
+def test_battery_and_trunk_are_drawn_in_proportion_to_the_robot() -> None:
+    """A Go2 has eight cells, whose 24 V would be empty, and weighs a quarter more."""
+    go2 = load_robot("go2")
+    params = load_sim_params(None, go2)
+    voltages = []
+    masses = []
+    for seed in range(60):
+        for drawn in bodies.draw_body(params, go2, seed=seed):
+            if drawn.parameter == "machine.bus_voltage":
+                voltages.append(drawn.value)
+            if drawn.parameter == "trunk.mass_offset":
+                masses.append(drawn.value)
+    own = params.machine.bus_voltage
+    assert 0.95 * own < min(voltages) < 0.97 * own
+    assert 1.03 * own < max(voltages) < 1.05 * own
+    assert -0.3 * 15.017 / 12.0 <= min(masses) < 0.0
+    assert 0.9 < max(masses) <= 0.9 * 1.2515
+    # The Mini Cheetah's are those of the table.
+    assert bodies.tolerances_of(ROBOT) == bodies.TOLERANCES
 
 
 def test_a_body_is_its_seed() -> None:

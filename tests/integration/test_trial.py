@@ -27,6 +27,7 @@ from pronk.jump.trial.trial import (
     load_subjects,
     prepare_folder,
     run_trial,
+    setup_of,
 )
 from pronk.jump.virtual import capture
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params
@@ -62,6 +63,14 @@ def go(policies: list[Path], out: Path, **changes: Any) -> TrialResults:
 
 
 # --- What is drawn ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_a_trial_names_the_shipped_parameters(name: str, tmp_path: Path) -> None:
+    setup = setup_of(tmp_path / "policy.onnx", tmp_path, robot=name)
+    assert setup.about["file"] == "shipped with pronk"
+    assert setup.about["sha256"]
+    assert setup.sim_params.robot == name
 
 
 def test_every_jump_has_a_start_of_its_own() -> None:

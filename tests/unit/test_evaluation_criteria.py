@@ -121,6 +121,24 @@ def test_a_bad_jump_fails_its_criterion_and_no_other(
     assert failed(evaluation(jumps=(result,))) == [f"jump forward 1: {criterion}"]
 
 
+def test_criteria_are_those_of_the_robot() -> None:
+    """A Go2 is compared with its own goals, a robot without goals with nothing."""
+    walks = []
+    for case in sim.ROBOT_WALKS["go2"]:
+        walks.append(command_result(case.name, GOOD_WALK | {"speed_error": 0.11}))
+    jumps = [command_result(case.name, GOOD_JUMP | {"height": 0.40}) for case in sim.JUMPS[:4]]
+    best = command_result("back 2", GOOD_JUMP | {"height": 0.46, "upright": 0.8})
+    go2 = evaluation(walks=tuple(walks), jumps=(*jumps, best), plan={"robot": "go2"})
+    # .11 m/s is too much for each of its four walks; 96 % upright and one height are enough.
+    assert failed(go2) == [
+        f"{name}: speed error" for name in ("forward 2", "back 2", "left 0.8", "right 0.8")
+    ]
+    fewer = replace(best, figures=best.figures | {"upright": spread(0.7)})
+    worse = replace(go2, walks=(), jumps=(*jumps, fewer))
+    assert failed(worse) == ["all jumps: upright"]
+    assert evaluation_checks(replace(go2, plan={"robot": "my_robot"})) == []
+
+
 def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
     before = dict.fromkeys(("forward 2", "back 2", "left 1", "right 1"), 0.1)
     assert cost_of_jumping(before, dict.fromkeys(before, 0.12)) == pytest.approx(1.2)

@@ -14,7 +14,7 @@ import pytest
 
 from pronk.errors import ArtefactError
 from pronk.jump.trial import tables
-from pronk.jump.trial.criteria import trial_checks
+from pronk.jump.trial.criteria import trial_checks, walk_checks
 from pronk.jump.trial.jumps import (
     ApproachFigures,
     FlightFigures,
@@ -322,6 +322,48 @@ def test_criteria_by_hand() -> None:
     assert trial_checks(trial({"matched": (0.45, 0.46)}))[-1].passed
     # Five commands of height, its scatter, distance, its scatter and success; four gaps; the best.
     assert len(checks) == 5 * 5 + 4 + 1
+
+
+def test_a_go2_has_its_own_criteria_and_no_column_of_the_paper() -> None:
+    go2 = replace(trial(), robot="go2")
+    checks = {check.name: check for check in trial_checks(go2)}
+    assert set(checks) == {"all: success", "best: height", "best: gap"}
+    assert checks["all: success"].value == pytest.approx(0.75)
+    assert checks["best: height"].value == pytest.approx(0.44)
+    assert (checks["best: height"].limit, checks["best: gap"].limit) == (0.45, 0.75)
+    shown = tables.trial_tables(go2)
+    assert not [table.title for table in shown if "paper" in table.title]
+    for table in shown:
+        headings = [column.heading for column in table.columns]
+        assert not [heading for heading in headings if "paper" in heading]
+        if table.title != tables.DEFINITIONS:
+            assert not [note for note in table.notes if "paper" in note]
+        assert {len(row) for row in table.rows} == {len(table.columns)}
+    crossed = tables.crossing_table(replace(crossings(), robot="go2"))
+    assert crossed.rows[0] == ("matched: gap, forward 2", 0.2, 0.2, 0.4)
+
+
+def test_a_robot_without_goals_has_no_criteria() -> None:
+    other = replace(trial(), robot="my_robot")
+    assert trial_checks(other) == []
+    titles = [table.title for table in tables.trial_tables(other)]
+    assert not [title for title in titles if "criteria" in title.lower()]
+
+
+def test_walks_of_a_go2_have_criteria() -> None:
+    walked = replace(walks(), robot="go2")
+    naive_first = replace(walked, subjects=tuple(reversed(walked.subjects)))
+    assert naive_first.subjects[0].name == "naive"
+    falls = walk_checks(naive_first)[-1]
+    assert (falls.name, falls.value, falls.passed) == ("all walks: falls", 1.0, False)
+    rows = []
+    for run, error in zip(walked.rows, (0.10, 0.14, 0.0, 0.0), strict=True):
+        rows.append(replace(run, figures=replace(run.figures, speed_error=error)))
+    error_check, fall_check = walk_checks(replace(walked, rows=tuple(rows)))
+    assert error_check.value == pytest.approx(0.12)
+    assert (error_check.limit, error_check.passed) == (0.10, False)
+    assert fall_check.passed
+    assert walk_checks(walks()) == [], "the Mini Cheetah's have none on the virtual robot"
 
 
 def test_criteria_of_few_jumps_say_so() -> None:

@@ -66,7 +66,12 @@ def evaluate_command(
         simulated: What is simulated.
     """
     from pronk.jump.train.devices import find_devices, require_extra
-    from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, EvaluationPlan
+    from pronk.jump.trial.training_sim.evaluation import (
+        JUMPS,
+        ROBOT_WALKS,
+        WALKS,
+        EvaluationPlan,
+    )
 
     require_extra()
     if out.suffix != ".json":
@@ -91,7 +96,7 @@ def evaluate_command(
         robot=robot,
         robots=evaluated.robots,
         seed=evaluated.seed,
-        walks=() if evaluated.what == "jump" else WALKS,
+        walks=() if evaluated.what == "jump" else ROBOT_WALKS.get(robot.name, WALKS),
         jumps=() if evaluated.what == "walk" else JUMPS,
     )
     if plan.jumps and not evaluated_policy.jump:

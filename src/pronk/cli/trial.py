@@ -133,7 +133,7 @@ def _trial_of_jumps(
 ) -> console.Outcome:
     """Jump, film, walk and cross by the options; print tables and write the page."""
     from pronk.jump.trial import tables
-    from pronk.jump.trial.criteria import trial_checks
+    from pronk.jump.trial.criteria import trial_checks, walk_checks
     from pronk.jump.trial.crossing import CrossingPlan, add_crossings
     from pronk.jump.trial.films.record import record_trial
     from pronk.jump.trial.results import SUMMARY, TABLE
@@ -161,6 +161,7 @@ def _trial_of_jumps(
         f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
     )
     films: tuple[Path, ...] = ()
+    checks = trial_checks(results)
     study_tables: list[Table] = []
     wrote = [output.out / TABLE, output.out / SUMMARY, output.out / CAPTURES]
     with console.progress() as report:
@@ -181,6 +182,10 @@ def _trial_of_jumps(
             walks = add_walks(policies, setup, seed=plan.seed, progress=report.bar("walking"))
             for subject in walks.subjects:
                 study_tables.append(tables.walk_table(walks, subject.name))
+            checks_of_walks = walk_checks(walks)
+            if checks_of_walks:
+                checks += checks_of_walks
+                study_tables.append(tables.walk_criteria_table(walks))
             wrote.append(output.out / walks.run_kind.table)
         if study.crossing:
             crossing_plan = CrossingPlan(seed=plan.seed)
@@ -199,7 +204,7 @@ def _trial_of_jumps(
         figures={
             "virtual": results.virtual,
             "tables": [*jump_tables, *study_tables],
-            "checks": [check.row() for check in trial_checks(results)],
+            "checks": [check.row() for check in checks],
             "cells": results.cells,
             "ratios": results.ratios,
             "timing": dict(timing),

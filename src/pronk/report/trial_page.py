@@ -15,7 +15,7 @@ from pronk.errors import ArtefactError
 from pronk.files import write_text
 from pronk.jump.trial import tables
 from pronk.jump.trial.criteria import trial_checks
-from pronk.jump.trial.protocol import RATES, in_paper_order
+from pronk.jump.trial.protocol import PAPER_ROBOT, RATES, in_paper_order
 from pronk.jump.trial.results import (
     SUMMARY,
     TrialResults,
@@ -184,13 +184,14 @@ def trial_part(path: Path) -> Part:
     checks = trial_checks(trial)
     passed = sum(check.passed for check in checks)
     policy = trial.subjects[0].name
+    is_paper_robot = trial.robot == PAPER_ROBOT
     panels = []
     for name in DRAWN_FIGURES:
         panels.append(
             JumpPanel(
                 label=f"{name} [m]",
                 values=jump_values(trial, name),
-                published=published_jumps(name),
+                published=published_jumps(name) if is_paper_robot else {},
             )
         )
     scatter_tables = []
@@ -208,7 +209,8 @@ def trial_part(path: Path) -> Part:
         "verdicts": verdicts,
         "cells": picture(draw_jumps(panels)),
         "table_iii": [tables.paper_table(trial, "height"), tables.paper_table(trial, "distance")],
-        "criteria": tables.criteria_table(trial),
+        "paper": is_paper_robot,
+        "criteria": tables.criteria_table(trial) if checks else None,
         "scatter_tables": scatter_tables,
         "moving": film_pictures(folder, "gif"),
         "stills": film_pictures(folder, "png"),
@@ -221,11 +223,14 @@ def trial_part(path: Path) -> Part:
         "setup": setup_table(trial.subjects),
         **_trace_content(trial, folder),
     }
+    summary = f"{policy}, {place}: {passed} of {len(checks)} acceptance criteria passed."
+    if not checks:
+        summary = f"{policy}, {place}; {trial.robot} has no acceptance criteria."
     return Part(
         kind="trial",
         title="Trial",
         virtual=trial.virtual,
-        summary=f"{policy}, {place}: {passed} of {len(checks)} acceptance criteria passed.",
+        summary=summary,
         warning=passed < len(checks),
         content=content,
         figures={"checks": [check.row() for check in checks]},

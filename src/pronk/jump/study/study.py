@@ -54,7 +54,7 @@ from pronk.jump.trial.condition_trial import SCHEMA as CONDITION_TRIAL_SCHEMA
 from pronk.jump.trial.conditions import Condition, changed_params, load_conditions
 from pronk.jump.trial.results import TrialRun, load_json
 from pronk.jump.trial.trial import software_versions
-from pronk.jump.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
+from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.names import file_name
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -210,8 +210,6 @@ def _robot_name(config: StudyConfig, folder: Path) -> str:
 
 def _sim_params(path: Path | None, spec: RobotSpec) -> SimParams:
     """Return the parameters of a file, the shipped ones, or those derived from the robot."""
-    if path is None and spec.name == SHIPPED_ROBOT:
-        path = SHIPPED
     return load_sim_params(path, spec)
 
 

@@ -8,7 +8,7 @@ one winding; and the friction at the onset of slip moves with the friction while
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -93,7 +93,13 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         "damping": _relative(0.4, "shore hardness of the feet, mats"),
     },
 }
-"""Tolerances by part of `SimParams` and name of the number."""
+"""Tolerances by part of `SimParams` and name of the number, of a robot of `MASS` and `VOLTAGE`."""
+MASS = 12.0
+"""Mass of the robot that the tolerance of the trunk's mass is for [kg]; another's is in proportion.
+"""
+VOLTAGE = 24.0
+"""Rated voltage of the drives that the tolerance of the battery is for [V]. Another battery is
+drawn about the robot's own number, as far in proportion."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +111,27 @@ class DrawnNumber:
     joint: str = ""
     """Joint that the number belongs to; empty outside of the joints."""
     value: Number
+
+
+def tolerances_of(robot: RobotSpec) -> Mapping[str, Mapping[str, Tolerance]]:
+    """Return the tolerances of a robot, those in kilograms and volts by its mass and drives.
+
+    Args:
+        robot: The robot.
+    """
+    mass_scale = round(float(robot.build_spec().compile().body_mass.sum()) / MASS, 3)
+    trunk = dict(TOLERANCES["trunk"])
+    trunk["mass_offset"] = replace(
+        trunk["mass_offset"],
+        centre=trunk["mass_offset"].centre * mass_scale,
+        half_width=trunk["mass_offset"].half_width * mass_scale,
+    )
+    machine = dict(TOLERANCES["machine"])
+    battery = machine["bus_voltage"]
+    if any(joint.drive.bus_voltage != VOLTAGE for joint in robot.joints):
+        share = battery.half_width / battery.centre
+        machine["bus_voltage"] = _relative(share, "a battery from nearly flat to full")
+    return {**TOLERANCES, "machine": machine, "trunk": trunk}
 
 
 def draw_body(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> list[DrawnNumber]:
@@ -120,13 +147,14 @@ def draw_body(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> list[Dra
     """
     sim_params.check_joints(robot.joint_names)
     rng = np.random.default_rng([seed, _STREAM])
+    tolerances = tolerances_of(robot)
     group_factors = {}
     for group in robot.groups:
         group_factors[group] = 1.0 + GROUP_TORQUE * rng.uniform(-1.0, 1.0)
     drawn_numbers = []
     for joint in robot.joints:
         nominal = sim_params.joints[joint.name]
-        drawn = _draw_part(nominal, TOLERANCES["joints"], rng)
+        drawn = _draw_part(nominal, tolerances["joints"], rng)
         drawn["torque_scale"] = _rounded(drawn["torque_scale"] * group_factors[joint.group])
         drawn["breakaway"] = _breakaway(nominal, drawn["coulomb"])
         for name, value in drawn.items():
@@ -134,7 +162,7 @@ def draw_body(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> list[Dra
                 DrawnNumber(parameter=f"joints.{name}", joint=joint.name, value=value)
             )
     for part in ("machine", "imu", "trunk", "attitude", "ground"):
-        drawn = _draw_part(getattr(sim_params, part), TOLERANCES[part], rng)
+        drawn = _draw_part(getattr(sim_params, part), tolerances[part], rng)
         for name, value in drawn.items():
             drawn_numbers.append(DrawnNumber(parameter=f"{part}.{name}", value=value))
     return drawn_numbers

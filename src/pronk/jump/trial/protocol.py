@@ -9,6 +9,8 @@ from pronk.policy.script import PAPER_VELOCITIES, STILL, Velocity, parse_velocit
 
 MeanStd = tuple[float, float]
 """Mean and standard deviation."""
+PAPER_ROBOT = "mini_cheetah"
+"""The paper's robot. Its figures stand beside no other robot's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,10 @@ _COMMANDS: Mapping[str, Velocity] = {
     "left 1": (0.0, 1.0, 0.0),
     "side -1": (0.0, -1.0, 0.0),
     "right 1": (0.0, -1.0, 0.0),
+    "side +0.8": (0.0, 0.8, 0.0),
+    "left 0.8": (0.0, 0.8, 0.0),
+    "side -0.8": (0.0, -0.8, 0.0),
+    "right 0.8": (0.0, -0.8, 0.0),
     "turn +2": (0.0, 0.0, 2.0),
     "yaw 2": (0.0, 0.0, 2.0),
     "turn -2": (0.0, 0.0, -2.0),

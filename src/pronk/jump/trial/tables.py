@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 
 from pronk.jump.trial.condition_trial import ConditionResults
-from pronk.jump.trial.criteria import CRITERIA_JUMPS, Check, trial_checks
+from pronk.jump.trial.criteria import CRITERIA_JUMPS, GOALS, Check, trial_checks, walk_checks
 from pronk.jump.trial.crossing import Climb, climbs
 from pronk.jump.trial.jumps import FIGURES, SYMBOLS, Figure
 from pronk.jump.trial.protocol import (
     PAPER_GAPS,
     PAPER_RATIOS,
+    PAPER_ROBOT,
     TABLE_III,
     in_paper_order,
 )
@@ -92,20 +93,22 @@ def trial_tables(trial: TrialResults) -> list[Table]:
     tables.append(drive_loads(trial))
     for subject in trial.subjects[1:]:
         tables.append(scatter_table(trial, subject.name))
-    tables.append(criteria_table(trial))
+    if GOALS.get(trial.robot) is not None:
+        tables.append(criteria_table(trial))
     tables.append(definitions())
     return tables
 
 
 def paper_table(trial: TrialResults, figure: str) -> Table:
-    """Return the paper's Table III beside ours, for `height` or `distance`.
+    """Return the paper's Table III beside ours, for `height` or `distance`; ours of another robot.
 
     Its last row is the mean of the standard deviations over the pooled commands.
     """
     columns = [Column(heading="command")]
     columns_of_cells: list[dict[str, str]] = []
     mean_scatter: list[float] = []
-    for gains in ("naive", "matched"):
+    is_paper_robot = trial.robot == PAPER_ROBOT
+    for gains in ("naive", "matched") if is_paper_robot else ():
         columns.append(Column(heading=f"paper, {gains}"))
         cells = {}
         stds = []
@@ -135,17 +138,18 @@ def paper_table(trial: TrialResults, figure: str) -> Table:
     for std in mean_scatter:
         scatter_cells.append(f"+- {std:.3f}" if math.isfinite(std) else NOT_MEASURED)
     rows.append(("mean scatter", *scatter_cells))
+    notes = [
+        f"{figure}: {FIGURES[figure].equation}.",
+        f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
+    ]
+    if is_paper_robot:
+        # Paper E2; that each column is of one policy is reading A21.
+        notes.append("paper: five jumps a cell on the real robot, of one policy each.")
     return Table(
         title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=(
-            f"{figure}: {FIGURES[figure].equation}.",
-            f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
-            # Paper E2; that each column is of one policy is reading A21.
-            "paper: five jumps a cell on the real robot, of one policy each.",
-            origin_note(trial),
-        ),
+        notes=(*notes, origin_note(trial)),
     )
 
 
@@ -292,7 +296,7 @@ def criteria_table(trial: TrialResults) -> Table:
             f"The criteria are meant for {CRITERIA_JUMPS} jumps with each command; these are of "
             f"{fewest}."
         )
-    title = f"Acceptance criteria of {policy}: the paper's matched column, and more"
+    title = f"Acceptance criteria of {policy}: {GOALS[trial.robot].source}"
     return check_table(title, trial_checks(trial), notes)
 
 
@@ -318,29 +322,31 @@ def scatter_table(trial: TrialResults, other: str) -> Table:
         command = ratio.case or _ALL
         if command not in commands:
             commands.append(command)
+    is_paper_robot = trial.robot == PAPER_ROBOT
     rows: list[tuple[Cell, ...]] = []
     for figure in trial.run_kind.compared:
         texts = []
         for ratio in ratios:
             if ratio.figure == figure:
                 texts.append(ratio_text(ratio).replace(" to ", "-"))
-        rows.append(
-            (figure.replace("_", " "), *texts, number(PAPER_RATIOS.get(figure, math.nan), 2))
-        )
+        if is_paper_robot:
+            texts.append(number(PAPER_RATIOS.get(figure, math.nan), 2))
+        rows.append((figure.replace("_", " "), *texts))
     columns = [Column(heading="figure")]
     for command in commands:
         columns.append(Column(heading=command, is_detail=command != _ALL))
-    columns.append(Column(heading="paper, all"))
+    notes = [f"all: ratio of the means over {', '.join(trial.pooled)}."]
+    if is_paper_robot:
+        columns.append(Column(heading="paper, all"))
+        # Reading A4: the table's own numbers are taken.
+        notes.append(
+            "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30."
+        )
     return Table(
         title=f"Standard deviations, {other} over {policy}, with 95 % bootstrap intervals",
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=(
-            f"all: ratio of the means over {', '.join(trial.pooled)}.",
-            # Reading A4: the table's own numbers are taken.
-            "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30.",
-            scatter_verdict(trial, other),
-        ),
+        notes=(*notes, scatter_verdict(trial, other)),
     )
 
 
@@ -366,7 +372,10 @@ def scatter_verdict(trial: TrialResults, other: str) -> str:
                 "command, too few for an interval"
             )
         else:
-            sentences.append(_compared_with_paper(ratio, PAPER_RATIOS[figure]))
+            sentence = f"in {figure} {_direction(ratio)}, {ratio_text(ratio)} times"
+            if trial.robot == PAPER_ROBOT:
+                sentence += _paper_position(ratio, PAPER_RATIOS[figure])
+            sentences.append(sentence)
             if ratio.low > 1.0:
                 repeated_better.append(figure)
     if repeated_better:
@@ -379,24 +388,21 @@ def scatter_verdict(trial: TrialResults, other: str) -> str:
     return f"scatter of {other} against {policy} on the {place}: {'; '.join(sentences)}; {end}."
 
 
-def _compared_with_paper(ratio: ScatterRatio, claim: float) -> str:
-    """Return how a ratio with its interval compares with 1 and with the paper's."""
+def _direction(ratio: ScatterRatio) -> str:
+    """Return how a ratio with its interval compares with 1."""
     if ratio.low > 1.0:
-        outcome = "more"
-    elif ratio.high < 1.0:
-        outcome = "less"
-    else:
-        outcome = "no clear difference"
+        return "more"
+    return "less" if ratio.high < 1.0 else "no clear difference"
+
+
+def _paper_position(ratio: ScatterRatio, claim: float) -> str:
+    """Return where the paper's ratio lies, by the interval of ours."""
+    position = "within"
     if claim > ratio.high:
         position = "above"
     elif claim < ratio.low:
         position = "below"
-    else:
-        position = "within"
-    return (
-        f"in {ratio.figure} {outcome}, {ratio_text(ratio)} times, and the paper's {claim:g} is "
-        f"{position} that interval"
-    )
+    return f", and the paper's {claim:g} is {position} that interval"
 
 
 # ---- tables of walks, crossings and conditions ----
@@ -423,33 +429,47 @@ def walk_table(walks: TrialResults, policy: str) -> Table:
     )
 
 
+def walk_criteria_table(walks: TrialResults) -> Table:
+    """Return the acceptance criteria of the first policy's walks, those that its robot has."""
+    policy = walks.subjects[0].name
+    return check_table(
+        f"Acceptance criteria of {policy}, walking", walk_checks(walks), notes=["PASSED."]
+    )
+
+
 def crossing_table(crossings: TrialResults) -> Table:
     """Return the largest obstacles that were crossed, and why larger ones were not."""
     settings = crossings.settings
-    notes = [
+    is_paper_robot = crossings.robot == PAPER_ROBOT
+    note = (
         f"crossed: in {settings['enough']} or more of {settings['runs']} runs, as were all smaller "
-        "ones. ever crossed: in any run. The paper's gaps were judged from video of jumps over "
-        "flat floor."
-    ]
+        "ones. ever crossed: in any run."
+    )
+    if is_paper_robot:
+        note += " The paper's gaps were judged from video of jumps over flat floor."
+    notes = [note]
     rows: list[tuple[Cell, ...]] = []
     for climb in climbs(crossings):
         obstacle = f"{climb.policy}: {_OBSTACLES.get(climb.shape, climb.shape)}, {climb.case}"
-        published = PAPER_GAPS.get(climb.case) if climb.shape == "gap" else None
         failed_at = _failed_at(climb)
-        rows.append((obstacle, climb.largest, climb.ever, published, failed_at))
+        row: list[Cell] = [obstacle, climb.largest, climb.ever]
+        if is_paper_robot:
+            row.append(PAPER_GAPS.get(climb.case) if climb.shape == "gap" else None)
+        rows.append((*row, failed_at))
         if failed_at is not None:
             reasons = sorted(climb.rungs[-1].reasons.items(), key=lambda item: -item[1])
             words = "; ".join(f"{reason} ({count})" for reason, count in reasons)
             notes.append(f"{obstacle}, {failed_at:.2f} m: {words}.")
+    columns = [
+        Column(heading="policy: obstacle"),
+        Column(heading="crossed", digits=2),
+        Column(heading="ever crossed", digits=2),
+    ]
+    if is_paper_robot:
+        columns.append(Column(heading="paper, from video", digits=2))
     return Table(
         title=f"{_capital_place(crossings)}, crossing: largest obstacles [m]",
-        columns=(
-            Column(heading="policy: obstacle"),
-            Column(heading="crossed", digits=2),
-            Column(heading="ever crossed", digits=2),
-            Column(heading="paper, from video", digits=2),
-            Column(heading="failed at", digits=2),
-        ),
+        columns=(*columns, Column(heading="failed at", digits=2)),
         rows=tuple(rows),
         notes=tuple(notes),
     )

@@ -44,7 +44,7 @@ from pronk.jump.trial.results import (
 from pronk.jump.virtual import capture as captures
 from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot
-from pronk.jump.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
+from pronk.jump.virtual.sim_params import SimParams, load_sim_params, shipped_file
 from pronk.policy.contract import check
 from pronk.policy.rollout import check_standing, ticks
 from pronk.policy.runtime import Policy, load_policy
@@ -383,9 +383,7 @@ def setup_of(
         processes: Number of runs at once; as many as there are cores if None.
     """
     spec = load_robot(robot or load_policy(policy).contract.robot)
-    file = sim_params
-    if file is None and spec.name == SHIPPED_ROBOT:
-        file = SHIPPED
+    file = sim_params or shipped_file(spec)
     if sim_params is not None:
         source = str(sim_params)
     elif file is not None:

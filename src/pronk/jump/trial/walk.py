@@ -10,7 +10,7 @@ comes back into the battery is taken off.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +45,10 @@ WALK_S = 20.0
 """Length of a walk [s]."""
 WALKS = named("forward 2", "back 2", "side +1", "side -1", "turn +2", "turn -2", "stand")
 """The paper's walks (R4), turning at the ends of the trained range (C3), and standing."""
+ROBOT_WALKS: Mapping[str, tuple[Case, ...]] = {
+    "go2": named("forward 2", "back 2", "side +0.8", "side -0.8", "turn +2", "turn -2", "stand"),
+}
+"""Walks of robots with other ranges."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +188,7 @@ def add_walks(
     policies: Sequence[Path],
     setup: TrialSetup,
     *,
-    cases: tuple[Case, ...] = WALKS,
+    cases: tuple[Case, ...] | None = None,
     runs: int = 20,
     seconds: float = WALK_S,
     seed: int = 0,
@@ -195,7 +199,7 @@ def add_walks(
     Args:
         policies: Files of the policies.
         setup: What the walks are on.
-        cases: Velocities.
+        cases: Velocities; None for those of the robot.
         runs: Number of walks with each velocity.
         seconds: Length of each walk [s].
         seed: Seed of all draws.
@@ -204,6 +208,8 @@ def add_walks(
     Raises:
         PronkError: A policy or parameter is impossible; nothing was run then.
     """
+    if cases is None:
+        cases = ROBOT_WALKS.get(setup.robot.name, WALKS)
     script = walk_script(STILL, seconds=seconds)
     plan = TrialPlan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
     return run_trial(policies, plan, setup, run_kind=WALK, progress=progress)

@@ -26,7 +26,7 @@ from pronk.robots.robot import Joint, RobotSpec
 
 SCHEMA = "pronk/sim_params/2"
 SHIPPED_ROBOT = "mini_cheetah"
-"""Robot whose parameters are shipped."""
+"""Robot whose parameters are taken where none is named."""
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 """File of the shipped parameters."""
 SHIPPED_FILES = {SHIPPED_ROBOT: SHIPPED, "go2": Path(__file__).with_name("go2_sim_params.yaml")}
@@ -284,12 +284,19 @@ def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = No
         return _parse_file(Path(path))
     if robot is None:
         return _parse_file(SHIPPED)
-    if robot.name not in SHIPPED_FILES:
-        return default_sim_params(robot)
-    shipped = _parse_file(SHIPPED_FILES[robot.name])
-    if set(shipped.joints) != set(robot.joint_names):  # another model of this name
-        return default_sim_params(robot)
-    return shipped
+    file = shipped_file(robot)
+    return default_sim_params(robot) if file is None else _parse_file(file)
+
+
+def shipped_file(robot: RobotSpec) -> Path | None:
+    """Return the file of parameters that is shipped for a robot; None without one.
+
+    A robot of the same name with other joints, so another model, has none.
+    """
+    file = SHIPPED_FILES.get(robot.name)
+    if file is None or set(_parse_file(file).joints) != set(robot.joint_names):
+        return None
+    return file
 
 
 def _parse_file(path: Path) -> SimParams:

@@ -38,6 +38,10 @@ WALKS = named(
     "stand",
 )
 """Velocities to keep."""
+ROBOT_WALKS: Mapping[str, tuple[Case, ...]] = {
+    "go2": named("forward 2", "back 2", "left 0.8", "right 0.8", "yaw 2", "yaw -2", "stand"),
+}
+"""Velocities of robots with other ranges."""
 JUMPS = PAPER_COMMANDS
 """Commands to jump with."""
 
