@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import pronk.robots
 from pronk.deploy.runtime.limits import AgeLimits, Limits
 from pronk.deploy.runtime.reasons import REASONS, Decision, FilterAction, Reason
-from pronk.deploy.runtime.rules import SafetyInput, apply_rules, tilt
+from pronk.deploy.runtime.rules import SafetyInput, apply_rules, limit_targets, tilt
 from pronk.deploy.runtime.safety import LEAST_DAMPING_S, SafetyFilter
 from pronk.errors import RobotError
 from pronk.robots import load_robot
@@ -379,6 +379,7 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
 def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
     """Which rows that were sent break which limit; written anew, not the filter's own code."""
     slack = 1e-6
+    reach = limits.operating.target_reach
     q = drawn.position
     v = drawn.velocity
     kp = drawn.stiffness
@@ -402,8 +403,8 @@ def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
     return {
         "finite": ~np.isfinite(target).all(axis=-1),
         "position": (
-            (target < limits.joints.low + limits.operating.margin - slack)
-            | (target > limits.joints.high - limits.operating.margin + slack)
+            (target < limits.joints.low + limits.operating.margin - reach - slack)
+            | (target > limits.joints.high - limits.operating.margin + reach + slack)
             | (out & inside)
         ).any(axis=-1),
         "change": (np.abs(target - drawn.previous) > limits.operating.change + slack).any(axis=-1),
@@ -452,6 +453,47 @@ def test_a_million_states_and_commands_break_no_limit() -> None:
     assert silent - rules_over_time <= rare
     assert times_of_level.min() > 1000
     assert times_of_level.sum() == 1_000_000
+
+
+def test_targets_beyond_a_range_break_no_limit() -> None:
+    """With `target_reach` a joint near its stop is still not driven further."""
+    rng = np.random.default_rng(44)
+    limits = operating(target_reach=0.8)
+    inner = limits.joints.high - limits.operating.margin
+    beyond = 0
+    for _ in range(10):
+        drawn = wild(rng, 5_000)
+        result = apply_rules(drawn, limits)
+        sent = result.level < FilterAction.DAMP
+        with np.errstate(invalid="ignore", over="ignore"):
+            for name, breaks in broken(drawn, result.target, limits).items():
+                assert not (breaks & sent).any(), name
+            beyond += int((result.target[sent] > inner).sum())
+    assert beyond > 100, "targets beyond the range were sent"
+    with pytest.raises(RobotError, match="target_reach"):
+        operating(target_reach=limits.operating.far_target)
+
+
+def test_a_go2_gets_the_torque_of_its_knees() -> None:
+    """From the default pose to the stop of the knees its stiffness alone gives 19 N m."""
+    robot = load_robot("go2")
+    limits = Limits.of(robot)
+    pose = np.array([joint.default_position for joint in robot.joints])
+    stiffness = np.full(12, 20.0)
+    target = pose.copy()
+    target[2::3] += 2.2
+    sent, _, possible = limit_targets(
+        pose, np.zeros(12), target, target, stiffness, np.full(12, 0.5), limits
+    )
+    assert possible
+    assert 20.0 * (sent - pose)[2] > 40.0
+    # A knee that would reach its stop within the horizon is not driven there.
+    near = pose.copy()
+    near[2] = -0.95
+    speed = np.zeros(12)
+    speed[2] = 5.0
+    sent, _, _ = limit_targets(near, speed, target, near, stiffness, np.full(12, 0.5), limits)
+    assert sent[2] <= near[2]
 
 
 def test_the_table_of_reasons_is_in_the_order_of_their_numbers() -> None:

@@ -22,7 +22,7 @@ class OperatingLimits:
     """Largest damping of a command [N m s/rad]."""
     margin: float = 0.05
     """Distance that targets keep inwards from both mechanical limits [rad], positive:
-    `low + margin <= target <= high - margin`."""
+    `low + margin <= target <= high - margin`, apart from `target_reach`."""
     horizon_s: float = 0.02
     """Time for which the motion of a joint is extrapolated [s], positive. A joint with
     `position + velocity horizon_s > high - margin` is not driven further up: its target is at most
@@ -39,6 +39,10 @@ class OperatingLimits:
     """Largest angle of the trunk's z axis from the vertical [rad]; infinite for a hung robot."""
     temperature: float = 80.0
     """Largest temperature of a motor, where it is measured [deg C]."""
+    target_reach: float = 0.0
+    """Distance by which targets may lie beyond that, 0 or more [rad]. Drives whose stiffness times
+    the distance to a stop is below their torque cannot give that torque otherwise. A joint that
+    comes near its stop is still not driven further, by `horizon_s`."""
     far_target: float = 1.0
     """Distance beyond a mechanical limit from which a target is a fault [rad]; nearer ones are
     moved back."""
@@ -63,6 +67,11 @@ class OperatingLimits:
                 raise RobotError(
                     f"OperatingLimits.{name} is {number}; it must be positive and finite."
                 )
+        if not 0.0 <= self.target_reach < self.far_target:
+            raise RobotError(
+                f"OperatingLimits.target_reach is {self.target_reach}; it must be 0 or more, and "
+                f"less than far_target, {self.far_target}."
+            )
         if not 0.0 <= self.bus_voltage < math.inf:
             raise RobotError(
                 f"OperatingLimits.bus_voltage is {self.bus_voltage}; it must be finite and not "

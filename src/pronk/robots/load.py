@@ -184,6 +184,7 @@ class LimitsEntry(_Entry, frozen=True):
     overrun: _Positive = OperatingLimits.overrun
     tilt: _Positive = OperatingLimits.tilt
     temperature: _Positive = OperatingLimits.temperature
+    target_reach: Annotated[float, Meta(ge=0.0)] = OperatingLimits.target_reach
     far_target: _Positive = OperatingLimits.far_target
     bus_voltage: float = OperatingLimits.bus_voltage
 
@@ -210,6 +211,7 @@ class LimitsEntry(_Entry, frozen=True):
             overrun=self.overrun,
             tilt=self.tilt,
             temperature=self.temperature,
+            target_reach=self.target_reach,
             far_target=self.far_target,
             bus_voltage=self.bus_voltage,
         )

@@ -197,13 +197,13 @@ def limit_targets(
     """Move targets into all limits at once.
 
     Each limit gives an interval for each joint's target. With `margin`, `horizon_s` and `change` of
-    `OperatingLimits`, all positive, `low`, `high` and `torque` of `JointLimits`, and
-    `ahead = position + velocity horizon_s`:
+    `OperatingLimits`, all positive, its `target_reach`, 0 or more, `low`, `high` and `torque` of
+    `JointLimits`, and `ahead = position + velocity horizon_s`:
 
-    - position: `floor <= target <= ceiling`, where `floor = low + margin`, or, if `ahead` is below
-      that, `max(low + margin, position)`; and `ceiling = high - margin`, or, if `ahead` is above
-      that, `min(high - margin, position)`. So a joint that leaves this range within the horizon is
-      not driven further out.
+    - position: `floor <= target <= ceiling`, where `floor = low + margin - target_reach`, or, if
+      `ahead` is below `low + margin`, `max(low + margin, position)`; and `ceiling = high - margin +
+      target_reach`, or, if `ahead` is above `high - margin`, `min(high - margin, position)`. So a
+      joint that leaves this range within the horizon is not driven further out.
     - change: `previous - change <= target <= previous + change`.
     - torque: `|stiffness (target - position) - damping velocity| <= torque`, which is
       `|target - (position + damping velocity / stiffness)| <= torque / stiffness`; a joint without
@@ -233,8 +233,10 @@ def limit_targets(
     lowest = joints.low + operating.margin
     highest = joints.high - operating.margin
     ahead = position + velocity * operating.horizon_s
-    floor = np.where(ahead < lowest, np.maximum(lowest, position), lowest)
-    ceiling = np.where(ahead > highest, np.minimum(highest, position), highest)
+    lowest_target = lowest - operating.target_reach
+    highest_target = highest + operating.target_reach
+    floor = np.where(ahead < lowest, np.maximum(lowest, position), lowest_target)
+    ceiling = np.where(ahead > highest, np.minimum(highest, position), highest_target)
     without_torque = position + damping * velocity / divisor
     reach = np.where(is_stiff, joints.torque / divisor, np.inf)
     slowest = previous - operating.change

@@ -117,6 +117,7 @@ class SweepTask:
                 operating,
                 tilt=math.inf,
                 margin=1e-6,
+                target_reach=0.0,
                 overrun=1e-9,
                 horizon_s=1e-6,
                 stiffness=max(operating.stiffness, float(self.plan.stiffness.max())),
