@@ -85,7 +85,7 @@ def simulated(*words: str) -> Iterator[None]:
     )
     assert running.stdout is not None
     try:
-        assert any(line.startswith("ready: the virtual mini_cheetah") for line in running.stdout)
+        assert any(line.startswith("ready: the virtual ") for line in running.stdout)
         yield
     finally:
         running.kill()
