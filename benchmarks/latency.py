@@ -119,7 +119,7 @@ def _hog() -> None:
 def _loop(case: Case, path: Path, seconds: float) -> Row:
     policy = load_policy(path)
     stand_in = policy.sibling()
-    states = _states(standing(policy.contract))
+    states = _states(standing(policy.start_position))
     histograms: dict[str, dict[str, Histogram]] = {}
     for way in WAYS:
         histograms[way] = {name: Histogram() for name in QUANTITIES}

@@ -169,12 +169,12 @@ def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Itera
         row |= {"seconds": time.perf_counter() - begin, **asdict(result)}
         row["rmse"] = {}
         row["moving"] = {}
-        for signal, recording in zip(HELD_OUT, held_out, strict=True):
+        for signal, recording in zip(logs.signals, held_out, strict=True):
             position = simulated(rigs, recording, [result.values])[0]
             difference = position - recording.positions[0]
             row["rmse"][signal] = float(np.sqrt(np.mean(difference**2)))
             row["moving"][signal] = float(difference.std())
-        if name != NOMINAL:
+        if name != NOMINAL and logs.exact is not None:
             try:
                 row["exact"] = dict(fit(rigs, logs.exact, logs.joint).values)
             except PronkError as error:

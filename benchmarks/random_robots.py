@@ -1,8 +1,8 @@
-"""Virtual Mini Cheetahs drawn at random, and their logs on the bench, cached on disk.
+"""Virtual robots drawn at random, and their logs on the bench, cached on disk.
 
-Ranges are those of issue 27. Every factor is relative to the shipped parameters of the virtual
-robot, apart from the torque constant, which is relative to the model's. Uniform draws, but the
-belts', whose logarithm is uniform.
+They are Mini Cheetahs, or those of another robot. Ranges are those of issue 27. Every factor is
+relative to the shipped parameters of the virtual robot, apart from the torque constant, which is
+relative to the model's. Uniform draws, but the belts', whose logarithm is uniform.
 """
 
 from __future__ import annotations
@@ -95,10 +95,10 @@ def held_out_signals() -> dict[str, Signal]:
     return dict(zip(HELD_OUT, signals, strict=True))
 
 
-def draw(seed: int, number: int) -> SimParams:
+def draw(seed: int, number: int, robot: str = ROBOT) -> SimParams:
     """Draw robot `number` of a seed; the same numbers for the same arguments."""
     rng = np.random.default_rng([seed, number])
-    shipped = load_sim_params()
+    shipped = load_sim_params(None, load_robot(robot))
     machine = replace(
         shipped.machine,
         command_delay_s=rng.uniform(*DELAY_S),
@@ -117,6 +117,7 @@ def _draw_joint(rng: np.random.Generator, joint: JointParams) -> JointParams:
     return replace(
         joint,
         coulomb=coulomb,
+        load_friction=friction * joint.load_friction,
         breakaway=coulomb * rng.uniform(*BREAKAWAY),
         stribeck_speed=rng.uniform(*STRIBECK_SPEED),
         presliding_stiffness=friction * joint.presliding_stiffness,
@@ -148,9 +149,11 @@ class Recorded:
     sweep: JointLog
     """The paper's chirp at `AMPLITUDES`, `REPEATS` times each."""
     held_out: JointLog
-    """A segment for each of `HELD_OUT`, in that order."""
-    exact: JointLog
-    """The sweep's chirp at `THIRD_AMPLITUDE` without noise, once."""
+    """A segment for each of `signals`, in that order."""
+    signals: tuple[str, ...] = HELD_OUT
+    """Names of the held-out signals."""
+    exact: JointLog | None = None
+    """The sweep's chirp at `THIRD_AMPLITUDE` without noise, once; None if it was not recorded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,9 +167,9 @@ class Plans:
 
 
 @cache
-def plans(leg: str, kinds: tuple[str, ...]) -> Plans:
+def plans(leg: str, kinds: tuple[str, ...], robot_name: str = ROBOT) -> Plans:
     """Plan the motions of some joints of a leg."""
-    robot = load_robot(ROBOT)
+    robot = load_robot(robot_name)
     joints = [f"{leg}_{joint_kind}" for joint_kind in kinds]
     sweep = make_plan(robot, joints, amplitudes=AMPLITUDES, repeats=REPEATS)
     held_out = []
@@ -190,22 +193,39 @@ def plans(leg: str, kinds: tuple[str, ...]) -> Plans:
 
 
 def recorded(
-    seed: int, number: int, kinds: Sequence[str], folder: Path | None = None
+    seed: int,
+    number: int,
+    kinds: Sequence[str],
+    folder: Path | None = None,
+    *,
+    robot: str = ROBOT,
+    leg: str | None = None,
+    with_exact: bool = True,
 ) -> list[Recorded]:
     """Record robot `number` of a seed on the bench, or read its logs from the cache.
 
-    One leg is excited: FR, FL, HR, HL in turn. Logs lie in `folder`, by default in the system's
-    temporary folder, under a hash of parameters, signals and seed.
+    Args:
+        seed: Seed of the draw and of the noise.
+        number: Number of the robot.
+        kinds: Joints of the leg, such as `knee`.
+        folder: Logs lie there under a hash of parameters, signals and seed; in the system's
+            temporary folder if None.
+        robot: Name of the robot.
+        leg: The leg that is excited; one leg after the other by `number` if None.
+        with_exact: Whether the chirp without noise is recorded too.
     """
-    params = draw(seed, number)
-    legs = legs_of(load_robot(ROBOT))
-    leg = legs[number % len(legs)]
-    motions = plans(leg, tuple(kinds))
+    params = draw(seed, number, robot)
+    legs = legs_of(load_robot(robot))
+    excited = leg or legs[number % len(legs)]
+    motions = plans(excited, tuple(kinds), robot)
     cache_folder = folder or Path(tempfile.gettempdir()) / "pronk-bench-match"
-    robot = f"{seed}-{number}-{leg}"
+    prefix = f"{seed}-{number}-{excited}"
     noise_seed = 1000 * seed + number
-    noisy_logs = _record(motions.noisy, params, leg, noise_seed, cache_folder, robot)
-    exact_logs = _record(motions.exact, without_noise(params), leg, noise_seed, cache_folder, robot)
+    noisy_logs = _record(motions.noisy, params, excited, noise_seed, cache_folder, prefix)
+    exact_logs: dict[str, JointLog] = {}
+    if with_exact:
+        exact_params = without_noise(params)
+        exact_logs = _record(motions.exact, exact_params, excited, noise_seed, cache_folder, prefix)
     swept = len(AMPLITUDES) * REPEATS
     recordings = []
     for joint in motions.noisy.joints:
@@ -215,7 +235,7 @@ def recorded(
                 joint=joint,
                 sweep=replace(noisy, segments=noisy.segments[:swept]),
                 held_out=replace(noisy, segments=noisy.segments[swept:]),
-                exact=exact_logs[joint],
+                exact=exact_logs.get(joint),
             )
         )
     return recordings
@@ -225,7 +245,7 @@ def _record(
     plan: SweepPlan, params: SimParams, leg: str, noise_seed: int, cache_folder: Path, prefix: str
 ) -> dict[str, JointLog]:
     """Record a plan on the bench into a folder of the cache, if it is not there; read its logs."""
-    robot = load_robot(ROBOT)
+    robot = plan.robot
     key = repr((params, plan.excitations, plan.settle_s, noise_seed)).encode()
     out = cache_folder / f"{prefix}-{hashlib.sha256(key).hexdigest()[:12]}"
     if not out.exists():

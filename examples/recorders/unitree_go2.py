@@ -1,19 +1,18 @@
-"""Send chirps to one joint of a Unitree Go2 through unitree_sdk2_python, and record it.
+"""Send chirps to one joint of a hanging Unitree Go2 by Unitree's SDK alone, and write a CSV file.
 
-    python unitree_go2.py eth0 --joint FR_calf_joint --out chirp.csv
+    python unitree_go2.py eth0 FR_calf_joint chirp.csv
+    pronk match chirp.csv --robot go2 --unit rad --drive-gains default --out gains.yaml
 
-The robot hangs, its own controller is off (sport mode released), and all joints hold the pose that
-they have at the start, with the gains below. `pronk sweep go2 --link dds` does the same with a
-pre-flight, limits and a standby process. Not run on hardware by pronk's developers.
+docs/from-your-go2.md says what to do before. Run on the virtual Go2, not yet on hardware.
 """
 
-from __future__ import annotations
-
-import argparse
+import csv
+import math
+import sys
 import time
 from pathlib import Path
 
-from chirp import command_at, write_csv
+from unitree_sdk2py.comm.motion_switcher.motion_switcher_client import MotionSwitcherClient
 from unitree_sdk2py.core.channel import (
     ChannelFactoryInitialize,
     ChannelPublisher,
@@ -25,64 +24,78 @@ from unitree_sdk2py.utils.crc import CRC
 
 LEGS = ("FR", "FL", "RR", "RL")
 JOINTS = [f"{leg}_{part}_joint" for leg in LEGS for part in ("hip", "thigh", "calf")]
-STIFFNESS, DAMPING = 20.0, 0.5
-PERIOD_S = 0.002
+POSE = [0.0, 0.9, -1.8] * 4  # [rad]
+GAINS = (20.0, 0.5)  # of the excited joint [N m/rad, N m s/rad]: what --drive-gains is to say
+HOLD = (60.0, 3.0)  # of the others
+AMPLITUDES = (0.25, 0.25, 0.125, 0.125)  # of the chirps, one after another [rad]
+LOW_HZ, HIGH_HZ, CHIRP_S, PAUSE_S, RISE_S = 0.2, 15.0, 20.0, 1.0, 3.0
 
 
-def main() -> None:
-    """Record."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("interface")
-    parser.add_argument("--joint", choices=JOINTS, required=True)
-    parser.add_argument("--amplitudes", type=float, nargs="+", default=[0.1, 0.2, 0.2])
-    parser.add_argument("--high-hz", type=float, default=15.0)
-    parser.add_argument("--out", type=Path, default=Path("chirp.csv"))
-    options = parser.parse_args()
-    number = JOINTS.index(options.joint)
+def excitation(t):
+    """Return the command relative to the pose [rad], a time after the rise [s]."""
+    number, t = divmod(t - PAUSE_S, CHIRP_S + PAUSE_S)
+    if not 0 <= number < len(AMPLITUDES) or t > CHIRP_S:
+        return 0.0
+    phase = 2.0 * math.pi * (LOW_HZ * t + 0.5 * (HIGH_HZ - LOW_HZ) / CHIRP_S * t * t)
+    return AMPLITUDES[int(number)] * min(1.0, t, CHIRP_S - t) * math.sin(phase)
 
-    states: list[LowState_] = []
 
-    def keep_last(state: LowState_) -> None:
-        states[:] = [state]
+def record(interface, joint, path, domain=0):
+    """Record the chirps of a joint."""
+    excited = JOINTS.index(joint)
+    ChannelFactoryInitialize(domain, interface)
+    switcher = MotionSwitcherClient()
+    switcher.Init()
+    code, mode = switcher.CheckMode()
+    if code != 0 or mode["name"]:
+        sys.exit(f"the motion service is on or silent ({code}, {mode}): release it first")
+    sent, measured, rows = {}, [], []
 
-    ChannelFactoryInitialize(0, options.interface)
+    def on_state(state):
+        measured[:] = [motor.q for motor in state.motor_state[:12]]
+        if joint in sent:
+            rows.append((time.perf_counter(), sent[joint], measured[excited]))
+
+    subscriber = ChannelSubscriber("rt/lowstate", LowState_)
+    subscriber.Init(on_state, 10)
     publisher = ChannelPublisher("rt/lowcmd", LowCmd_)
     publisher.Init()
-    subscriber = ChannelSubscriber("rt/lowstate", LowState_)
-    subscriber.Init(keep_last, 10)
-    while not states:
-        time.sleep(0.01)
-    pose = [motor.q for motor in states[0].motor_state[:12]]
+    message, checksum = unitree_go_msg_dds__LowCmd_(), CRC()
+    message.head, message.level_flag = [0xFE, 0xEF], 0xFF
 
-    message = unitree_go_msg_dds__LowCmd_()
-    message.head[0], message.head[1] = 0xFE, 0xEF
-    message.level_flag = 0xFF
-    checksum = CRC()
-    rows: list[tuple[float, float, float]] = []
-    begin = time.perf_counter()
-    try:
-        while True:
-            now = time.perf_counter() - begin
-            relative = command_at(now, options.amplitudes, options.high_hz)
-            if relative is None:
-                break
-            for joint, motor in enumerate(message.motor_cmd[:12]):
-                motor.mode = 0x01
-                motor.q = pose[joint] + (relative if joint == number else 0.0)
-                motor.kp, motor.dq, motor.kd, motor.tau = STIFFNESS, 0.0, DAMPING, 0.0
-            message.crc = checksum.Crc(message)
-            publisher.Write(message)
-            rows.append((now, pose[number] + relative, states[0].motor_state[number].q))
-            time.sleep(max(0.0, len(rows) * PERIOD_S - (time.perf_counter() - begin)))
-    finally:
-        for motor in message.motor_cmd[:12]:
-            motor.kp, motor.kd = 0.0, 2.0
+    def send(targets, share):
+        for number, motor in enumerate(message.motor_cmd[:12]):
+            kp, kd = GAINS if number == excited else HOLD
+            motor.mode, motor.q, motor.kp, motor.kd = 1, targets[number], share * kp, kd
         message.crc = checksum.Crc(message)
+        publisher.Write(message)
+        time.sleep(0.002)
+
+    while not measured:
+        time.sleep(0.01)
+    start, begin = list(measured), time.perf_counter() + RISE_S
+    end = PAUSE_S + len(AMPLITUDES) * (CHIRP_S + PAUSE_S)
+    try:
+        now = -RISE_S
+        while now < end:
+            now = time.perf_counter() - begin
+            share = min(1.0, 1.0 + now / RISE_S)  # of the way to the pose, and of the stiffness
+            targets = [a + share * (b - a) for a, b in zip(start, POSE, strict=True)]
+            if now > 0.0:
+                targets[excited] += excitation(now)
+                sent[joint] = targets[excited]
+                if abs(measured[excited] - targets[excited]) > 0.6:
+                    sys.exit(f"{joint} is 0.6 rad from its command: damped")
+            send(targets, share)
+    finally:
+        sent.clear()
         for _ in range(500):
-            publisher.Write(message)
-            time.sleep(PERIOD_S)
-        write_csv(options.out, options.joint, rows)
+            send(measured, 0.0)  # damping
+        with Path(path).open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time", f"command.{joint}", f"position.{joint}"])
+            writer.writerows(rows)
 
 
 if __name__ == "__main__":
-    main()
+    record(*sys.argv[1:4])

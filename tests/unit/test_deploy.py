@@ -52,12 +52,15 @@ from pronk.deploy.runtime.teleop import (
 )
 from pronk.errors import HardwareError, LogError, RobotError
 from pronk.identify.logs.mcap import DamagedError, McapWriter, records
+from pronk.jump.virtual.robot import VirtualRobot
+from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.policy.script import Script
 from pronk.robots import load_robot
 from pronk.robots.machine import State
 from virtual_robot import POSE, ROBOT, connected, rolled, still
 
 LIMITS = Limits.of(ROBOT)
+GO2 = load_robot("go2")
 LYING = folded_pose(ROBOT)
 state = partial(still, position=LYING)
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
@@ -304,6 +307,37 @@ def test_swapped_encoders_are_found_before_the_robot_rises(swapped: str) -> None
     else:
         assert run.safety.reason is Reason.NONE
         assert run.mode is Mode.STAND
+
+
+@pytest.mark.parametrize("swapped", ["", *SWAPPED])
+def test_a_go2_stands_up_and_its_swapped_encoders_are_found(swapped: str) -> None:
+    robot = VirtualRobot(GO2, load_sim_params(None, GO2), base="ground", capture_rate_hz=None)
+    robot.connect()
+    machine = StateMachine(GO2, RunTiming(damp_s=0.5))
+    safety = SafetyFilter(limits=Limits.of(GO2))
+    machine.preflighted((), 0.0)
+    machine.request(OperatorRequest.STAND)
+    t = 0.0
+    while t < 12.0 and machine.mode not in (Mode.FAULT, Mode.POLICY):
+        t += 0.002
+        state = robot.wait(t)[-1]
+        seen = spoiled(swapped, state, state) if swapped else state
+        if machine.mode is Mode.STAND:
+            machine.request(OperatorRequest.WALK)
+        desired = machine.step(t, seen.position, safety, None)
+        if safety.faulted:
+            machine.faulted(t)
+        if desired.command is None:
+            robot.damp()
+        else:
+            robot.send(desired.command)
+    if swapped:
+        assert safety.reason is Reason.SWAPPED
+        assert t < 6.0
+    else:
+        assert machine.mode is Mode.POLICY, machine.notice
+        # The default pose without sag has the trunk at 0.29 m.
+        assert robot.snapshot().position[0, 2] > 0.24
 
 
 def test_the_trunk_is_still_when_the_policy_may_begin() -> None:

@@ -43,7 +43,7 @@ def running() -> Iterator[PolicyProcess]:
 
 def states(count: int) -> list[State]:
     """Of a robot that moves a little."""
-    still = standing(load_policy(POLICY).contract)
+    still = standing(load_policy(POLICY).start_position)
     rng = np.random.default_rng(3)
     made_states = []
     for k in range(count):

@@ -276,9 +276,37 @@ def test_targets_are_moved_into_each_limit() -> None:
     assert LIMITS.joints.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
 
 
+def test_with_a_reach_a_joint_clear_of_its_limits_gets_a_torque() -> None:
+    limits = operating(target_reach=0.5, far_target=1.0)
+    knee = 2
+    highest = LIMITS.joints.high[knee] - LIMITS.operating.margin
+    # Clear of its limits: half a radian beyond them, no more.
+    s = state(position=at(POSE, 2.1, knee))
+    before = at(POSE, 2.7, knee)
+    desired = command(position=at(POSE, highest + 0.4, knee))
+    _, decision, _ = judged(s, desired, limits=limits, sent_target=before)
+    assert decision.reason is Reason.NONE
+    target, reason = moved(s, at(POSE, highest + 0.7, knee), before, limits=limits)
+    assert target[knee] == pytest.approx(highest + 0.5)
+    assert reason is Reason.POSITION
+    # On its way to a limit it is not driven further, whatever target was sent before.
+    s = state(position=at(POSE, 2.4, knee), velocity=at(np.zeros(N), 10.0, knee))
+    before = at(POSE, highest + 0.5, knee)
+    small_change = operating(target_reach=0.5, far_target=1.0, change=0.1)
+    target, reason = moved(s, at(POSE, highest + 0.4, knee), before, limits=small_change)
+    assert (target[knee], reason) == (2.4, Reason.POSITION)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("tilt", -1.0)],
+    [
+        ("power_w", 0.0),
+        ("target_reach", -0.1),
+        ("target_reach", 1.0),
+        ("change", math.inf),
+        ("margin", 3.0),
+        ("tilt", -1.0),
+    ],
 )
 def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
     with pytest.raises(RobotError, match=name):
@@ -392,6 +420,9 @@ def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
     w, x, y, z = drawn.orientation.T
     upright = w * w - x * x - y * y + z * z
     ahead = q + limits.operating.horizon_s * v
+    near = (ahead > limits.joints.high - limits.operating.margin) | (
+        ahead < limits.joints.low + limits.operating.margin
+    )
     out = (ahead > limits.joints.high - limits.operating.margin) & (target > q + slack)
     out |= (ahead < limits.joints.low + limits.operating.margin) & (target < q - slack)
     # Where the joint itself is beyond the margin its target may lead it back, no less.
@@ -407,7 +438,11 @@ def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
             | (target > limits.joints.high - limits.operating.margin + reach + slack)
             | (out & inside)
         ).any(axis=-1),
-        "change": (np.abs(target - drawn.previous) > limits.operating.change + slack).any(axis=-1),
+        # With a reach, a joint that nears a limit may be brought back from a far target at once.
+        "change": (
+            (np.abs(target - drawn.previous) > limits.operating.change + slack)
+            & ~(near & (reach > 0.0))
+        ).any(axis=-1),
         "torque": (np.abs(torque) > limits.joints.torque + slack).any(axis=-1),
         "power": power > limits.operating.power_w * (1.0 + slack),
         "tilt": upright < math.cos(limits.operating.tilt) - slack,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pronk.deploy.runtime.records import Event
     from pronk.deploy.runtime.run import RunSummary
     from pronk.deploy.runtime.teleop import Operator
-    from pronk.policy.contract import Contract
+    from pronk.policy.deployable import DeployablePolicy
     from pronk.policy.script import Script
 
 
@@ -34,9 +34,28 @@ class SteeringOptions:
     """With --script: walk without jumps."""
     gamepad: Path | None = None
     """Steer with this gamepad, such as /dev/input/js0; with the keyboard if left out."""
+    remote: bool = False
+    """Steer with the robot's own wireless remote (--link dds)."""
     seconds: float | None = None
     """Sit down after this time with the policy in charge, in s; at the end of the script, or when
     told to, if left out."""
+
+    def check(self, scheme: str) -> None:
+        """Refuse two ways to steer, and a remote on a link that does not carry its bytes."""
+        ways = []
+        if self.script is not None:
+            ways.append("--script")
+        if self.gamepad is not None:
+            ways.append("--gamepad")
+        if self.remote:
+            ways.append("--remote")
+        if len(ways) > 1:
+            raise HardwareError(f"{' and '.join(ways)} both steer; give one of them.")
+        if self.remote and scheme != "dds":
+            raise HardwareError(
+                f"--remote is of --link dds, and not of {scheme}: Unitree's states alone carry the "
+                "bytes of the robot's remote; use --gamepad or the keyboard."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +82,7 @@ class TakeoverOptions:
 
 def deploy_command(
     policy: tyro.conf.Positional[Path],
+    deploy: Path | None = None,
     robot: str | None = None,
     base: Base | None = None,
     steering: SteeringOptions = SteeringOptions(),
@@ -76,7 +96,8 @@ def deploy_command(
         pronk deploy policies/matched/policy.onnx --script 1,0,0 --log run.mcap
 
     Args:
-        policy: policy.onnx, as `pronk train` writes it.
+        policy: policy.onnx, as `pronk train` writes it; with --deploy any other.
+        deploy: Unitree's deploy.yaml of a policy that was trained elsewhere.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
         base: What holds the virtual robot; the ground if left out.
         steering: Who steers, and for how long.
@@ -86,6 +107,7 @@ def deploy_command(
     """
     from pronk.deploy.links.address import SIM
     from pronk.deploy.runtime.plan import Link, RunPlan
+    from pronk.deploy.runtime.remote_operator import REMOTE_HELP, Remote
     from pronk.deploy.runtime.run import run_plan
     from pronk.deploy.runtime.teleop import (
         HELP,
@@ -96,13 +118,24 @@ def deploy_command(
         TimeLimit,
     )
     from pronk.files import require_place
+    from pronk.policy.deploy_yaml import read_deploy_yaml
+    from pronk.policy.deployable import open_policy
+    from pronk.policy.foreign import deploy_problems
     from pronk.policy.runtime import load_policy
+    from pronk.robots import load_robot
 
     log = record.log
     capture = record.capture
     seconds = steering.seconds
-    contract = load_policy(policy).contract
+    robot_name = robot
+    if deploy is None:
+        robot_name = robot or load_policy(policy).contract.robot
+    if robot_name is None:
+        raise PronkError("--deploy needs --robot, such as --robot go2; deploy.yaml names none.")
+    robot_spec = load_robot(robot_name)
+    loaded_policy = open_policy(policy, robot_spec, deploy)
     address = machine.address(base)
+    steering.check(address.scheme)
     if capture is not None and (address.scheme != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     if seconds is not None and not seconds > 0.0:
@@ -111,8 +144,9 @@ def deploy_command(
         if path is not None:
             require_place(path)
     plan = RunPlan(
-        link=Link(robot=robot or contract.robot, address=address, release=machine.release),
+        link=Link(robot=robot_name, address=address, release=machine.release),
         policy=policy,
+        deploy_yaml=deploy,
         log=log,
         trajectory=capture,
         tilt=takeover.tilt,
@@ -122,9 +156,12 @@ def deploy_command(
     )
     scripts = None
     if steering.script is not None:
-        scripts = _scripts(steering.script, contract, steering.walk_only)
+        scripts = _scripts(steering.script, loaded_policy, steering.walk_only)
+    if deploy is not None:
+        for problem in deploy_problems(read_deploy_yaml(deploy), robot_spec):
+            console.warn(problem)
     if not (address.local or machine.yes):
-        console.confirm(contract.robot, str(address))
+        console.confirm(robot_spec.name, str(address))
     operator: Operator
     if scripts is not None:
         scripted = ScriptedOperator(scripts)
@@ -133,10 +170,13 @@ def deploy_command(
         if seconds is None or seconds > scripted.seconds:
             seconds = scripted.seconds
     elif steering.gamepad is not None:
-        operator = Gamepad(steering.gamepad, contract.command_ranges)
+        operator = Gamepad(steering.gamepad, loaded_policy.command_ranges)
         greeting = PAD_HELP
+    elif steering.remote:
+        operator = Remote(loaded_policy.command_ranges)
+        greeting = REMOTE_HELP
     else:
-        operator = Keyboard(contract.command_ranges)
+        operator = Keyboard(loaded_policy.command_ranges)
         greeting = HELP
     if seconds is not None:
         operator = TimeLimit(operator, seconds)
@@ -167,18 +207,18 @@ def deploy_command(
     )
 
 
-def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
+def _scripts(text: str, policy: DeployablePolicy, walk_only: bool) -> list[Script]:
     """Return the scripts of an unattended run; PronkError if the policy was not trained for one."""
     from pronk.policy.script import PAPER_VELOCITIES, Script, parse_velocity
 
     velocities = PAPER_VELOCITIES
     if text.strip() != "paper":
         velocities = {text: parse_velocity(text)}
-    jump_s = Script.jump_s if contract.jump and not walk_only else 0.0
+    jump_s = Script.jump_s if policy.jumps and not walk_only else 0.0
     scripts = []
     for name, velocity in velocities.items():
         for component, (axis, (low, high)) in zip(
-            velocity, contract.command_ranges.items(), strict=True
+            velocity, policy.command_ranges.items(), strict=True
         ):
             if not low <= component <= high:
                 raise PronkError(

@@ -73,7 +73,7 @@ def policy(
         try_changes,
     )
     from pronk.jump.virtual.sim_params import load_sim_params
-    from pronk.policy.deploy_yaml import read_deploy_yaml
+    from pronk.policy.deploy_yaml import RANGE_NAMES, read_deploy_yaml
     from pronk.policy.foreign import ForeignPolicy, deploy_problems, load_foreign_network
     from pronk.policy.script import parse_velocity
     from pronk.robots import load_robot
@@ -96,7 +96,7 @@ def policy(
     console.show(_file_table(deploy_file, robot_spec), wide=wide)
     for problem in problems:
         console.warn(problem)
-    for name, value in zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), velocity, strict=True):
+    for name, value in zip(RANGE_NAMES, velocity, strict=True):
         low, high = deploy_file.command_ranges.get(name, (-math.inf, math.inf))
         if not low <= value <= high:
             console.warn(f"{name} {value:g} is outside the {low:g} to {high:g} of deploy.yaml")

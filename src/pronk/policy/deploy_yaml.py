@@ -32,6 +32,8 @@ JOINT_TERMS = ("joint_pos", "joint_pos_rel", "joint_vel", "joint_vel_rel", "last
 """Terms of one number a joint."""
 COMMAND_TERMS = ("velocity_commands", "keyboard_velocity_commands")
 """Terms of the commanded velocity."""
+RANGE_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""Components of the commanded velocity: forward, left [m/s], yaw rate [rad/s]."""
 POSITION_ACTION = "JointPositionAction"
 """The one action that can be run: targets of joint positions."""
 _SWITCHES = ("use_gym_history", "scale_first")
@@ -87,8 +89,7 @@ class DeployFile:
     by_sample: bool
     """True if an observation has sample after sample, not term after term."""
     command_ranges: Mapping[str, tuple[float, float]]
-    """Least and greatest command, by the names `lin_vel_x`, `lin_vel_y`, `ang_vel_z`; may be
-    empty."""
+    """Least and greatest command, by some of the names `RANGE_NAMES`; may be empty."""
     newest_first: bool = False
     """True if the newest sample of a history comes first."""
     gravity_sign: float = 1.0
@@ -278,7 +279,7 @@ def _command_ranges(commands: Any, source: str) -> dict[str, tuple[float, float]
     entry = (commands or {}).get("base_velocity") or {}
     stated = entry.get("ranges") if isinstance(entry, dict) else None
     if isinstance(stated, dict):
-        for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
+        for name in RANGE_NAMES:
             if name in stated:
                 place = f"{source}: commands.base_velocity.ranges.{name}"
                 ranges[name] = _range(stated[name], place)

@@ -74,6 +74,11 @@ class ForeignPolicy:
         """Targets at action zero, in the order of the robot's file [rad]."""
         return self._in_robot_order(self._offset)
 
+    @property
+    def action(self) -> Array:
+        """Outputs of the network in the latest step, in the order of the robot's file."""
+        return self._in_robot_order(self._action)
+
     def reset(self) -> None:
         """Begin anew: the next measurement fills the histories, the past action is zero."""
         self._histories = []
@@ -268,6 +273,20 @@ def run_foreign(
     return tick * step_s
 
 
+def poses_out_of_range(deploy: DeployFile, robot: RobotSpec) -> list[str]:
+    """List the joints whose pose in the file is outside of their range."""
+    problems = []
+    for index, value in zip(deploy.joint_ids, deploy.default_position, strict=True):
+        joint = robot.joints[index]
+        low, high = joint.range
+        if not low <= value <= high:
+            problems.append(
+                f"default_joint_pos puts {joint.name} at {value:g} rad, outside its range of "
+                f"{low:.3g} to {high:.3g}: the order of the joints is another one, or the robot"
+            )
+    return problems
+
+
 def deploy_problems(deploy: DeployFile, robot: RobotSpec) -> list[str]:
     """List what contradicts the robot's file.
 
@@ -279,14 +298,7 @@ def deploy_problems(deploy: DeployFile, robot: RobotSpec) -> list[str]:
         raise ArtefactError(
             f"deploy.yaml has {len(deploy.joint_ids)} joints; {robot.name} has {len(joints)}."
         )
-    problems = []
-    for index, value in zip(deploy.joint_ids, deploy.default_position, strict=True):
-        low, high = joints[index].range
-        if not low <= value <= high:
-            problems.append(
-                f"default_joint_pos puts {joints[index].name} at {value:g} rad, outside its range "
-                f"of {low:.3g} to {high:.3g}: the order of the joints is another one, or the robot"
-            )
+    problems = poses_out_of_range(deploy, robot)
     named: dict[str, list[str]] = {}
     for joint, stiffness, damping in zip(joints, deploy.stiffness, deploy.damping, strict=True):
         same_stiffness = math.isclose(stiffness, joint.stiffness, rel_tol=1e-3)

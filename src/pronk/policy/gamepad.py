@@ -46,6 +46,20 @@ class GamepadButton(IntEnum):
     START = 7
 
 
+def stick_command(push: float, span: tuple[float, float]) -> float:
+    """Return the command of a stick.
+
+    Args:
+        push: Share of its way that the stick is off its centre, -1 to 1.
+        span: Smallest and largest command, at the ends of its way.
+    """
+    if abs(push) <= DEAD_ZONE:
+        return 0.0
+    low, high = span
+    share = min(abs(push), 1.0)
+    return share * high if push > 0.0 else share * low
+
+
 @dataclass(frozen=True, kw_only=True)
 class GamepadInput:
     """Sticks and buttons of a gamepad at a moment."""
@@ -121,11 +135,7 @@ class GamepadReader:
 
     def _commanded(self, axis: int, name: str) -> float:
         """Return the command of one axis, which is negative forward and to the left."""
-        push = -self._axes.get(axis, 0.0)
-        if abs(push) <= DEAD_ZONE:
-            return 0.0
-        low, high = self._ranges[name]
-        return push * high if push > 0.0 else -push * low
+        return stick_command(-self._axes.get(axis, 0.0), self._ranges[name])
 
     def _read_events(self) -> bytes:
         """Return all events since the last call; notes the end of the device."""

@@ -78,6 +78,48 @@ class Policy:
             f"{jump} jump input)"
         )
 
+    @property
+    def rate_hz(self) -> float:
+        """Steps per second [Hz]."""
+        return self.contract.policy_rate_hz
+
+    @property
+    def start_position(self) -> NDArray[np.float64]:
+        """Joint positions in which it starts [rad], shape (12,)."""
+        return np.array(self.contract.default_position)
+
+    @property
+    def command_ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Smallest and largest command trained for, by the names in `contract.COMMANDS`."""
+        return self.contract.command_ranges
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the network has a jump input."""
+        return self.contract.jump
+
+    @property
+    def delay_range_s(self) -> tuple[float, float]:
+        """Command delays trained for [s]."""
+        return self.contract.delay_range_s
+
+    @property
+    def logs_observation(self) -> bool:
+        """True: the observation is laid out as `pronk.policy.observation` says."""
+        return True
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what a log says of the policy."""
+        contract = self.contract
+        return {
+            "sha256": self.sha256,
+            "gains": contract.gains,
+            "gains_sha256": contract.gains_sha256,
+            "delay_range_s": contract.delay_range_s,
+            "jump": contract.jump,
+            "virtual": contract.virtual,
+        }
+
     def sibling(self) -> Self:
         """Return the same network with a history of its own."""
         return type(self)(self._session, self.contract, sha256=self.sha256)
@@ -180,7 +222,10 @@ def load_policy(path: Path | str) -> Policy:
     except UnicodeDecodeError:
         text = None
     if text is None:
-        raise ArtefactError(f"{path}: a network without a contract of pronk; {_WRITER}.")
+        raise ArtefactError(
+            f"{path}: a network without a contract of pronk; {_WRITER}, and with Unitree's "
+            "deploy.yaml `pronk deploy --deploy` and `pronk policy check` run others."
+        )
     contract = from_json(text, source=path)
     if contract.observation != measured_layout(contract.policy_rate_hz):
         raise ArtefactError(

@@ -9,6 +9,36 @@ from pronk.errors import RobotError
 
 
 @dataclass(frozen=True, kw_only=True)
+class StandingUp:
+    """How a robot stands up and sits down, apart from its poses."""
+
+    stiffness: float | None = None
+    """Stiffness of all joints from the rise on, until a policy acts, and while it sits down
+    [N m/rad]; None for that of the drives, which carries a light robot."""
+    damping: float | None = None
+    """Damping of all joints with it [N m s/rad]; None for that of the drives."""
+    swing: float = 0.15
+    """Swing of each leg's last joint in the folded pose towards the default pose and back, to know
+    that its encoder is its own [rad]. At 0.15 that of a Mini Cheetah on the ground moves by 0.01 to
+    0.02, and any other by 0.47 of that at most, where the motions out and back are averaged: a
+    robot that still sinks moves all of them."""
+    swing_s: float = 0.15
+    """Time of each half of such a swing [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not positive and finite."""
+        numbers = {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "swing": self.swing,
+            "swing_s": self.swing_s,
+        }
+        for name, number in numbers.items():
+            if number is not None and not 0.0 < number < math.inf:
+                raise RobotError(f"StandingUp.{name} is {number}; it must be positive and finite.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class OperatingLimits:
     """Limits of the commands to a robot and of its measurements, for the safety filter.
 
@@ -48,6 +78,8 @@ class OperatingLimits:
     moved back."""
     bus_voltage: float = 0.0
     """Least bus voltage, where the link carries it [V]; 0 for a share of the drives' nominal."""
+    stand: StandingUp = StandingUp()
+    """How it stands up and sits down, within these limits."""
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
@@ -76,6 +108,15 @@ class OperatingLimits:
             raise RobotError(
                 f"OperatingLimits.bus_voltage is {self.bus_voltage}; it must be finite and not "
                 "negative."
+            )
+        if (self.stand.stiffness or 0.0) > self.stiffness:
+            raise RobotError(
+                f"StandingUp.stiffness is {self.stand.stiffness:g}; the limit is {self.stiffness:g}"
+                "."
+            )
+        if (self.stand.damping or 0.0) > self.damping:
+            raise RobotError(
+                f"StandingUp.damping is {self.stand.damping:g}; the limit is {self.damping:g}."
             )
         if not self.tilt > 0.0:
             raise RobotError(f"OperatingLimits.tilt is {self.tilt}; it must be positive.")

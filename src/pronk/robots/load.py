@@ -25,7 +25,7 @@ from pronk.errors import RobotError
 from pronk.files import converted, read_yaml
 from pronk.robots.held_model import POSITIONS, held_mjcf
 from pronk.robots.held_reasons import held_reasons
-from pronk.robots.limits import OperatingLimits
+from pronk.robots.limits import OperatingLimits, StandingUp
 from pronk.robots.robot import Drive, Joint, RobotSpec, ServoKind
 from pronk.robots.servos import joint_servos
 from pronk.robots.source_model import MUJOCO_ERRORS, SourceModel, read_source
@@ -172,6 +172,24 @@ class AboutEntry(_Entry, frozen=True):
     """Name of the training task with mjlab."""
 
 
+class StandEntry(_Entry, frozen=True):
+    """How a robot stands up, as `pronk.robots.limits.StandingUp` has it."""
+
+    stiffness: _Positive | None = None
+    damping: _Positive | None = None
+    swing: _Positive = StandingUp.swing
+    swing_s: _Positive = StandingUp.swing_s
+
+    def standing_up(self) -> StandingUp:
+        """Return the same as a dataclass."""
+        return StandingUp(
+            stiffness=self.stiffness,
+            damping=self.damping,
+            swing=self.swing,
+            swing_s=self.swing_s,
+        )
+
+
 class LimitsEntry(_Entry, frozen=True):
     """Limits of commands and measurements, as `pronk.robots.limits.OperatingLimits` has them."""
 
@@ -188,8 +206,8 @@ class LimitsEntry(_Entry, frozen=True):
     far_target: _Positive = OperatingLimits.far_target
     bus_voltage: float = OperatingLimits.bus_voltage
 
-    def limits(self, joints: Sequence[Joint]) -> OperatingLimits:
-        """Return the limits of a robot with some joints.
+    def limits(self, joints: Sequence[Joint], stand: StandingUp) -> OperatingLimits:
+        """Return the limits of a robot with some joints, which stands up in some way.
 
         Where the file states no limit of gains, margin or power, it is that of a legged robot of
         the size of a Mini Cheetah, or what these joints need if that is not enough: twice their
@@ -214,6 +232,7 @@ class LimitsEntry(_Entry, frozen=True):
             target_reach=self.target_reach,
             far_target=self.far_target,
             bus_voltage=self.bus_voltage,
+            stand=stand,
         )
 
 
@@ -239,6 +258,7 @@ class RobotFile(_Entry, frozen=True):
     grid_damping: _Band | None = None
     about: AboutEntry = AboutEntry()
     limits: LimitsEntry = LimitsEntry()
+    stand: StandEntry = StandEntry()
 
 
 @dataclass(frozen=True)
@@ -320,7 +340,7 @@ def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> Robot
         decimation=file.decimation,
         grid_stiffness=file.grid_stiffness or _grid(joint.stiffness for joint in joints),
         grid_damping=file.grid_damping or _grid(joint.damping for joint in joints),
-        limits=file.limits.limits(joints),
+        limits=file.limits.limits(joints, file.stand.standing_up()),
     )
     _verify_mirrors(robot, model, source)
     return robot

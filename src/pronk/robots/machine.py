@@ -42,6 +42,7 @@ class State:
     orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     robot_time: float | None = None  # the robot's own [s]; None where the wire carries none
     temperature: Array | None = None  # of the motors [deg C]; None where the wire carries none
+    remote: bytes = b""  # of the robot's wireless remote, as on the wire; empty where it has none
 
 
 @dataclass(frozen=True, kw_only=True)

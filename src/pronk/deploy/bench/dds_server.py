@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pronk.deploy.bench.server import ServerTransport
@@ -22,6 +22,7 @@ from pronk.deploy.links.dds.link import (
     take_samples,
     write_bytes,
 )
+from pronk.deploy.links.remote import REMOTE_BYTES
 from pronk.robots.machine import Command, State
 from pronk.robots.robot import RobotSpec
 
@@ -53,6 +54,8 @@ class DdsServerTransport(ServerTransport):
         network = link.DdsNetwork(domain=domain)
         super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
+        self.remote = bytes(REMOTE_BYTES)
+        """Bytes of the wireless remote; zero while none is switched on."""
         # Another writer is another participant.
         participant = link.Participant(network)
         rival = link.Participant(network)
@@ -83,10 +86,9 @@ class DdsServerTransport(ServerTransport):
         return arrived
 
     def publish(self, state: State) -> None:
-        """Put a state on the wire."""
-        write_bytes(
-            self._states, self.corrupt_out(encode_dds_state(self._joints, state)), self.counts
-        )
+        """Put a state on the wire, with the bytes of the remote."""
+        data = encode_dds_state(self._joints, replace(state, remote=self.remote))
+        write_bytes(self._states, self.corrupt_out(data), self.counts)
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
@@ -133,7 +135,9 @@ class DdsServerTransport(ServerTransport):
         return DONE, None
 
     def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
-        """Hold joints mechanically."""
+        """Hold joints mechanically, or take what a person does at the wireless remote."""
+        if api_id == link.REMOTE:
+            return self._hold_remote(parameter)
         if api_id != link.CLAMP:
             return UNKNOWN_API, None
         joints = parameter.get("joints") if isinstance(parameter, dict) else None
@@ -143,3 +147,15 @@ class DdsServerTransport(ServerTransport):
             return BAD_PARAMETER, None
         self.clamps = tuple(name for name in self._joint_names if name in joints)
         return DONE, {"joints": list(self.clamps)}
+
+    def _hold_remote(self, parameter: Any) -> tuple[int, Any]:
+        """Take the bytes of the remote, which go out with every state from now on."""
+        text = parameter.get("bytes") if isinstance(parameter, dict) else None
+        try:
+            data = bytes.fromhex(text or "")
+        except (TypeError, ValueError):
+            return BAD_PARAMETER, None
+        if len(data) != REMOTE_BYTES:
+            return BAD_PARAMETER, None
+        self.remote = data
+        return DONE, {"bytes": data.hex()}

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
+from pronk.arrays import Array
 from pronk.deploy.links.address import Address
 from pronk.deploy.links.link import ClampOperator, Freshness, LinkSettings
 from pronk.deploy.links.realtime import RealTimeSettings
@@ -13,6 +16,7 @@ from pronk.deploy.runtime.limits import AgeLimits, Limits
 from pronk.deploy.runtime.poses import RunTiming
 from pronk.deploy.runtime.sweep import STALE_S, SweepTask
 from pronk.errors import HardwareError
+from pronk.policy.deploy_yaml import read_deploy_yaml
 from pronk.robots import load_robot
 from pronk.robots.machine import Machine, TorqueKind
 from pronk.robots.robot import RobotSpec
@@ -73,6 +77,8 @@ class RunPlan:
     """Robot of the run."""
     policy: Path | None = None
     """The policy, policy.onnx; None for a sweep."""
+    deploy_yaml: Path | None = None
+    """Unitree's deploy.yaml of a policy that was trained elsewhere; None for one of pronk."""
     sweep: SweepTask | None = None
     """The sweep; None for a policy."""
     log: Path | None = None
@@ -131,6 +137,22 @@ class RunPlan:
         if self.ages is not None:
             limits = replace(limits, ages=self.ages)
         return limits
+
+    def policy_gains(self) -> tuple[Array, Array]:
+        """Return the stiffness and damping that the drives have under the policy, (joints,).
+
+        They are those of the drives themselves, whatever gains the policy was trained with, or
+        those of `deploy.yaml`, with which such a policy is run by its makers.
+
+        Raises:
+            ArtefactError: The file cannot be read.
+        """
+        if self.deploy_yaml is not None:
+            deploy = read_deploy_yaml(self.deploy_yaml)
+            return np.array(deploy.stiffness), np.array(deploy.damping)
+        joints = self.robot.joints
+        stiffness = np.array([joint.stiffness for joint in joints])
+        return stiffness, np.array([joint.damping for joint in joints])
 
     @property
     def silence_s(self) -> float:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from pronk.arrays import Array
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import POLICY_MODES, Mode
@@ -27,10 +28,9 @@ from pronk.deploy.runtime.plan import POLICY_PRIORITY, RunPlan
 from pronk.deploy.runtime.process_body import run_to_end
 from pronk.deploy.runtime.records import ACTIONS, STEP, event_record, get_state
 from pronk.errors import PronkError
-from pronk.policy.contract import Contract, check
+from pronk.policy.deployable import DeployablePolicy, open_policy
 from pronk.policy.observation import History
 from pronk.policy.rollout import measurement
-from pronk.policy.runtime import Policy, load_policy
 from pronk.policy.script import STILL, Commanded
 from pronk.processes import die_with_parent
 from pronk.robots.machine import State
@@ -91,20 +91,21 @@ def serve_policy(plan: RunPlan, name: str, end: Connection) -> None:
     die_with_parent()
     assert plan.policy is not None
     shared = Shared(name, len(plan.robot.joints))
-    process = PolicyProcess(plan, shared, load_policy(plan.policy))
+    policy = open_policy(plan.policy, plan.robot, plan.deploy_yaml)
+    process = PolicyProcess(plan, shared, policy)
     for line in enter(plan.real_time_settings(POLICY_PRIORITY, 1)):
         notice = event_record(time.monotonic(), "system", f"policy: {line}")
         shared.policy_events.put(notice)
     run_to_end(process, shared, end)
 
 
-def standing(contract: Contract) -> State:
-    """Return the state of a robot that stands in its default pose."""
-    count = len(contract.joint_names)
+def standing(position: Array) -> State:
+    """Return the state of a robot that stands with its joints at a position [rad]."""
+    count = len(position)
     return State(
         time=0.0,
         sequence=0,
-        position=np.array(contract.default_position),
+        position=np.array(position),
         velocity=np.zeros(count),
         torque=np.zeros(count),
         gyro=np.zeros(3),
@@ -116,18 +117,21 @@ def standing(contract: Contract) -> State:
 class PolicyProcess:
     """The loop and its figures."""
 
-    def __init__(self, plan: RunPlan, shared: Shared, policy: Policy) -> None:
+    def __init__(self, plan: RunPlan, shared: Shared, policy: DeployablePolicy) -> None:
         """Warm the network up.
 
+        Args:
+            plan: Plan of the run.
+            shared: Memory of the run.
+            policy: The policy, as `open_policy` has checked it.
+
         Raises:
-            ArtefactError: The policy is not for this robot, or its output is not finite.
+            ArtefactError: The policy's output is not finite.
         """
-        contract = policy.contract
-        check(contract, plan.robot)
         self.plan = plan
         self.shared = shared
         self.policy = policy
-        self.rate_hz = contract.policy_rate_hz
+        self.rate_hz = policy.rate_hz
         self.lateness = Histogram()
         """Lateness of steps [s]."""
         self.decision = Histogram()
@@ -135,10 +139,13 @@ class PolicyProcess:
         self.network = Histogram()
         """Times of the network alone [s]."""
         self._stand_in = policy.sibling()
-        self._standing = measurement(standing(contract))
-        self._history = History(contract.default_position)
-        self._jumps = contract.jump
-        ranges = contract.command_ranges.values()
+        self._standing = measurement(standing(policy.start_position))
+        self._history: History | None = None
+        """History of the observations for the log; None for a policy that has others."""
+        if policy.logs_observation:
+            self._history = History(policy.start_position)
+        self._jumps = policy.jumps
+        ranges = policy.command_ranges.values()
         self._lowest_command = [low for low, _ in ranges]
         self._highest_command = [high for _, high in ranges]
         self._pace: Pace | None = None
@@ -205,7 +212,8 @@ class PolicyProcess:
             is_first_of_halt = mode is Mode.HALT and self._mode is Mode.POLICY
             if mode_count != self._mode_count and not is_first_of_halt:
                 self.policy.reset()
-                self._history.reset()
+                if self._history is not None:
+                    self._history.reset()
                 self._mode_count = mode_count
             self._mode = mode
             try:
@@ -240,10 +248,12 @@ class PolicyProcess:
         self.shared.actions.write(action)
         done = time.monotonic()
         self._count += 1
-        # The observation for the log, built again after the action is out.
-        observation = self._history.observe(measurement(state), velocity)
-        self._history.acted(outputs.action[0])
         step = self._step
+        step["observation"] = np.nan
+        if self._history is not None:
+            # The observation for the log, built again after the action is out.
+            step["observation"] = self._history.observe(measurement(state), velocity)
+            self._history.acted(outputs.action[0])
         step["sequence"] = action["sequence"]
         step["state_sequence"] = state.sequence
         step["state_time"] = state.time
@@ -256,7 +266,6 @@ class PolicyProcess:
         step["command"] = velocity
         step["jump"] = jump
         step["target"] = target
-        step["observation"] = observation
         step["action"] = outputs.action[0]
         step["contact"] = outputs.contact[0]
         step["linear_velocity"] = outputs.linear_velocity[0]

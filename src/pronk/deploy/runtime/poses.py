@@ -12,11 +12,6 @@ from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots.robot import RobotSpec
 
-SWING = 0.15
-"""Swing of each leg's last joint towards the default pose and back, to know that its encoder is its
-own [rad]. In the folded pose on the ground it moves by 0.010 to 0.020, any other by 0.47 of that at
-most, where the motions out and back are averaged: a robot that still sinks moves all of them."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RunTiming:
@@ -27,8 +22,8 @@ class RunTiming:
     fold_s: float = 1.0
     """Time from the measured pose to the folded pose [s]."""
     check_s: float = 0.15
-    """Time of each half swing of a leg in the folded pose before the first rise, and of each small
-    motion in the default pose after it; 0 for no check [s]."""
+    """Time of each small motion in the default pose after the first rise; 0 for no check, and no
+    swing of the legs before it either [s]."""
     rest_s: float = 1.2
     """Time in the default pose after the small motions, until the trunk is still: the Mini Cheetah
     on the virtual ground moves by up to 2.5 cm in the first second, by 1.5 mm afterwards [s]."""
@@ -82,6 +77,9 @@ class PosePath:
     """Times from each pose to the next [s]."""
     ramp_s: float = 0.0
     """Time in which the stiffness grows [s]."""
+    rises: range = range(0)
+    """Parts of the way in which the gains go over from those of the drives to those of standing;
+    none for the gains of standing on the whole way."""
 
     def target(self, t: float) -> Array:
         """Return the joint targets at a time [rad], (joints,)."""
@@ -97,6 +95,14 @@ class PosePath:
     def stiffness(self, t: float) -> float:
         """Return the share of the drives' stiffness at a time, 0 to 1."""
         return minimum_jerk((t - self.began) / self.ramp_s) if self.ramp_s > 0.0 else 1.0
+
+    def standing_share(self, t: float) -> float:
+        """Return the share of the gains of standing at a time, 0 to 1; the drives' are the rest."""
+        if not self.rises:
+            return 1.0
+        rise_began = self.began + sum(self.seconds[: self.rises.start])
+        rise_s = sum(self.seconds[self.rises.start : self.rises.stop])
+        return minimum_jerk((t - rise_began) / rise_s) if rise_s > 0.0 else float(t >= rise_began)
 
     def done(self, t: float) -> bool:
         """Whether the target has reached the last pose."""
@@ -141,8 +147,8 @@ def stand_up(
         measured: Measured joint positions [rad], (joints,).
         began: Time at the measured pose [s].
         timing: Times of the way.
-        swing: Whether each leg's last joint swings by `SWING` in the folded pose, one leg after
-            another.
+        swing: Whether each leg's last joint swings by `StandingUp.swing` in the folded pose, one
+            leg after another.
         nods: Poses of small motions after the default pose, the last of them the default pose
             again, `RunTiming.check_s` apart [rad], each (joints,); `RunTiming.rest_s` follows.
     """
@@ -153,15 +159,22 @@ def stand_up(
     if swing:
         for i in last_joints(robot):
             swung = folded.copy()
-            swung[i] += math.copysign(SWING, default[i] - folded[i])
+            swung[i] += math.copysign(robot.limits.stand.swing, default[i] - folded[i])
             poses += [swung, folded]
-            seconds += [timing.check_s, timing.check_s]
+            seconds += [robot.limits.stand.swing_s, robot.limits.stand.swing_s]
     poses.append(default)
     seconds.append(timing.rise_s)
+    rise = len(seconds) - 1
     for pose in nods:
         poses.append(pose)
         seconds.append(timing.check_s)
     if nods:
         poses.append(default)
         seconds.append(timing.rest_s)
-    return PosePath(began=began, poses=tuple(poses), seconds=tuple(seconds), ramp_s=timing.ramp_s)
+    return PosePath(
+        began=began,
+        poses=tuple(poses),
+        seconds=tuple(seconds),
+        ramp_s=timing.ramp_s,
+        rises=range(rise, rise + 1),
+    )

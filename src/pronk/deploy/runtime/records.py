@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.deploy.links.remote import REMOTE_BYTES
 from pronk.deploy.runtime.reasons import FilterAction, Reason
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.robots.machine import State
@@ -49,7 +50,8 @@ def state_dtype(joints: int) -> np.dtype[Any]:
     """Return the record of the servo to all, written at every tick.
 
     The newest state; `now`, the time of this tick, and `start`, that of tick 0; `progress`, the
-    share of a sweep that is done; the mode, and `mode_count`, the number of mode changes so far.
+    share of a sweep that is done; the mode, and `mode_count`, the number of mode changes so far;
+    `remote`, the bytes of the robot's wireless remote, zero where the link carries none.
     """
     return np.dtype(
         [
@@ -59,6 +61,7 @@ def state_dtype(joints: int) -> np.dtype[Any]:
             ("progress", _FLOAT),
             ("mode", _INT),
             ("mode_count", _INT),
+            ("remote", "u1", (REMOTE_BYTES,)),
         ]
     )
 

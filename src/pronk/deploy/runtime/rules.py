@@ -204,7 +204,8 @@ def limit_targets(
       `ahead` is below `low + margin`, `max(low + margin, position)`; and `ceiling = high - margin +
       target_reach`, or, if `ahead` is above `high - margin`, `min(high - margin, position)`. So a
       joint that leaves this range within the horizon is not driven further out.
-    - change: `previous - change <= target <= previous + change`.
+    - change: `previous - change <= target <= previous + change`; with a `target_reach`, as far as
+      the position interval is not beyond it, so that a joint that nears a limit is not driven on.
     - torque: `|stiffness (target - position) - damping velocity| <= torque`, which is
       `|target - (position + damping velocity / stiffness)| <= torque / stiffness`; a joint without
       stiffness has no such interval, and its damping alone must stay within the torque.
@@ -241,6 +242,9 @@ def limit_targets(
     reach = np.where(is_stiff, joints.torque / divisor, np.inf)
     slowest = previous - operating.change
     fastest = previous + operating.change
+    if operating.target_reach > 0.0:
+        slowest = np.minimum(slowest, ceiling)
+        fastest = np.maximum(fastest, floor)
     least_torque = without_torque - reach
     largest_torque = without_torque + reach
     low = np.maximum(np.maximum(floor, slowest), least_torque)

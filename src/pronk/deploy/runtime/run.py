@@ -28,8 +28,7 @@ from pronk.deploy.runtime.servo import serve_robot
 from pronk.deploy.runtime.standby import serve_standby
 from pronk.deploy.runtime.teleop import Operator, OperatorCommand
 from pronk.errors import HardwareError, LogError, PronkError
-from pronk.policy.contract import check
-from pronk.policy.runtime import Policy, load_policy
+from pronk.policy.deployable import UNKNOWN_DELAY_S, DeployablePolicy, open_policy
 from pronk.version import VERSION
 
 _RATE_HZ = 50.0
@@ -66,7 +65,7 @@ class RunSummary:
     interrupted: bool = False
     """Whether a signal ended it: the interrupt key, or the end of the terminal."""
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
-    """Command delays that the policy was trained for [s]."""
+    """Command delays that the policy was trained for [s]; `UNKNOWN_DELAY_S` if it does not say."""
 
     @property
     def faults(self) -> list[str]:
@@ -83,6 +82,14 @@ class RunSummary:
         low_ms = 1e3 * self.trained_delay_s[0]
         high_ms = 1e3 * self.trained_delay_s[1]
         measured = self.servo.get("state_to_command", {})
+        if self.trained_delay_s == UNKNOWN_DELAY_S:
+            if not measured.get("n"):
+                return "no delay was measured; deploy.yaml does not say what was trained for."
+            return (
+                f"state to command {measured['p50_ms']:.1f} ms (median), {measured['p95_ms']:.1f} "
+                f"ms (95 %), n = {measured['n']}; deploy.yaml does not say which delays the policy "
+                "was trained for; the drives' own delay comes on top."
+            )
         if not measured.get("n"):
             return (
                 f"no delay was measured; the policy was trained for {low_ms:g} to {high_ms:g} ms."
@@ -98,10 +105,13 @@ class RunSummary:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for JSON and the end of the log."""
+        trained_delay_s = None
+        if self.trained_delay_s != UNKNOWN_DELAY_S:
+            trained_delay_s = list(self.trained_delay_s)
         return {
             "servo": self.servo,
             "policy": self.policy,
-            "trained_delay_s": list(self.trained_delay_s),
+            "trained_delay_s": trained_delay_s,
             "faults": self.faults,
             "refusals": self.refusals,
             "standby": self.standby,
@@ -125,9 +135,8 @@ class Deployment:
         self.summary = RunSummary()
         self._header: dict[str, Any] = {}
         if plan.policy is not None:
-            policy = load_policy(plan.policy)
-            check(policy.contract, plan.robot)
-            self.summary.trained_delay_s = policy.contract.delay_range_s
+            policy = open_policy(plan.policy, plan.robot, plan.deploy_yaml)
+            self.summary.trained_delay_s = policy.delay_range_s
             self._header = log_header(plan, policy)
         if plan.sweep is not None:
             plan.sweep.check()
@@ -287,8 +296,10 @@ class Deployment:
                     notify(event)
             if mode is Mode.ENDED:
                 return self.summary
+            record = self.shared.state.read()
+            if record is not None:
+                operator.sensed(record["remote"].tobytes())
             if progress is not None:
-                record = self.shared.state.read()
                 progress(0.0 if record is None else float(record["progress"]))
             try:
                 command = operator.command(time.monotonic(), mode)
@@ -443,24 +454,15 @@ def run_plan(
     return summary
 
 
-def log_header(plan: RunPlan, policy: Policy) -> dict[str, Any]:
+def log_header(plan: RunPlan, policy: DeployablePolicy) -> dict[str, Any]:
     """Return the header of a policy's log."""
     import onnxruntime
 
-    contract = policy.contract
     return {
         "robot": plan.robot.name,
         "joints": list(plan.robot.joint_names),
         "link": str(plan.link),
-        "policy": {
-            "file": str(plan.policy),
-            "sha256": policy.sha256,
-            "gains": contract.gains,
-            "gains_sha256": contract.gains_sha256,
-            "delay_range_s": contract.delay_range_s,
-            "jump": contract.jump,
-            "virtual": contract.virtual,
-        },
+        "policy": {"file": str(plan.policy), **policy.provenance()},
         "limits": asdict(plan.limits()),
         "timing": asdict(plan.timing),
         "versions": {"pronk": VERSION, "onnxruntime": onnxruntime.__version__},

@@ -101,7 +101,12 @@ class Servo:
         self.plan = plan
         self.shared = shared
         self.trained_delay_s = trained_delay_s
-        self.modes = StateMachine(plan.robot, plan.timing, sweeps=plan.sweep is not None)
+        self.modes = StateMachine(
+            plan.robot,
+            plan.timing,
+            sweeps=plan.sweep is not None,
+            policy_gains=plan.policy_gains(),
+        )
         self.safety = SafetyFilter(limits=plan.limits())
         self.action: Record | None = None
         """Newest action of the policy, a record of `ACTIONS`."""
@@ -223,6 +228,8 @@ class Servo:
         record = self._state_record
         if self._state is not None:
             put_state(record, self._state)
+            if self._state.remote:
+                record["remote"] = np.frombuffer(self._state.remote, np.uint8)
         record["now"] = now
         record["start"] = self.pace.start
         record["progress"] = 0.0 if self._sweep is None else self._sweep.progress

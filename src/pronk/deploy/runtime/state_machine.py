@@ -57,6 +57,12 @@ STRAY_SHARE = 1.4
 """Motion of another joint that is a fault, as a share of that of the swung one."""
 
 
+def mixed(values: Array, others: Array, share: float) -> Array:
+    """Return the mean of two arrays, with a share of the second; the first itself at 0."""
+    mean: Array = values + share * (others - values)
+    return mean
+
+
 class DesiredCommand(NamedTuple):
     """The command of a tick, before the safety filter."""
 
@@ -80,6 +86,7 @@ class SwingCheck:
     def __init__(self, robot: RobotSpec, timing: RunTiming) -> None:
         """Begin without a position."""
         self._timing = timing
+        self._swing_s = robot.limits.stand.swing_s
         self._swung = last_joints(robot)
         self.needed = timing.check_s > 0.0 and len(self._swung) > 0
         """Whether the check is still to be passed."""
@@ -98,7 +105,7 @@ class SwingCheck:
             began: Time at which the robot began to stand up [s].
             position: Measured joint positions [rad], (joints,).
         """
-        half_swings = math.floor((t - began - self._timing.fold_s) / self._timing.check_s)
+        half_swings = math.floor((t - began - self._timing.fold_s) / self._swing_s)
         leg, back = divmod(half_swings, 2)
         if leg < 0:
             return False
@@ -118,13 +125,22 @@ class SwingCheck:
 class StateMachine:
     """The modes of one run, a policy's or a sweep's."""
 
-    def __init__(self, robot: RobotSpec, timing: RunTiming, *, sweeps: bool = False) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        timing: RunTiming,
+        *,
+        sweeps: bool = False,
+        policy_gains: tuple[Array, Array] | None = None,
+    ) -> None:
         """Begin idle.
 
         Args:
             robot: The robot.
             timing: Times of standing up, starting the policy and sitting down.
             sweeps: Whether the run is a sweep's.
+            policy_gains: Stiffness [N m/rad] and damping [N m s/rad] of the drives under the
+                policy, (joints,) each; those of the robot's file if None.
         """
         self.robot = robot
         self.timing = timing
@@ -138,6 +154,17 @@ class StateMachine:
         """Why the last request was not granted; empty if it was."""
         self._stiffness = np.array([joint.stiffness for joint in robot.joints])
         self._damping = np.array([joint.damping for joint in robot.joints])
+        stand = robot.limits.stand
+        self._stand_stiffness = self._stiffness
+        self._stand_damping = self._damping
+        if stand.stiffness is not None:
+            self._stand_stiffness = np.full(len(robot.joints), stand.stiffness)
+        if stand.damping is not None:
+            self._stand_damping = np.full(len(robot.joints), stand.damping)
+        self._policy_stiffness = self._stiffness
+        self._policy_damping = self._damping
+        if policy_gains is not None:
+            self._policy_stiffness, self._policy_damping = policy_gains
         self._path: PosePath | None = None
         self._swing_check = SwingCheck(robot, timing)
         self._nods: list[Array] = []
@@ -280,10 +307,10 @@ class StateMachine:
             if self._nods and self._finds_contradiction(t, path, position, safety):
                 safety.fault(Reason.ORIENTATION, t)
                 return DesiredCommand()
-            return self._pose(t, path.target(t), path.stiffness(t))
+            return self._pose(t, path.target(t), path.stiffness(t), path.standing_share(t))
         if self.mode is Mode.SIT:
             if not path.done(t):
-                return self._pose(t, path.target(t), path.stiffness(t))
+                return self._pose(t, path.target(t), path.stiffness(t), path.standing_share(t))
             self.enter(Mode.DAMP, t)
         return DesiredCommand()
 
@@ -328,12 +355,19 @@ class StateMachine:
         )
         self.enter(Mode.SIT, t)
 
-    def _pose(self, t: float, target: Array, share: float) -> DesiredCommand:
-        """Return the command of a pose with a share of the drives' stiffness."""
+    def _pose(self, t: float, target: Array, share: float, standing_share: float) -> DesiredCommand:
+        """Return the command of a pose.
+
+        Args:
+            t: Time of the tick [s].
+            target: The pose [rad], (joints,).
+            share: Share of the stiffness, 0 to 1.
+            standing_share: Share of the gains of standing in the gains; the drives' are the rest.
+        """
         command = Command(
             position=target,
-            stiffness=share * self._stiffness,
-            damping=self._damping,
+            stiffness=share * mixed(self._stiffness, self._stand_stiffness, standing_share),
+            damping=mixed(self._damping, self._stand_damping, standing_share),
             made=t,
             valid_for=VALID_S,
         )
@@ -342,14 +376,17 @@ class StateMachine:
     def _follow_policy(
         self, t: float, pose: Array, action: Record | None, safety: SafetyFilter
     ) -> DesiredCommand:
-        """Return the policy's targets, blended in; the standing pose until the first of them."""
+        """Return the policy's targets, blended in; the standing pose until the first of them.
+
+        The gains go over to those of the policy with its targets.
+        """
         if self._blending_since is None:
             # Halted before its first action, the policy may act for either mode.
             if action is None or action["mode_count"] < self._policy_mode_count:
                 if t - self.since > FIRST_ACTION_S:
                     safety.fault(Reason.EXPIRED, t)
                     return DesiredCommand()
-                return self._pose(t, pose, 1.0)
+                return self._pose(t, pose, 1.0, 1.0)
             self._blending_since = t
         assert action is not None
         share = 1.0
@@ -357,8 +394,8 @@ class StateMachine:
             share = minimum_jerk((t - self._blending_since) / self.timing.blend_s)
         command = Command(
             position=pose + share * (action["position"] - pose),
-            stiffness=self._stiffness,
-            damping=self._damping,
+            stiffness=mixed(self._stand_stiffness, self._policy_stiffness, share),
+            damping=mixed(self._stand_damping, self._policy_damping, share),
             sequence=int(action["sequence"]),
             state_sequence=int(action["state_sequence"]),
             made=float(action["made"]),

@@ -48,6 +48,9 @@ class Operator:
     def notified(self, event_kind: str, text: str) -> None:
         """Receive an event of the servo."""
 
+    def sensed(self, remote: bytes) -> None:
+        """Receive the bytes of the robot's wireless remote that came with the newest state."""
+
     def leave(self) -> None:
         """End, because the program was interrupted."""
 
@@ -159,6 +162,10 @@ class TimeLimit(Operator):
     def notified(self, event_kind: str, text: str) -> None:
         """Pass an event of the servo on."""
         self._operator.notified(event_kind, text)
+
+    def sensed(self, remote: bytes) -> None:
+        """Pass the bytes of the robot's remote on."""
+        self._operator.sensed(remote)
 
     def leave(self) -> None:
         """End, because the program was interrupted."""

@@ -171,12 +171,14 @@ def _check_range(quantity: str, values: Array, largest: float) -> None:
 
 
 def encode_dds_state(joints: JointMap, state: State) -> bytes:
-    """Encode the `LowState` of a virtual robot; what it does not have (cells, remote) is zero."""
+    """Encode the `LowState` of a virtual robot; what it does not have (cells) is zero."""
     record = _record_with_head(LowState)
     record["sn"] = VIRTUAL_SERIAL
     robot_time = state.time if state.robot_time is None else state.robot_time
     record["tick"] = round(robot_time * TICKS_PER_S) % 2**32
     record["power_v"] = state.bus_voltage
+    if state.remote:
+        record["wireless_remote"] = np.frombuffer(state.remote, np.uint8)
     imu = record["imu_state"]
     imu["quaternion"] = state.orientation
     imu["gyroscope"] = state.gyro
@@ -238,6 +240,7 @@ class DdsStateDecoder(StateNumbering):
             orientation=unit_quaternion("imu_state.quaternion", quaternion.astype(np.float64)),
             robot_time=tick / TICKS_PER_S,
             temperature=temperature,
+            remote=record["wireless_remote"][0].tobytes(),
         )
         return self.number(measurement, tick)
 

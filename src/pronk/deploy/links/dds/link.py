@@ -78,8 +78,10 @@ ROBOT_STATE = "robot_state"
 """Service of older firmware."""
 SERVICE_SWITCH = 1001
 BENCH = "pronk_bench"
-"""Service of the virtual robot alone: requests for clamps."""
+"""Service of the virtual robot alone: clamps, and the hands at the wireless remote."""
 CLAMP = 1
+REMOTE = 2
+"""Function of that service: the bytes of the wireless remote, in hexadecimal."""
 # Codes of a response, as in unitree_sdk2.
 DONE = 0
 UNKNOWN_API = 3203
