@@ -45,6 +45,7 @@ def build(
     observation: TensorDict | None = None,
     multi_gpu: dict[str, int] | None = None,
     estimator: dict[str, Any] | None = None,
+    compile_mode: str | None = None,
     **algorithm: Any,
 ) -> EstimatorPPO:
     """Build it as rsl_rl's runner does from mjlab's configuration."""
@@ -64,6 +65,7 @@ def build(
         "obs_groups": {"actor": list(read), "critic": ["critic", "critic_jump"]},
         "num_steps_per_env": STEPS,
         "multi_gpu": multi_gpu,
+        "torch_compile_mode": compile_mode,
     }
     env: Any = SimpleNamespace(num_envs=ROBOTS, num_actions=12)
     start = observe() if observation is None else observation

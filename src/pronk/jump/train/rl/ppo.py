@@ -172,6 +172,11 @@ class EstimatorPPO(PPO):
         self._compiled_losses = compiled(self._losses)
         self._compiled_estimator_losses = compiled(self._raw_actor.estimator.losses)
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether `compile` has compiled the policy's step and the losses."""
+        return self._compiled_policy is not None
+
     def act(self, obs: TensorDict) -> Tensor:
         """Draw actions, (N, 12), and remember what PPO needs of the step.
 

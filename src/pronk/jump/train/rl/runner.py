@@ -98,6 +98,12 @@ class PronkRunner(MjlabOnPolicyRunner):
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
+        if compiles and not self.alg.is_compiled:
+            self.note(
+                "warning: --compile leaves the networks as they are: it knows PPO with a Gaussian "
+                "of one standard deviation an action, an adaptive learning rate, values that are "
+                "not clipped and advantages of the whole rollout, without a mirror loss."
+            )
         self.folder = None if log_dir is None else Path(log_dir)
         self.phases: dict[str, dict[str, Any]] = {}
         """Figures of the phases that were finished: iterations, seconds, and so on."""

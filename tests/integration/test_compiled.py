@@ -1,0 +1,102 @@
+"""`--compile`: the same numbers but for rounding, and nothing compiled twice as phases go on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+from mjlab.envs import ManagerBasedRlEnv
+
+import ppo_case
+import training_env
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.phases import PHASES, curriculum
+
+pytestmark = [pytest.mark.train, pytest.mark.slow]
+
+ROUNDING = 1e-5
+"""Largest difference of results that should be alike but for rounding, of the order of 1."""
+STEPS = 6
+"""Policy steps in each phase."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Batches this small lose more by waiting for each other's threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def rewards_of_all_phases(*, compiles: bool) -> list[Any]:
+    """Step eight robots through all phases with jumps; returns the rewards of each step."""
+    env = ManagerBasedRlEnv(training_env.config(8, training_env.MATCHED), device="cpu")
+    StackedRewardManager.install(env)
+    command = motion_command(env)
+    if compiles:
+        command.compile()
+        env.reward_manager.compile()
+    env.reset(seed=0)
+    rewards: list[Any] = []
+    generator = torch.Generator().manual_seed(1)
+    for phase in PHASES.values():
+        # All that is to be compiled is compiled in the first phase.
+        is_strict = compiles and len(rewards) > 0
+        with torch.inference_mode(), torch._dynamo.config.patch(error_on_recompile=is_strict):
+            for step in range(STEPS):
+                curriculum(env).apply(env, phase, step / STEPS)
+                actions = torch.randn(8, 12, generator=generator)
+                _, reward, *_ = env.step(0.3 * actions)
+                rewards.append(reward.clone())
+                command.jump[:] = phase.jump and step > 0
+    env.close()
+    return rewards
+
+
+def test_compiled_rewards_are_the_same_in_every_phase() -> None:
+    """Weights, jump scales, lift-off kernel and step length change without compiling anew."""
+    plain = rewards_of_all_phases(compiles=False)
+    fast = rewards_of_all_phases(compiles=True)
+    for step, (expected, reward) in enumerate(zip(plain, fast, strict=True)):
+        assert reward.tolist() == pytest.approx(expected.tolist(), abs=ROUNDING), step
+    assert torch.stack(plain).std() > 0.01
+
+
+def updated(compile_mode: str | None) -> tuple[Any, dict[str, float]]:
+    """Learn from one rollout of random observations, with a rate that follows the divergence."""
+    torch.manual_seed(2)
+    algorithm = ppo_case.build(
+        compile_mode=compile_mode, use_clipped_value_loss=False, desired_kl=0.01
+    )
+    ppo_case.roll_out(algorithm)
+    return algorithm, algorithm.update()
+
+
+def test_a_compiled_update_is_that_of_rsl_rl() -> None:
+    plain, plain_losses = updated(None)
+    fast, fast_losses = updated("default")
+    assert fast.is_compiled
+    assert not plain.is_compiled
+    for name in ("surrogate", "value", "entropy"):
+        assert fast_losses[name] == pytest.approx(plain_losses[name], abs=ROUNDING), name
+    assert fast.learning_rate == pytest.approx(plain.learning_rate)
+    assert plain.learning_rate != 1e-3  # it was adapted
+    # Adam divides by the size of a gradient: where it is all but zero, rounding is magnified.
+    expected = torch.nn.utils.parameters_to_vector(plain._raw_critic.parameters())
+    weights = torch.nn.utils.parameters_to_vector(fast._raw_critic.parameters())
+    assert (weights - expected).abs().median() < ROUNDING
+    # What was saved is read without --compile, and the other way round.
+    plain.load(fast.save())
+    assert isinstance(plain.learning_rate, float)
+
+
+def test_a_configuration_that_is_not_known_is_left_as_it_is() -> None:
+    algorithm = ppo_case.build(compile_mode="default", use_clipped_value_loss=True)
+    assert not algorithm.is_compiled
+    ppo_case.learn(algorithm)
