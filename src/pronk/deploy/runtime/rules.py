@@ -243,8 +243,8 @@ def limit_targets(
     slowest = previous - operating.change
     fastest = previous + operating.change
     if operating.target_reach > 0.0:
-        slowest = np.minimum(slowest, ceiling)
-        fastest = np.maximum(fastest, floor)
+        slowest = np.where(ahead > highest, np.minimum(slowest, ceiling), slowest)
+        fastest = np.where(ahead < lowest, np.maximum(fastest, floor), fastest)
     least_torque = without_torque - reach
     largest_torque = without_torque + reach
     low = np.maximum(np.maximum(floor, slowest), least_torque)
