@@ -6,6 +6,7 @@
 docs/from-your-go2.md says what to do before. Run on the virtual Go2, not yet on hardware.
 """
 
+import bisect
 import csv
 import math
 import sys
@@ -49,15 +50,14 @@ def record(interface, joint, path, domain=0):
     code, mode = switcher.CheckMode()
     if code != 0 or mode["name"]:
         sys.exit(f"the motion service is on or silent ({code}, {mode}): release it first")
-    sent, measured, rows = {}, [], []
+    measured, states, sent = [], [], []
 
     def on_state(state):
         measured[:] = [motor.q for motor in state.motor_state[:12]]
-        if joint in sent:
-            rows.append((time.perf_counter(), sent[joint], measured[excited]))
+        states.append((time.perf_counter(), 0.001 * state.tick, measured[excited]))
 
     subscriber = ChannelSubscriber("rt/lowstate", LowState_)
-    subscriber.Init(on_state, 10)
+    subscriber.Init(on_state)
     publisher = ChannelPublisher("rt/lowcmd", LowCmd_)
     publisher.Init()
     message, checksum = unitree_go_msg_dds__LowCmd_(), CRC()
@@ -83,18 +83,23 @@ def record(interface, joint, path, domain=0):
             targets = [a + share * (b - a) for a, b in zip(start, POSE, strict=True)]
             if now > 0.0:
                 targets[excited] += excitation(now)
-                sent[joint] = targets[excited]
+                sent.append((time.perf_counter(), targets[excited]))
                 if abs(measured[excited] - targets[excited]) > 0.6:
                     sys.exit(f"{joint} is 0.6 rad from its command: damped")
             send(targets, share)
     finally:
-        sent.clear()
         for _ in range(500):
             send(measured, 0.0)  # damping
+        # States by the robot's clock, for this program may be late; each with the command in force.
+        offset = min(arrived - tick for arrived, tick, _ in states)
+        times = [moment for moment, _ in sent]
         with Path(path).open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["time", f"command.{joint}", f"position.{joint}"])
-            writer.writerows(rows)
+            for _, tick, position in states:
+                number = bisect.bisect(times, tick + offset) - 1
+                if number >= 0 and tick + offset < times[-1]:
+                    writer.writerow([f"{tick:.3f}", sent[number][1], position])
 
 
 if __name__ == "__main__":

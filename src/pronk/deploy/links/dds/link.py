@@ -59,7 +59,7 @@ _WRITE_NS = 1_000_000
 _ON_INTERFACE = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface name={}/></Interfaces></General></Domain></CycloneDDS>"""
 # Loopback often has no multicast: query the ports of the first participants one by one.
-_ON_LOOPBACK = """<CycloneDDS><Domain Id="any"><General>
+ON_LOOPBACK = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -151,7 +151,7 @@ class Participant:
                     f"this process already uses {opened_network}; close it and start anew for "
                     f"{network}."
                 )
-        configuration = _ON_LOOPBACK
+        configuration = ON_LOOPBACK
         if network.interface:
             configuration = _ON_INTERFACE.format(quoteattr(network.interface))
         try:
