@@ -61,7 +61,7 @@ def serve(domain: int, mode: str, end: Connection) -> None:
 
 
 def record(domain: int, path: Path, end: Connection) -> None:
-    """Body of the recorder's process, with fewer and shorter chirps; sends what ended it, if any."""
+    """Body of the recorder's process, with fewer and shorter chirps; sends what ended it."""
     from unitree_sdk2py.core import channel
 
     enter(RealTimeSettings(priority=20, lock=False))
