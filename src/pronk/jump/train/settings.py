@@ -25,8 +25,8 @@ class DeviceSettings:
     gpu_ids: str | None = None
     """GPUs of this host, as in 0,1, or all; 0."""
     compile: bool = False
-    """Compile rewards, networks and losses with torch.compile, which changes how they round; takes
-    a minute or so at first."""
+    """Compile rewards, networks and losses with torch.compile, which changes how they round;
+    compiling takes time at first."""
 
 
 @dataclass(frozen=True, kw_only=True)
