@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,9 +14,11 @@ from mjlab.envs import ManagerBasedRlEnv
 
 import ppo_case
 import training_env
+from pronk.cli import main as cli
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum
+from pronk.jump.train.provenance import RunFolder
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 
@@ -66,6 +69,17 @@ def test_compiled_rewards_are_the_same_in_every_phase() -> None:
     for step, (expected, reward) in enumerate(zip(plain, fast, strict=True)):
         assert reward.tolist() == pytest.approx(expected.tolist(), abs=ROUNDING), step
     assert torch.stack(plain).std() > 0.01
+
+
+def test_a_compiled_run_is_exported_and_says_so(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    arguments = ["walk", "--gains", "naive", "--phase", "walk=2", "--envs", "8"]
+    arguments += ["--device", "cpu", "--compile", "--out", str(folder.path)]
+    assert cli.run(["train", *arguments]) == 0
+    record = folder.read()
+    assert record["finished"]
+    assert [session["compiled"] for session in record["sessions"]] == [True]
+    assert (folder.path / "policy.onnx").is_file()
 
 
 def updated(compile_mode: str | None) -> tuple[Any, dict[str, float]]:

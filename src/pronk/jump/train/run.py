@@ -257,6 +257,7 @@ def _train_session(folder: RunFolder, settings: TrainSettings, processes: int) -
     config = _train_config(folder, settings)
     record = folder.read()
     session = provenance.new_session()
+    session["compiled"] = settings.devices.compile  # which rounds otherwise
     record["sessions"].append(session)
     folder.write(record)
     log_dir = folder.path.resolve()
