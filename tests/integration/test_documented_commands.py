@@ -57,6 +57,7 @@ LEG_PLACES = ("docs/your-log.md", "docs/your-robot.md", "CONTRIBUTING.md")
 PARSED = {
     "train": "needs a GPU",
     "study": "trains for hours",
+    "runs/": "needs the folder of a training",
     "evaluate": "needs a GPU",
     "play": "serves a browser until it is ended",
     "simulate": "runs until it is ended",
