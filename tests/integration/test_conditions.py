@@ -255,9 +255,9 @@ def test_battery_and_trunk_are_drawn_in_proportion_to_the_robot() -> None:
                 voltages.append(drawn.value)
             if drawn.parameter == "trunk.mass_offset":
                 masses.append(drawn.value)
-    own = params.machine.bus_voltage
-    assert 0.95 * own < min(voltages) < 0.97 * own
-    assert 1.03 * own < max(voltages) < 1.05 * own
+    nominal_voltage = params.machine.bus_voltage
+    assert 0.95 * nominal_voltage < min(voltages) < 0.97 * nominal_voltage
+    assert 1.03 * nominal_voltage < max(voltages) < 1.05 * nominal_voltage
     assert -0.3 * 15.017 / 12.0 <= min(masses) < 0.0
     assert 0.9 < max(masses) <= 0.9 * 1.2515
     # The Mini Cheetah's are those of the table.

@@ -7,12 +7,13 @@ m/s, by the charge of the battery, where the Mini Cheetah could at 3; so what a 
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.commands import NAME as COMMAND
+from pronk.jump.train.mdp.events import Shape
 from pronk.jump.train.mdp.jump import JumpSettings
 from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg
 from pronk.robots.robot import RobotSpec
@@ -38,9 +39,24 @@ RESISTANCE = (0.03, 0.08)
 """Of these cells, 3 to 8 milliohm each, with plugs and wires [ohm]."""
 
 
-def env_cfg(robot: RobotSpec, gains: TrainingGains, **options: Any) -> ManagerBasedRlEnvCfg:
-    """Configure the environment; arguments are those of `jump_env_cfg`."""
-    cfg = jump_env_cfg(robot, gains, **options)
+def env_cfg(
+    robot: RobotSpec,
+    gains: TrainingGains,
+    *,
+    iterations: Mapping[str, int],
+    gain_shape: Shape = "box",
+    num_envs: int = 4096,
+    seed: int = 0,
+) -> ManagerBasedRlEnvCfg:
+    """Configure the environment of all phases; the arguments are those of `jump_env_cfg`."""
+    cfg = jump_env_cfg(
+        robot,
+        gains,
+        iterations=iterations,
+        gain_shape=gain_shape,
+        num_envs=num_envs,
+        seed=seed,
+    )
     command = cfg.commands[COMMAND]
     command.limits = SPEEDS
     command.settings = JUMP
