@@ -136,7 +136,10 @@ def _training_arms(config: StudyConfig, folder: Path, study_file: Path) -> dict[
                 )
         try:
             values = parsed_command([*words, *options])
-            settings = replace(values["settings"], gains=gains).completed()
+            settings = replace(values["settings"], gains=gains)
+            if settings.recipe is not None:
+                settings = replace(settings, recipe=folder / settings.recipe)
+            settings = settings.completed()
         except PronkError as error:
             raise PronkError(f"{study_file}: arms.{name}: {error}") from None
         if arm.randomization is not None and (settings.draws.ellipsoid or settings.draws.by_joint):

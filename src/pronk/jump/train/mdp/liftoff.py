@@ -10,23 +10,6 @@ import torch
 from torch import Tensor
 
 
-def carried_speed(along: Tensor, target: Tensor, vertical: Tensor, wanted: float) -> Tensor:
-    """Compute the speed along the command that a lift-off carries into its flight [m/s].
-
-    It is `along`, 0 to `target`, times the share of the wanted vertical velocity that there is, at
-    most 1: a fast step that hardly leaves the ground carries nothing, and more than what is
-    rewarded earns no more.
-
-    Args:
-        along: Horizontal velocity along the command at lift-off [m/s].
-        target: The speed that is rewarded in jump mode [m/s].
-        vertical: Vertical velocity at lift-off [m/s].
-        wanted: The wanted vertical velocity [m/s].
-    """
-    speed = torch.minimum(along, target).clamp_min(0.0)
-    return speed * (vertical / wanted).clamp(0.0, 1.0)
-
-
 def angle_kernel(
     along: Tensor, target: Tensor, vertical: Tensor, wanted: float, std: float
 ) -> Tensor:
@@ -53,6 +36,16 @@ def angle_kernel(
     return torch.exp(error.square() * (-0.5 / std**2)) * share.clamp_max(1.0)
 
 
+def forward_share(forward: Tensor, full_speed: float) -> Tensor:
+    """Compute how much a command is one forwards, 0 (at rest, sideways, backwards) to 1.
+
+    Args:
+        forward: Commanded forward velocity, negative backwards [m/s].
+        full_speed: Speed from which on the share is 1 [m/s].
+    """
+    return (forward / full_speed).clamp(0.0, 1.0)
+
+
 def height_share(forward: Tensor, full_speed: float, least: float) -> Tensor:
     """Compute the share of the reward for height that is left at a forward command, 1 to `least`.
 
@@ -65,4 +58,4 @@ def height_share(forward: Tensor, full_speed: float, least: float) -> Tensor:
         full_speed: Speed from which on the share is `least` [m/s].
         least: The smallest share, 0 to 1.
     """
-    return 1.0 - (1.0 - least) * (forward / full_speed).clamp(0.0, 1.0)
+    return 1.0 - (1.0 - least) * forward_share(forward, full_speed)

@@ -258,21 +258,12 @@ def _liftoff_along(command: MotionCommand) -> Tensor:
     return (command.motion.trunk.velocity_heading * commanded).sum(dim=-1) / speed
 
 
-def liftoff_speed(env: Env) -> Tensor:
-    """Speed along the command that the first lift-off carries into its flight [m/s]; an event."""
-    command = _measured(env)
-    state = command.state
-    speed = liftoff.carried_speed(
-        _liftoff_along(command),
-        torch.linalg.vector_norm(command.target, dim=-1),
-        command.motion.trunk.velocity_world[:, 2],
-        state.settings.liftoff_velocity,
-    )
-    return speed * state.reward_scale * state.first_liftoff / command.step_s
+def liftoff_angle(env: Env, vertical: float, std: float, forward_speed: float) -> Tensor:
+    """Similarity of the first lift-off's direction to the asked-for one, 0 to 1; an event.
 
-
-def liftoff_angle(env: Env, vertical: float, std: float) -> Tensor:
-    """Similarity of the first lift-off's direction to the asked-for one, 0 to 1; an event."""
+    It is asked of commands forwards, fully from `forward_speed` on [m/s]: jumps backwards came to
+    fly so fast by it that they fell.
+    """
     command = _measured(env)
     state = command.state
     kernel = liftoff.angle_kernel(

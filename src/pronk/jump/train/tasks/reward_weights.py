@@ -110,10 +110,11 @@ def candidate_terms() -> dict[str, RewardTermCfg]:
     changes how it is rounded.
     """
     return {
-        "liftoff_speed": _term(rewards.liftoff_speed, 0.0),
         # 2 m/s upwards beside 2.6 m/s forwards, as in the paper's jumps at 2 m/s: .97 m in .40 s.
         # A kernel of .15 rad separates 53 degrees (today's 2.2 and 1.67 m/s) from 38.
-        "liftoff_angle": _term(rewards.liftoff_angle, 0.0, vertical=2.0, std=0.15),
+        "liftoff_angle": _term(
+            rewards.liftoff_angle, 0.0, vertical=2.0, std=0.15, forward_speed=1.0
+        ),
         # Table III: .318 and .244 m at 1 and 2 m/s forwards, .38 m at most elsewhere.
         "height_by_speed": _term(rewards.height_by_speed, 0.0, full_speed=2.0, least=0.4),
     }
