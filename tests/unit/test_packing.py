@@ -176,3 +176,10 @@ def test_trainings_are_added_to_gpus_as_they_show_their_rates(tmp_path: Path) ->
     # The third one would share a GPU with a training that has not shown its rate.
     assert places == ["GPU 0", "GPU 1", ""]
     assert executor.rooms() >= 2
+
+
+def test_the_rate_that_is_told_is_the_mean_of_what_was_measured() -> None:
+    rates = GpuRates(limit=4)
+    for rate in (80_000.0, 90_000.0, 100_000.0):
+        rates.note([rate] * 4)
+    assert "90,000 steps/s each, 360,000 together" in packing_text(rates)

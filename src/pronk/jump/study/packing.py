@@ -25,7 +25,9 @@ class GpuRates:
     """What was measured of trainings side by side, on any GPU of this host."""
 
     totals: dict[int, float] = field(default_factory=dict)
-    """Steps/s of all trainings on a GPU together, by their number."""
+    """Mean steps/s of all trainings on a GPU together, by their number."""
+    notes: dict[int, int] = field(default_factory=dict)
+    """How often that was measured, by the same number."""
     limit: int | None = None
     """Number of trainings on one GPU beyond which no more are started; None while not known."""
     reason: str = ""
@@ -35,7 +37,9 @@ class GpuRates:
         """Take note of the rates of trainings that run side by side [steps/s]."""
         total = math.fsum(rates)
         count = len(rates)
-        self.totals[count] = max(total, self.totals.get(count, 0.0))
+        self.notes[count] = self.notes.get(count, 0) + 1
+        mean = self.totals.get(count, 0.0)
+        self.totals[count] = mean + (total - mean) / self.notes[count]
         before = self.totals.get(count - 1)
         if self.limit is not None or before is None:
             return
