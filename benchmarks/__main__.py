@@ -29,6 +29,7 @@ SUMMARIES = {
     "kills": "Processes of commands killed and stopped: files, orphans, damping.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
+    "study": "A study on pages of the documentation, from its results.",
 }
 MODULES = {"foreign": "foreign.command"}
 """Modules whose names are not those of their benchmarks."""

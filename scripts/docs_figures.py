@@ -21,10 +21,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pronk.identify.simulators.actuator_network import SampleGains
+from pronk.jump.study.study_results import load_study_results
 from pronk.report import style
+from pronk.report.study_figures import draw_robots, draw_tolerance
 from pronk.report.style import key
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "figures"
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "docs" / "figures"
 Response = NDArray[np.complex128]
 INERTIA = 0.0093
 """Inertia of the joint of the figures, armature included [kg m^2]: examples/pendulum."""
@@ -308,6 +311,21 @@ def study() -> Figure:
     return figure
 
 
+MATCH_WORTH = ROOT / "examples" / "studies" / "match_worth" / "results.json"
+"""Results of the study of what a match is worth; there once it has been run."""
+
+
+def match_worth() -> Figure:
+    """Draw the first outcome of the study, by arm and robot."""
+    results = load_study_results(MATCH_WORTH)
+    return draw_robots(results, results.outcomes[:1])
+
+
+def match_worth_tolerance() -> Figure:
+    """Draw the tolerance curves of the study."""
+    return draw_tolerance(load_study_results(MATCH_WORTH))
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "drive-laws.svg": drive_laws,
     "stiffness-and-damping.svg": stiffness_and_damping,
@@ -317,6 +335,9 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "actuator-network.svg": actuator_network,
 }
 """How each file is drawn."""
+if MATCH_WORTH.exists():
+    FIGURES["match-worth.svg"] = match_worth
+    FIGURES["match-worth-tolerance.svg"] = match_worth_tolerance
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
 TOLERANCE_PX = 0.5
 

@@ -10,8 +10,8 @@ import pytest
 
 from pronk.errors import PronkError
 from pronk.jump.study.local import LocalExecutor
-from pronk.jump.study.schedule import run_tasks
-from pronk.jump.study.tasks import StudyState, copied_input, study_folder
+from pronk.jump.study.schedule import StudyProgress, TaskEnd, run_tasks
+from pronk.jump.study.tasks import StudyState, StudyTask, copied_input, study_folder
 from study_cases import GAINS, Watched, export_task, finished, study_root
 
 
@@ -60,6 +60,49 @@ def test_a_study_that_is_run_again_does_only_what_is_new(tmp_path: Path) -> None
     (root / "inputs" / "gains.yaml").write_bytes(GAINS.read_bytes() + b"# another\n")
     states = [status.state for status in finished(tasks, LocalExecutor(root), root).values()]
     assert states == ["done"] * 3
+
+
+class _Full:
+    """An executor that has no room, and counts how often it was asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def try_start(self, task: StudyTask) -> str:
+        self.asked += 1
+        return ""
+
+    def poll(self) -> list[TaskEnd]:
+        return []
+
+    def stop(self) -> None:
+        pass
+
+    def rooms(self) -> int:
+        return 1
+
+
+def test_a_large_study_without_room_asks_once_a_look_and_reads_each_input_once(
+    tmp_path: Path,
+) -> None:
+    """Hundreds of trials wait for a core; the policies that they read are large."""
+    root = study_root(tmp_path)
+    tasks = [export_task(str(number)) for number in range(300)]
+    executor = _Full()
+    looks = 0
+
+    def report(progress: StudyProgress) -> None:
+        nonlocal looks
+        looks += 1
+        assert progress.count("waiting") == 300
+        # A file that has gone is noticed when a task begins, not at every look.
+        (root / "inputs" / "gains.yaml").unlink(missing_ok=True)
+        if looks == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks, executor, root, report=report)
+    assert executor.asked == 3
 
 
 def test_no_more_tasks_run_at_once_than_there_are_cores(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -256,6 +257,34 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
             assert torch.allclose(velocity, expected_velocity, atol=1e-5)
 
 
+def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
+    trained: tuple[Path, Any], tmp_path: Path
+) -> None:
+    """By joint, with drives down to 0.7 of their torque, whether checkpoint or exported."""
+    pytest.importorskip("onnxruntime")
+    file = Path(__file__).parents[2] / "examples" / "studies" / "match_worth" / "gains"
+    gains = training_gains(file / "shipped.yaml", ROBOT, by_joint=True)
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    settings = {"robot": "mini_cheetah", "by_joint": True, "weakest_drive": 0.7}
+    recorded = {"name": "matched", "sha256": gains.sha256}
+    folder.write({"schema": SCHEMA, "settings": settings, "gains": recorded})
+    shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    provenance = {"by_joint": True, "weakest_drive": 0.7}
+    contract = contract_for(cfg, jump=True, provenance=provenance)
+    export_policy(trained[1], contract, tmp_path / "policy.onnx")
+    for path in (folder.path, tmp_path / "policy.onnx"):
+        policy = adapter.load_evaluated_policy(path, "cpu")
+        assert policy.knows(gains)
+        assert (policy.draws.by_joint, policy.draws.weakest_drive) == (True, 0.7)
+    plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
+    evaluation = adapter.run_evaluation(policy, gains, plan, device="cpu")
+    assert evaluation.about["by_joint"] is True
+    # A policy of which nothing is recorded is evaluated by group.
+    assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is None
+
+
 # --- The command ---------------------------------------------------------------------------------
 
 
@@ -272,5 +301,6 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     assert about["randomization"] == "full"
     assert about["gains"] == {"name": "naive", "sha256": "", "virtual": False}
     assert about["policy"]["iteration"] == 7
+    assert about["by_joint"] is False
     assert about["device"]["device"] == "cpu"
     assert about["versions"]["mjlab"]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from pronk.jump.study.bootstrap import (
+    WeightedCell,
+    contrast_interval,
     difference_interval,
     hierarchical_draws,
     mean_interval,
@@ -127,3 +129,76 @@ def test_fewer_than_two_seeds_have_no_interval(count: int) -> None:
     ):
         assert math.isnan(estimate.low)
         assert math.isnan(estimate.high)
+
+
+def test_a_contrast_is_the_weighted_sum_of_means() -> None:
+    """Own less other robot, of two arms on two robots, in closed form."""
+    means = {("a", "r"): 1.0, ("a", "s"): 2.0, ("b", "r"): 5.0, ("b", "s"): 11.0}
+    weights = {("a", "r"): 0.5, ("a", "s"): -0.5, ("b", "r"): -0.5, ("b", "s"): 0.5}
+    arms = []
+    for arm in ("a", "b"):
+        cells = []
+        for robot in ("r", "s"):
+            values = {seed: [np.full(4, means[arm, robot])] for seed in (1, 2, 3)}
+            cells.append(WeightedCell(weight=weights[arm, robot], seeds=values))
+        arms.append(cells)
+    estimate = contrast_interval(arms, is_share=False)
+    assert estimate.value == pytest.approx(0.5 * (1.0 - 2.0 - 5.0 + 11.0))
+    assert (estimate.low, estimate.high) == pytest.approx((estimate.value, estimate.value))
+    assert estimate.seeds == (3, 3)
+
+
+def test_robots_weigh_alike_whatever_their_number_of_jumps() -> None:
+    many = WeightedCell(weight=0.5, seeds={1: [np.zeros(100)], 2: [np.zeros(100)]})
+    few = WeightedCell(weight=0.5, seeds={1: [np.ones(2)], 2: [np.ones(2)]})
+    other = WeightedCell(weight=-1.0, seeds={1: [np.zeros(5)], 2: [np.zeros(5)]})
+    assert contrast_interval([[many, few], [other]], is_share=True).value == 0.5
+
+
+def test_what_a_seed_does_on_all_robots_cancels_in_a_contrast() -> None:
+    """One policy on two robots has one effect of its seed, which own less other leaves out."""
+    rng = np.random.default_rng(5)
+    cells = []
+    for weight in (1.0, -1.0):
+        values = {}
+        for seed in range(5):
+            values[seed] = [10.0 * seed + 0.1 * rng.standard_normal(50)]
+        cells.append(WeightedCell(weight=weight, seeds=values))
+    together = contrast_interval([cells], is_share=False)
+    apart = contrast_interval([cells[:1], cells[1:]], is_share=False)
+    assert together.high - together.low < 0.5
+    assert apart.high - apart.low > 10.0
+
+
+def test_a_contrast_leaves_out_a_seed_that_one_robot_lacks() -> None:
+    first = WeightedCell(weight=1.0, seeds={1: [np.ones(3)], 2: [np.ones(3)], 3: [np.ones(3)]})
+    second = WeightedCell(weight=1.0, seeds={1: [np.ones(3)], 2: [np.full(3, math.nan)]})
+    estimate = contrast_interval([[first, second]], is_share=False)
+    assert estimate.seeds == (1,)
+    assert math.isnan(estimate.low)
+
+
+def test_intervals_of_contrasts_cover_the_truth() -> None:
+    """Two arms on two robots; a seed has an effect on both robots and one on each."""
+    rng = np.random.default_rng(6)
+    covered = 0
+    for study in range(STUDIES):
+        arms = []
+        for sign in (1.0, -1.0):
+            cells: list[dict[int, list[np.ndarray]]] = [{}, {}]
+            for seed in range(5):
+                shared = rng.standard_normal()
+                for place, values in enumerate(cells):
+                    own = 0.4 if (place == 0) == (sign > 0.0) else 0.0
+                    effect = own + shared + 0.5 * rng.standard_normal()
+                    values[seed] = [effect + rng.standard_normal(10)]
+            weights = (0.5 * sign, -0.5 * sign)
+            arms.append(
+                [
+                    WeightedCell(weight=weight, seeds=values)
+                    for weight, values in zip(weights, cells, strict=True)
+                ]
+            )
+        estimate = contrast_interval(arms, is_share=False, rng_seed=study, resamples=399)
+        covered += estimate.low <= 0.4 <= estimate.high
+    assert covered / STUDIES > 0.92

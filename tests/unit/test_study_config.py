@@ -147,6 +147,41 @@ def test_a_plan_counts_trainings_trials_and_jumps(tmp_path: Path) -> None:
             },
             "comparisons.c.robots|'x'|shipped, weak",
         ),
+        (
+            {
+                "comparisons": {
+                    "c": {"outcome": "landed", "own": {"x": "shipped", "matched": "weak"}}
+                }
+            },
+            "comparisons.c.own|'x'|nominal, matched",
+        ),
+        (
+            {
+                "comparisons": {
+                    "c": {"outcome": "landed", "own": {"nominal": "s", "matched": "weak"}}
+                }
+            },
+            "comparisons.c.own|'s'|shipped, weak",
+        ),
+        (
+            {"comparisons": {"c": {"outcome": "landed", "own": {"matched": "weak"}}}},
+            "comparisons.c|own|two robots",
+        ),
+        (
+            {
+                "comparisons": {
+                    "c": {"outcome": "landed", "arm": "matched", "own": {"matched": "weak"}}
+                }
+            },
+            "comparisons.c|own|against",
+        ),
+        ({"comparisons": {"c": {"outcome": "landed", "arm": "matched"}}}, "comparisons.c|against"),
+        ({"robots": {"shipped": {"arms": ["x"]}}}, "robots.shipped.arms|'x'"),
+        ({"robots": {"shipped": {"jumps": 0}}}, "robots.shipped|jumps is 0"),
+        (
+            {"robots": {"shipped": {"arms": ["matched"]}}},
+            "comparisons.a match|no robot|nominal",
+        ),
         ({"trial": {"jumps": 0}}, "trial.jumps|0"),
         ({"trial": {"commands": ["fast"]}}, "fast"),
         ({"training": {"task": "walk"}}, "training.task|walk"),
@@ -164,6 +199,47 @@ def test_impossible_studies_are_refused_in_the_words_of_the_file(
     for word in words.split("|"):
         assert word in text, (word, text)
     assert not out.exists()
+
+
+def test_robots_have_jumps_and_arms_of_their_own(tmp_path: Path) -> None:
+    """3 seeds of both arms do 4 jumps on one robot; 3 of one do 2 on each of the 26 conditions."""
+    path = written(
+        tmp_path,
+        robots={
+            "shipped": {},
+            "tolerance": {"conditions": "tolerance", "jumps": 2, "arms": ["matched"]},
+        },
+    )
+    figures_file = tmp_path / "plan.json"
+    accepted("study", path, "--plan", "--json", figures_file)
+    figures = json.loads(figures_file.read_text())
+    conditions = len(figures["robots"]) - 1
+    assert figures["trials"] == 6 + 3 * conditions
+    assert figures["jumps"] == 5 * (6 * 4 + 3 * conditions * 2)
+
+
+def test_a_plan_of_some_arms_counts_those_alone(tmp_path: Path) -> None:
+    figures_file = tmp_path / "plan.json"
+    path = written(tmp_path)
+    accepted("study", path, "--plan", "--arms", "matched", "--json", figures_file)
+    figures = json.loads(figures_file.read_text())
+    assert (figures["trainings"], figures["trials"]) == (3, 6)
+    accepted("study", path, "--plan", "--arms", "matched,nominal", "--json", figures_file)
+    assert json.loads(figures_file.read_text())["trainings"] == 6
+    text = refused("study", path, "--plan", "--arms", "x")
+    for word in ("--arms", "'x'", "nominal, matched"):
+        assert word in text
+
+
+def test_the_study_of_the_examples_is_as_large_as_it_says() -> None:
+    path = Path(__file__).parents[2] / "examples" / "studies" / "match_worth" / "study.yaml"
+    config = load_study(path)
+    assert len(config.arms) * len(config.seed_numbers) == 40
+    primary = [comparison for comparison in config.comparisons.values() if comparison.primary]
+    assert list(config.comparisons.values())[: len(primary)] == primary
+    for robot in config.robots.values():
+        assert robot.sim_params is not None
+        assert (path.parent / robot.sim_params).is_file()
 
 
 def test_configurations_are_checked_when_they_are_built() -> None:

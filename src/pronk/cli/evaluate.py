@@ -38,6 +38,9 @@ class TrainingSimOptions:
     randomization: Literal["full", "noise", "none"] = "full"
     """full: as in training. noise: one nominal robot many times, with noise, timing and delay as in
     training. none: the nominal robot, undisturbed."""
+    by_joint: bool | None = None
+    """Draw each joint about its own gains, as `pronk train` does; as the policy was trained if left
+    out, about those of its group where that is not known."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU if there is one. On the CPU take a few robots."""
     allow_unmatched: bool = False
@@ -78,7 +81,7 @@ def evaluate_command(
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
     simulation_device = "cuda:0" if find_devices(simulated.device) else "cpu"
 
-    from pronk.jump.train.gains import training_gains
+    from pronk.jump.train.gains import NAIVE, training_gains
     from pronk.jump.train.tasks import load_task
     from pronk.jump.trial.training_sim.adapter import load_evaluated_policy, run_evaluation
     from pronk.jump.trial.training_sim.results import (
@@ -101,8 +104,17 @@ def evaluate_command(
     )
     if plan.jumps and not evaluated_policy.jump:
         raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
+    by_joint = simulated.by_joint
+    if by_joint is None:
+        # Nominal gains without a file have no intervals to draw from.
+        has_file = gains != NAIVE or simulated.like is not None
+        by_joint = bool(evaluated_policy.draws.by_joint) and has_file
     simulated_gains = training_gains(
-        gains, robot, like=simulated.like, allow_unmatched=simulated.allow_unmatched
+        gains,
+        robot,
+        like=simulated.like,
+        allow_unmatched=simulated.allow_unmatched,
+        by_joint=by_joint,
     )
     if not evaluated_policy.knows(simulated_gains):
         console.warn(

@@ -32,6 +32,7 @@ def study(
     study_file: tyro.conf.Positional[Path],
     place: Annotated[StudyPlace, tyro.conf.arg(name="")],
     out: Path = Path("out/study"),
+    arms: tuple[str, ...] = (),
     plan: bool = False,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> console.Outcome:
@@ -48,12 +49,21 @@ def study(
         study_file: The file of the study, YAML.
         place: Where trainings and trials run.
         out: Folder of the study: trainings, trials, tables and the page.
+        arms: Train and try these arms alone, for now; the results hold what is there of the others.
+            With commas between several, or repeat it.
         plan: Print trainings, GPU hours, cores and comparisons, and stop.
         device: Device of trainings. auto: GPUs if there are any. The CPU is for tests.
     """
     from pronk.jump.study.config import load_study
     from pronk.jump.study.place import choose_place
-    from pronk.jump.study.study import collect_results, plan_figures, plan_study, study_tasks
+    from pronk.jump.study.study import (
+        collect_results,
+        plan_figures,
+        plan_study,
+        selected_arms,
+        study_tasks,
+        tasks_of,
+    )
     from pronk.jump.study.study_results import RUNS_FILE, STUDY_FILE, STUDY_TABLE, study_tables
     from pronk.jump.study.tasks import study_folder
     from pronk.jump.study.trainings import check_arm
@@ -61,31 +71,36 @@ def study(
 
     config = load_study(study_file)
     folder = study_file.parent
-    arms = _training_arms(config, folder, study_file)
+    training_arms = _training_arms(config, folder, study_file)
     try:
-        study_plan = plan_study(config, folder, arms)
+        study_plan = plan_study(config, folder, training_arms)
     except PronkError as error:
         raise PronkError(f"{study_file}: {error}") from None
-    for name, arm in arms.items():
+    selection = selected_arms(study_plan, arms)
+    for name, arm in training_arms.items():
         try:
             check_arm(arm)
         except PronkError as error:
             raise PronkError(f"{study_file}: arms.{name}: {error}") from None
     if plan:
-        tables = _plan_tables(study_plan)
+        tables = _plan_tables(selection)
         for table in tables:
             console.show(table)
-        following = shlex.join(["pronk", "study", str(study_file), "--out", str(out)])
+        words = ["pronk", "study", str(study_file), "--out", str(out)]
+        for arm_name in arms:
+            words += ["--arms", arm_name]
         return console.Outcome(
-            figures={**plan_figures(study_plan), "tables": tables}, following=[following]
+            figures={**plan_figures(selection), "tables": tables}, following=[shlex.join(words)]
         )
-    chosen = choose_place(place, "cpu" if not arms and device == "auto" else device)
+    is_trained = selection.trainings > 0
+    chosen = choose_place(place, "cpu" if not is_trained and device == "auto" else device)
     console.say(
-        f"{config.title}: {study_plan.trainings} trainings, {study_plan.trials} trials of "
-        f"{study_plan.jumps} jumps in all, on {chosen.words}; folder {out}"
+        f"{config.title}: {selection.trainings} trainings, {selection.trials} trials of "
+        f"{selection.jumps} jumps in all, on {chosen.words}; folder {out}"
     )
     with study_folder(out):
         tasks = study_tasks(study_plan, out, chosen.training)
+        tasks = tasks_of(selection, tasks, out)
         statuses = run_shown(tasks, chosen, out)
         results = collect_results(study_plan, out, statuses)
         page = write_study_page(out)
@@ -173,6 +188,8 @@ _NAMED_ELSEWHERE = {
 
 def _plan_tables(plan: StudyPlan) -> list[Table]:
     """Return what a study runs and asks, and what that takes."""
+    from pronk.jump.study.config import comparison_robots
+    from pronk.jump.study.study_results import OTHER_ROBOT, OWN_ROBOT
     from pronk.tables import Column, Table
 
     config = plan.config
@@ -180,9 +197,9 @@ def _plan_tables(plan: StudyPlan) -> list[Table]:
         title=config.title,
         columns=(Column(heading="what"), Column(heading="how much")),
         rows=(
-            ("arms", ", ".join(config.arms)),
+            ("arms", ", ".join(arm.name for arm in plan.arms)),
             ("seeds", ", ".join(map(str, config.seed_numbers))),
-            ("robots", ", ".join(robot.name for robot in plan.robots)),
+            ("robots", _robots_text(plan)),
             ("commands", ", ".join(case.name for case in config.trial.cases())),
             ("trainings", plan.trainings),
             ("environment steps", f"{plan.env_steps:,}"),
@@ -199,13 +216,17 @@ def _plan_tables(plan: StudyPlan) -> list[Table]:
     )
     rows = []
     for name, comparison in config.comparisons.items():
-        robots = ", ".join(comparison.robots) or "all"
-        rows.append(
-            (name, comparison.outcome, f"{comparison.arm} less {comparison.against}", robots)
-        )
+        robots = comparison_robots(comparison, plan.arms_by_robot)
+        compared = f"{comparison.arm} less {comparison.against}"
+        if comparison.own:
+            compared = f"{OWN_ROBOT} less {OTHER_ROBOT}: {', '.join(comparison.own)}"
+        question = "primary" if comparison.primary else "secondary"
+        shown = "all" if len(robots) == len(plan.robots) > 1 else ", ".join(robots)
+        rows.append((question, name, comparison.outcome, compared, shown))
     comparisons = Table(
         title="Comparisons",
         columns=(
+            Column(heading="question"),
             Column(heading="comparison"),
             Column(heading="outcome"),
             Column(heading="difference of"),
@@ -214,6 +235,20 @@ def _plan_tables(plan: StudyPlan) -> list[Table]:
         rows=tuple(rows),
     )
     return [amounts, comparisons] if rows else [amounts]
+
+
+def _robots_text(plan: StudyPlan) -> str:
+    """Return the names of the robots by themselves, and how many points each series has."""
+    parts = []
+    points: dict[str, int] = {}
+    for robot in plan.robots:
+        if robot.series:
+            points[robot.series] = points.get(robot.series, 0) + 1
+        else:
+            parts.append(robot.name)
+    for series, count in points.items():
+        parts.append(f"{count} of {series}")
+    return ", ".join(parts)
 
 
 # ---- shared with `pronk train` ----

@@ -14,7 +14,7 @@ are a little too wide rather than too narrow where seeds do not differ.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,19 +78,39 @@ def hierarchical_draws(
         rng: Generator of all draws.
         resamples: Number of resamples.
     """
+    return _weighted_draws([1.0], [[commands] for commands in seeds], rng, resamples)
+
+
+def _weighted_draws(
+    weights: Sequence[float],
+    seeds: Sequence[Sequence[SeedValues]],
+    rng: np.random.Generator,
+    resamples: int,
+) -> Array:
+    """Draw means over seeds of a weighted sum of the means of several cells. (resamples,).
+
+    Args:
+        weights: Weight of each cell.
+        seeds: Finite values of each seed, by cell and command.
+        rng: Generator of all draws.
+        resamples: Number of resamples.
+    """
     count = len(seeds)
     drawn_seed = rng.integers(count, size=(resamples, count))
     means = np.empty((resamples, count))
-    for index, commands in enumerate(seeds):
+    for index, cells in enumerate(seeds):
         slots = drawn_seed == index
         draws = int(slots.sum())
-        total = np.zeros(draws)
-        number = 0
-        for values in commands:
-            picked = rng.integers(len(values), size=(draws, len(values)))
-            total += values[picked].sum(axis=1)
-            number += len(values)
-        means[slots] = total / number
+        weighted = np.zeros(draws)
+        for weight, commands in zip(weights, cells, strict=True):
+            total = np.zeros(draws)
+            number = 0
+            for values in commands:
+                picked = rng.integers(len(values), size=(draws, len(values)))
+                total += values[picked].sum(axis=1)
+                number += len(values)
+            weighted += weight * total / number
+        means[slots] = weighted
     drawn: Array = means.mean(axis=1)
     return drawn
 
@@ -133,9 +153,6 @@ def difference_interval(
 ) -> SeedEstimate:
     """Return the mean over some seeds less that over others, with its interval.
 
-    The two are independent: a seed of one arm has nothing in common with that of another but its
-    number. The degrees of freedom are Welch's.
-
     Args:
         seeds: Values of the jumps of each seed, by command.
         other_seeds: The same of the arm that is subtracted.
@@ -143,36 +160,104 @@ def difference_interval(
         rng_seed: Seed of the resamples.
         resamples: Number of resamples.
     """
-    arms = [finite_seeds(seeds), finite_seeds(other_seeds)]
-    counts = (len(arms[0]), len(arms[1]))
+    arms = []
+    for weight, values in ((1.0, seeds), (-1.0, other_seeds)):
+        arms.append([WeightedCell(weight=weight, seeds=dict(enumerate(values)))])
+    return contrast_interval(arms, is_share=is_share, rng_seed=rng_seed, resamples=resamples)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightedCell:
+    """The jumps of an arm on one robot, with their weight in a contrast."""
+
+    weight: float
+    seeds: Mapping[int, SeedValues]
+    """Values of the jumps of each seed, by command."""
+
+
+def contrast_interval(
+    arms: Sequence[Sequence[WeightedCell]],
+    *,
+    is_share: bool,
+    rng_seed: int = 0,
+    resamples: int = RESAMPLES,
+) -> SeedEstimate:
+    """Return a weighted sum of the means of arms on robots, with its interval.
+
+    Arms are independent: a seed of one arm has nothing in common with that of another but its
+    number. The robots of one arm are not, since the same policies are on all of them: a resample
+    draws the seeds of an arm once. Degrees of freedom are those of Welch and Satterthwaite.
+
+    Args:
+        arms: The cells of each arm, one for each robot. A seed without a value in one of them
+            is left out of its arm.
+        is_share: True for shares. The interval is then at least that of the jumps alone, by the
+            Wilson intervals of the cells after Newcombe (Zou and Donner, "Construction of
+            confidence limits about effect measures", 2008).
+        rng_seed: Seed of the resamples.
+        resamples: Number of resamples.
+    """
     rng = np.random.default_rng(rng_seed)
-    values = []
-    deviations = []
+    value = 0.0
+    deviations = np.zeros(resamples)
     variances = []
-    for arm in arms:
-        if not arm:
-            return SeedEstimate(value=math.nan, low=math.nan, high=math.nan, seeds=counts)
-        means = np.array([seed_mean(commands) for commands in arm])
-        values.append(float(means.mean()))
-        if len(arm) > 1:
-            drawn = hierarchical_draws(arm, rng, resamples)
-            deviations.append((drawn - values[-1]) * math.sqrt(len(arm) / (len(arm) - 1)))
-            variances.append(float(means.var(ddof=1)) / len(arm))
-    value = values[0] - values[1]
+    counts = []
+    kept_arms = []
+    for cells in arms:
+        weights = [cell.weight for cell in cells]
+        kept = _complete_seeds(cells)
+        count = len(kept)
+        counts.append(count)
+        if not count:
+            value = math.nan
+            continue
+        totals = np.zeros(count)
+        for index, seed in enumerate(kept):
+            for weight, commands in zip(weights, seed, strict=True):
+                totals[index] += weight * seed_mean(commands)
+        mean = float(totals.mean())
+        value += mean
+        if count > 1:
+            drawn = _weighted_draws(weights, kept, rng, resamples)
+            deviations += (drawn - mean) * math.sqrt(count / (count - 1))
+            variances.append(float(totals.var(ddof=1)) / count)
+        kept_arms.append((weights, kept))
     if min(counts) < 2:
-        return SeedEstimate(value=value, low=math.nan, high=math.nan, seeds=counts)
+        return SeedEstimate(value=value, low=math.nan, high=math.nan, seeds=tuple(counts))
     freedom = _welch(variances, counts)
-    low, high = _stretched(value + deviations[0] - deviations[1], value, 1.0, freedom)
-    if is_share:
-        first_low, first_high = _wilson(arms[0])
-        other_low, other_high = _wilson(arms[1])
-        first = _pooled_share(arms[0])
-        other = _pooled_share(arms[1])
-        newcombe_low = value - math.hypot(first - first_low, other_high - other)
-        newcombe_high = value + math.hypot(first_high - first, other - other_low)
-        low = max(min(low, newcombe_low), -1.0)
-        high = min(max(high, newcombe_high), 1.0)
-    return SeedEstimate(value=value, low=low, high=high, seeds=counts)
+    low, high = _stretched(value + deviations, value, 1.0, freedom)
+    if not is_share:
+        return SeedEstimate(value=value, low=low, high=high, seeds=tuple(counts))
+    squares_below = 0.0
+    squares_above = 0.0
+    largest = 0.0
+    smallest = 0.0
+    for weights, kept in kept_arms:
+        for place, weight in enumerate(weights):
+            seeds = [seed[place] for seed in kept]
+            share = _pooled_share(seeds)
+            wilson_low, wilson_high = _wilson(seeds)
+            ends = sorted((weight * (wilson_low - share), weight * (wilson_high - share)))
+            squares_below += ends[0] ** 2
+            squares_above += ends[1] ** 2
+            largest += max(weight, 0.0)
+            smallest += min(weight, 0.0)
+    low = max(min(low, value - math.sqrt(squares_below)), smallest)
+    high = min(max(high, value + math.sqrt(squares_above)), largest)
+    return SeedEstimate(value=value, low=low, high=high, seeds=tuple(counts))
+
+
+def _complete_seeds(cells: Sequence[WeightedCell]) -> list[list[list[Array]]]:
+    """Return the finite values by cell and command of each seed that has some in every cell."""
+    complete = set(cells[0].seeds)
+    for cell in cells[1:]:
+        complete &= set(cell.seeds)
+    kept = []
+    for seed in sorted(complete):
+        strata = finite_seeds([cell.seeds[seed] for cell in cells])
+        if len(strata) == len(cells):
+            kept.append(strata)
+    return kept
 
 
 def _stretched(drawn: Array, value: float, factor: float, freedom: float) -> tuple[float, float]:
@@ -184,7 +269,7 @@ def _stretched(drawn: Array, value: float, factor: float, freedom: float) -> tup
 
 
 def _welch(variances: Sequence[float], counts: Sequence[int]) -> float:
-    """Return Welch's degrees of freedom, of the variances of two means."""
+    """Return the degrees of freedom of a sum of means after Welch and Satterthwaite."""
     total = math.fsum(variances)
     smallest = float(min(counts) - 1)
     if total <= 0.0:

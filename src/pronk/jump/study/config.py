@@ -93,23 +93,55 @@ class RobotConfig:
     """Changes of the parameters, as in a file of conditions."""
     conditions: str | None = None
     """A file of conditions, tolerance or bodies: a robot for each of them."""
+    jumps: int | None = None
+    """Jumps with each command on this robot; those of the trial if left out."""
+    arms: tuple[str, ...] = ()
+    """Arms that are tried on it; all if empty."""
 
     def __post_init__(self) -> None:
-        """Refuse changes beside conditions."""
+        """Refuse changes beside conditions, and a number of jumps out of range."""
         if self.changes and self.conditions is not None:
             raise PronkError("changes and conditions are both given; give one of them.")
+        if self.jumps is not None:
+            _check_jumps("jumps", self.jumps)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonConfig:
-    """A difference of two arms that is asked for before the runs."""
+    """A difference that is asked for before the runs: of two arms, or of own and other robots."""
 
     outcome: str
-    arm: str
-    against: str
+    arm: str = ""
+    against: str = ""
     """Arm that is subtracted."""
     robots: tuple[str, ...] = ()
-    """Robots over which the outcome is averaged; all if empty."""
+    """Robots over which the outcome is averaged, each with one weight; all if empty."""
+    own: dict[str, str] = field(default_factory=dict)
+    """Instead of two arms: arms by name, and the robot that each was matched to. On each of these
+    robots the arms that were matched to it are compared with the others."""
+    primary: bool = False
+    """True for a question that the study is made to answer; others are secondary."""
+
+    def __post_init__(self) -> None:
+        """Refuse a comparison that is neither or both, and one of a single robot."""
+        if self.own:
+            if self.arm or self.against or self.robots:
+                raise PronkError("own names arms and robots; leave arm, against and robots out.")
+            if len(set(self.own.values())) < 2:
+                raise PronkError(
+                    f"own: {', '.join(self.own)} on one robot; expected arms that were matched to "
+                    "two robots or more."
+                )
+            return
+        if not (self.arm and self.against):
+            raise PronkError("expected arm and against, two arms, or own, arms with their robots.")
+        if self.arm == self.against:
+            raise PronkError(f"arm and against are both {self.arm}.")
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Names of all arms that it compares."""
+        return tuple(self.own) or (self.arm, self.against)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +178,7 @@ class TrialConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range and commands that cannot be read."""
-        if not 1 <= self.jumps <= 10_000:
-            raise PronkError(f"trial.jumps is {self.jumps}; expected 1 to 10000.")
+        _check_jumps("trial.jumps", self.jumps)
         if not 0 <= self.seed < 2**31:
             raise PronkError(f"trial.seed is {self.seed}; expected 0 or more, below 2^31.")
         if not self.commands:
@@ -194,10 +225,14 @@ class StudyConfig:
         for name, comparison in self.comparisons.items():
             place = f"comparisons.{name}"
             _check_known(f"{place}.outcome", [comparison.outcome], OUTCOMES)
+            if comparison.own:
+                _check_known(f"{place}.own", list(comparison.own), self.arms)
+                continue
             _check_known(f"{place}.arm", [comparison.arm], self.arms)
             _check_known(f"{place}.against", [comparison.against], self.arms)
-            if comparison.arm == comparison.against:
-                raise PronkError(f"{place}: arm and against are both {comparison.arm}.")
+        for name, robot in self.robots.items():
+            if robot.arms:
+                _check_known(f"robots.{name}.arms", robot.arms, self.arms)
 
     @property
     def seed_numbers(self) -> tuple[int, ...]:
@@ -207,15 +242,58 @@ class StudyConfig:
             seeds = ",".join(str(seed) for seed in seeds)
         return parse_seeds(str(seeds))
 
-    def check_robots(self, names: Sequence[str]) -> None:
-        """Refuse comparisons on robots that the study does not have.
+    def check_robots(self, arms_by_robot: Mapping[str, Sequence[str]]) -> None:
+        """Refuse comparisons on robots that the study, or one of their arms, does not have.
 
         Args:
-            names: Names of all robots, with one for each condition.
+            arms_by_robot: Arms that are tried on each robot, by its name; with a robot for each
+                condition.
         """
         for name, comparison in self.comparisons.items():
-            if comparison.robots:
-                _check_known(f"comparisons.{name}.robots", comparison.robots, names)
+            place = f"comparisons.{name}"
+            robots = comparison.robots
+            if comparison.own:
+                robots = tuple(dict.fromkeys(comparison.own.values()))
+            if robots:
+                section = "own" if comparison.own else "robots"
+                _check_known(f"{place}.{section}", robots, arms_by_robot)
+            for robot in robots:
+                for arm in comparison.arms:
+                    if arm not in arms_by_robot[robot]:
+                        raise PronkError(
+                            f"{place}: {arm} is not tried on {robot}, whose arms are "
+                            f"{', '.join(arms_by_robot[robot])}."
+                        )
+            if not comparison_robots(comparison, arms_by_robot):
+                raise PronkError(
+                    f"{place}: no robot on which {' and '.join(comparison.arms)} are all tried."
+                )
+
+
+def comparison_robots(
+    comparison: ComparisonConfig, arms_by_robot: Mapping[str, Sequence[str]]
+) -> tuple[str, ...]:
+    """Return the robots of a comparison: those that it names, or all that its arms share.
+
+    Args:
+        comparison: The comparison.
+        arms_by_robot: Arms that are tried on each robot, by its name.
+    """
+    if comparison.own:
+        return tuple(dict.fromkeys(comparison.own.values()))
+    if comparison.robots:
+        return comparison.robots
+    shared = []
+    for robot, arms in arms_by_robot.items():
+        if comparison.arm in arms and comparison.against in arms:
+            shared.append(robot)
+    return tuple(shared)
+
+
+def _check_jumps(place: str, jumps: int) -> None:
+    """Refuse a number of jumps out of range."""
+    if not 1 <= jumps <= 10_000:
+        raise PronkError(f"{place} is {jumps}; expected 1 to 10000.")
 
 
 def _check_known(place: str, names: Sequence[str], known: Any) -> None:
@@ -247,8 +325,9 @@ def load_study(path: Path) -> StudyConfig:
 
 
 def _check_parts(path: Path, body: Mapping[str, Any]) -> None:
-    """Read each arm and robot by itself, so that a message names it."""
-    for section, kind in (("arms", ArmConfig), ("robots", RobotConfig)):
+    """Read each arm, robot and comparison by itself, so that a message names it."""
+    kinds = (("arms", ArmConfig), ("robots", RobotConfig), ("comparisons", ComparisonConfig))
+    for section, kind in kinds:
         entries = body.get(section)
         if not isinstance(entries, Mapping):
             continue

@@ -110,6 +110,8 @@ class _Loop:
         self.failures = dict.fromkeys(self.tasks, 0)
         self.losses = dict.fromkeys(self.tasks, 0)
         self.durations: dict[str, list[float]] = {"training": [], "trial": []}
+        self.keys: dict[str, str] = {}
+        """Hashes of the tasks that were ready to start."""
         for task in tasks:
             is_ready = all(self.statuses[name].state == "kept" for name in task.needs)
             state: Literal["waiting", "kept"] = "waiting"
@@ -149,10 +151,15 @@ class _Loop:
 
     def start(self) -> None:
         """Start what is ready and has room; skip what needs a task that has failed."""
+        full: set[tuple[str, bool, float]] = set()
         for name, status in self.statuses.items():
             if status.state != "waiting":
                 continue
             task = self.tasks[name]
+            # Where one had no room no other that needs the same has any.
+            needs = (task.kind, task.gpu, task.cores)
+            if needs in full:
+                continue
             needed = [self.statuses[need].state for need in task.needs]
             if any(state in ("failed", "skipped") for state in needed):
                 failed = [need for need in task.needs if self.statuses[need].state != "done"]
@@ -160,15 +167,19 @@ class _Loop:
                 continue
             if any(state not in ("done", "kept") for state in needed):
                 continue
-            key = task.key(self.root)
-            if self.failures[name] + self.losses[name] == 0 and self.state.is_done(task):
-                self._set(name, state="kept")
-                continue
+            if name not in self.keys:
+                self.keys[name] = task.key(self.root)
+                if self.failures[name] + self.losses[name] == 0 and self.state.is_done(task):
+                    self._set(name, state="kept")
+                    continue
             place = self.executor.try_start(task)
             if not place:
+                full.add(needs)
                 continue
             attempts = self.failures[name] + self.losses[name] + 1
-            record = TaskRecord(key=key, status="started", attempts=attempts, place=place)
+            record = TaskRecord(
+                key=self.keys[name], status="started", attempts=attempts, place=place
+            )
             self.state.set(name, record)
             self.running[name] = _Running(task=task, place=place, begun=time.monotonic())
             self._set(name, state="running", place=place, attempts=attempts)

@@ -23,11 +23,23 @@ from pronk.arrays import Array
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256, write_text
 from pronk.identify.match.gains import MatchedGains, load_gains, save_gains
-from pronk.jump.study.bootstrap import difference_interval, mean_interval, seed_mean
-from pronk.jump.study.config import ComparisonConfig, RandomizationConfig, StudyConfig
+from pronk.jump.study.bootstrap import (
+    WeightedCell,
+    contrast_interval,
+    mean_interval,
+    seed_mean,
+)
+from pronk.jump.study.config import (
+    ComparisonConfig,
+    RandomizationConfig,
+    StudyConfig,
+    comparison_robots,
+)
 from pronk.jump.study.outcomes import OUTCOMES
 from pronk.jump.study.schedule import TaskStatus
 from pronk.jump.study.study_results import (
+    OTHER_ROBOT,
+    OWN_ROBOT,
     RUNS_FILE,
     STUDY_FILE,
     ComparedArms,
@@ -35,7 +47,13 @@ from pronk.jump.study.study_results import (
     StudyResults,
     save_study,
 )
-from pronk.jump.study.tasks import INPUTS, StudyTask, copied_input, written_input
+from pronk.jump.study.tasks import (
+    INPUTS,
+    StudyState,
+    StudyTask,
+    copied_input,
+    written_input,
+)
 from pronk.jump.study.trainings import (
     TrainingArm,
     TrainingPlace,
@@ -78,6 +96,10 @@ class StudiedRobot:
     """Series of conditions that it is a point of; empty for a robot by itself."""
     place: float | None = None
     """Place in its series, in the unit of the series."""
+    jumps: int
+    """Jumps with each command."""
+    arms: tuple[str, ...]
+    """Names of the arms that are tried on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,14 +149,22 @@ class StudyPlan:
     @property
     def trials(self) -> int:
         """Number of pairs of policy and robot."""
-        policies = sum(len(self.seeds(arm)) for arm in self.arms)
-        return policies * len(self.robots)
+        return sum(self._policies_on(robot) for robot in self.robots)
 
     @property
     def jumps(self) -> int:
         """Number of jumps of all trials."""
-        trial = self.config.trial
-        return self.trials * trial.jumps * len(trial.cases())
+        jumps = sum(self._policies_on(robot) * robot.jumps for robot in self.robots)
+        return jumps * len(self.config.trial.cases())
+
+    def _policies_on(self, robot: StudiedRobot) -> int:
+        """Return the number of policies that are tried on a robot."""
+        return sum(len(self.seeds(arm)) for arm in self.arms if arm.name in robot.arms)
+
+    @property
+    def arms_by_robot(self) -> dict[str, tuple[str, ...]]:
+        """Names of the arms that are tried on each robot."""
+        return {robot.name: robot.arms for robot in self.robots}
 
     @property
     def gpu_hours(self) -> float:
@@ -164,10 +194,14 @@ def plan_study(config: StudyConfig, folder: Path, arms: Mapping[str, TrainingArm
         try:
             path = robot_config.sim_params
             base = _sim_params(None if path is None else folder / path, spec)
+            jumps = config.trial.jumps if robot_config.jumps is None else robot_config.jumps
+            arms_on_it = robot_config.arms or tuple(config.arms)
             if robot_config.conditions is None:
                 condition = Condition(name=name, changes=robot_config.changes)
                 params = changed_params(condition, base, spec)
-                robots.append(StudiedRobot(name=name, sim_params=params))
+                robots.append(
+                    StudiedRobot(name=name, sim_params=params, jumps=jumps, arms=arms_on_it)
+                )
                 continue
             text = robot_config.conditions
             if (folder / text).is_file():
@@ -179,11 +213,13 @@ def plan_study(config: StudyConfig, folder: Path, arms: Mapping[str, TrainingArm
                         sim_params=changed_params(condition, base, spec),
                         series=condition.series,
                         place=condition.place,
+                        jumps=jumps,
+                        arms=arms_on_it,
                     )
                 )
         except PronkError as error:
             raise PronkError(f"robots.{name}: {error}") from None
-    config.check_robots([robot.name for robot in robots])
+    config.check_robots({robot.name: robot.arms for robot in robots})
     study_arms = []
     for name, arm_config in config.arms.items():
         policies = tuple(folder / path for path in arm_config.policies)
@@ -244,23 +280,77 @@ def study_tasks(plan: StudyPlan, root: Path, place: TrainingPlace) -> list[Study
     params_by_robot = {}
     for robot in plan.robots:
         params_by_robot[robot.name] = _params_input(root, robot)
+    single = [robot for robot in plan.robots if not robot.series]
+    in_series = [robot for robot in plan.robots if robot.series]
     most_seeds = max(len(plan.seeds(arm)) for arm in plan.arms)
-    for index in range(most_seeds):
-        for arm in plan.arms:
-            seeds = plan.seeds(arm)
-            if index >= len(seeds):
-                continue
-            policy = ""
-            needs: tuple[str, ...] = ()
-            if arm.training is not None:
-                policy = f"{training_folder(arm.training, seeds[index])}/policy.onnx"
-                needs = (training_name(arm.name, seeds[index]),)
-            else:
-                policy = copied_input(root, arm.policies[index], "policy")
-            for robot in plan.robots:
-                inputs = (policy, params_by_robot[robot.name], nominal)
-                tasks.append(_trial_task(plan, arm, seeds[index], robot, inputs, needs))
+    # Robots by themselves first: comparisons are of them, and series take the most time.
+    for robots in (single, in_series):
+        for index in range(most_seeds):
+            for arm in plan.arms:
+                if index >= len(plan.seeds(arm)):
+                    continue
+                seed = plan.seeds(arm)[index]
+                needs: tuple[str, ...] = ()
+                if arm.training is not None:
+                    policy = f"{training_folder(arm.training, seed)}/policy.onnx"
+                    needs = (training_name(arm.name, seed),)
+                else:
+                    policy = copied_input(root, arm.policies[index], "policy")
+                for robot in robots:
+                    if arm.name in robot.arms:
+                        inputs = (policy, params_by_robot[robot.name], nominal)
+                        tasks.append(_trial_task(plan, arm, seed, robot, inputs, needs))
     return tasks
+
+
+def selected_arms(plan: StudyPlan, names: Sequence[str]) -> StudyPlan:
+    """Return the plan of some arms alone.
+
+    Args:
+        plan: The study.
+        names: Names of arms, several in one text with commas between them; all if empty.
+
+    Raises:
+        PronkError: The study has no such arm.
+    """
+    selected = set()
+    for text in names:
+        for name in text.split(","):
+            selected.add(name.strip())
+    known = [arm.name for arm in plan.arms]
+    for name in sorted(selected):
+        if name not in known:
+            raise PronkError(f"--arms {name!r}: expected some of {', '.join(known)}.")
+    if not selected:
+        return plan
+    return replace(plan, arms=tuple(arm for arm in plan.arms if arm.name in selected))
+
+
+def tasks_of(selection: StudyPlan, tasks: Sequence[StudyTask], root: Path) -> list[StudyTask]:
+    """Return the tasks of the arms of a plan, and of other arms those that are done.
+
+    Args:
+        selection: The study with the arms that are run now.
+        tasks: Tasks of the whole study.
+        root: Its folder.
+    """
+    names = set()
+    for arm in selection.arms:
+        for seed in selection.seeds(arm):
+            names.add(training_name(arm.name, seed))
+            for robot in selection.robots:
+                names.add(trial_name(arm.name, seed, robot.name))
+    state = StudyState(root)
+    kept: list[StudyTask] = []
+    done: set[str] = set()
+    for task in tasks:
+        is_ready = all(name in done for name in task.needs)
+        if task.name in names:
+            kept.append(task)
+        elif is_ready and state.is_done(task):
+            kept.append(task)
+            done.add(task.name)
+    return kept
 
 
 def trial_name(arm: str, seed: int, robot: str) -> str:
@@ -286,13 +376,13 @@ def _trial_task(
     policy, params, nominal = inputs
     folder = trial_folder(arm, seed, robot)
     words = ["trial", policy, "--sim-params", params, "--conditions", nominal]
-    words += ["--jumps", str(trial.jumps), "--seed", str(trial.seed), "--processes", "1"]
+    words += ["--jumps", str(robot.jumps), "--seed", str(trial.seed), "--processes", "1"]
     for command in trial.commands:
         words.append(f"--commands={command}")
     if plan.robot.source != plan.robot.name:
         words += ["--robot", str(Path(plan.robot.source).resolve())]
     words += ["--out", folder]
-    settings = {"commands": list(trial.commands), "jumps": trial.jumps, "seed": trial.seed}
+    settings = {"commands": list(trial.commands), "jumps": robot.jumps, "seed": trial.seed}
     return StudyTask(
         name=trial_name(arm.name, seed, robot.name),
         kind="trial",
@@ -385,12 +475,18 @@ def collect_results(
     cells = []
     for arm in plan.arms:
         for robot in plan.robots:
+            if arm.name not in robot.arms:
+                continue
             for outcome_name in plan.config.outcomes:
                 cells.append(_outcome_cell(jumps, arm.name, robot, outcome_name))
     robot_names = [robot.name for robot in plan.robots]
     comparisons = []
     for name, comparison in plan.config.comparisons.items():
-        comparisons.append(_compared(jumps, name, comparison, robot_names))
+        robots = comparison_robots(comparison, plan.arms_by_robot)
+        if comparison.own:
+            comparisons += own_and_other(jumps, name, comparison)
+        else:
+            comparisons.append(_compared(jumps, name, comparison, robots))
     trial = plan.config.trial
     failed = []
     for status in statuses.values():
@@ -407,6 +503,7 @@ def collect_results(
         trial_seed=trial.seed,
         cells=tuple(cells),
         comparisons=tuple(comparisons),
+        robot_jumps={robot.name: robot.jumps for robot in plan.robots},
         missing=tuple(missing),
         failed=tuple(failed),
         versions=software_versions(),
@@ -424,10 +521,12 @@ def _read_jumps(
     missing = []
     for arm in plan.arms:
         for robot in plan.robots:
+            if arm.name not in robot.arms:
+                continue
             by_seed: dict[int, list[TrialRun]] = {}
             for seed in plan.seeds(arm):
                 name = trial_name(arm.name, seed, robot.name)
-                if statuses[name].state not in ("done", "kept"):
+                if name not in statuses or statuses[name].state not in ("done", "kept"):
                     missing.append(name)
                     continue
                 by_seed[seed] = read_trial(root / trial_folder(arm, seed, robot))
@@ -477,34 +576,87 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
 
 
 def _compared(
-    jumps: Jumps, name: str, comparison: ComparisonConfig, robot_names: Sequence[str]
+    jumps: Jumps, name: str, comparison: ComparisonConfig, robots: Sequence[str]
 ) -> ComparedArms:
     """Return the difference of two arms, over the seeds that were tried on all of the robots."""
-    robots = comparison.robots or tuple(robot_names)
-    arms = []
-    for arm in (comparison.arm, comparison.against):
-        complete = set(jumps[arm, robots[0]])
-        for robot in robots[1:]:
-            complete &= set(jumps[arm, robot])
-        seeds = []
-        for seed in sorted(complete):
-            strata: list[Array] = []
-            for robot in robots:
-                strata += values_by_command(jumps[arm, robot][seed], comparison.outcome)
-            seeds.append(strata)
-        arms.append(seeds)
+    weights = {}
+    for robot in robots:
+        weights[comparison.arm, robot] = 1.0 / len(robots)
+        weights[comparison.against, robot] = -1.0 / len(robots)
+    return _contrast(
+        jumps, weights, name, comparison, (comparison.arm, comparison.against), tuple(robots)
+    )
+
+
+def own_and_other(jumps: Jumps, name: str, comparison: ComparisonConfig) -> list[ComparedArms]:
+    """Return what arms do on the robot they were matched to, less what the others do there.
+
+    Args:
+        jumps: Jumps of every arm on every robot.
+        name: Name of the comparison.
+        comparison: A comparison of own and other robots.
+
+    Returns:
+        First the mean over the robots, each with one weight, then each robot by itself.
+    """
+    by_robot: dict[str, dict[tuple[str, str], float]] = {}
+    for robot in dict.fromkeys(comparison.own.values()):
+        own = [arm for arm, matched_to in comparison.own.items() if matched_to == robot]
+        others = [arm for arm in comparison.own if arm not in own]
+        by_robot[robot] = {}
+        for arm in own:
+            by_robot[robot][arm, robot] = 1.0 / len(own)
+        for arm in others:
+            by_robot[robot][arm, robot] = -1.0 / len(others)
+    weights = {}
+    for robot_weights in by_robot.values():
+        for pair, weight in robot_weights.items():
+            weights[pair] = weight / len(by_robot)
+    words = (OWN_ROBOT, OTHER_ROBOT)
+    compared = [_contrast(jumps, weights, name, comparison, words, tuple(by_robot))]
+    for robot, robot_weights in by_robot.items():
+        single = replace(comparison, primary=False)
+        compared.append(_contrast(jumps, robot_weights, name, single, words, (robot,)))
+    return compared
+
+
+def _contrast(
+    jumps: Jumps,
+    weights: Mapping[tuple[str, str], float],
+    name: str,
+    comparison: ComparisonConfig,
+    words: tuple[str, str],
+    robots: tuple[str, ...],
+) -> ComparedArms:
+    """Return a weighted sum of outcomes.
+
+    Args:
+        jumps: Jumps of every arm on every robot.
+        weights: Weights by arm and robot.
+        name: Name of the comparison.
+        comparison: The comparison.
+        words: What is compared, and against what.
+        robots: Names of the robots.
+    """
+    cells_by_arm: dict[str, list[WeightedCell]] = {}
+    for (arm, robot), weight in weights.items():
+        values = {}
+        for seed, runs in jumps[arm, robot].items():
+            values[seed] = values_by_command(runs, comparison.outcome)
+        cells_by_arm.setdefault(arm, []).append(WeightedCell(weight=weight, seeds=values))
     is_share = OUTCOMES[comparison.outcome].is_share
-    estimate = difference_interval(arms[0], arms[1], is_share=is_share)
+    estimate = contrast_interval(list(cells_by_arm.values()), is_share=is_share)
     return ComparedArms(
         name=name,
         outcome=comparison.outcome,
-        arm=comparison.arm,
-        against=comparison.against,
-        robots=tuple(robots),
+        arm=words[0],
+        against=words[1],
+        robots=robots,
         value=estimate.value,
         low=estimate.low,
         high=estimate.high,
         seeds=estimate.seeds,
+        primary=comparison.primary,
     )
 
 
@@ -515,7 +667,7 @@ def runs_csv(plan: StudyPlan, jumps: Jumps) -> str:
     writer.writerow(["arm", "seed", "robot", "command", "number", *OUTCOMES])
     for arm in plan.arms:
         for robot in plan.robots:
-            for seed, runs in jumps[arm.name, robot.name].items():
+            for seed, runs in jumps.get((arm.name, robot.name), {}).items():
                 for run in runs:
                     row: list[Any] = [arm.name, seed, robot.name, run.case, run.number]
                     for outcome in OUTCOMES.values():

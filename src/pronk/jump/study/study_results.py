@@ -25,6 +25,10 @@ STUDY_TABLE = "study.csv"
 RUNS_FILE = "runs.csv"
 SCHEMA = "pronk/study-results/1"
 WRITER = "pronk study STUDY.yaml"
+OWN_ROBOT = "arms on their own robot"
+"""What is compared where a comparison names the robot that each arm was matched to."""
+OTHER_ROBOT = "arms of other robots"
+"""What that is compared with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +73,9 @@ class ComparedArms:
     low: float = math.nan
     high: float = math.nan
     seeds: tuple[int, ...] = ()
-    """Number of seeds of the arm and of the other."""
+    """Number of seeds of each arm that has a part in it."""
+    primary: bool = False
+    """True for a question that the study was made to answer."""
 
     @property
     def verdict(self) -> str:
@@ -96,7 +102,9 @@ class StudyResults:
     outcomes: tuple[str, ...]
     commands: tuple[str, ...]
     jumps: int
-    """Number of jumps with each command, of each policy on each robot."""
+    """Number of jumps with each command, of each policy on each robot without another number."""
+    robot_jumps: dict[str, int] = field(default_factory=dict)
+    """Number of jumps with each command by robot; empty in results of an earlier pronk."""
     trial_seed: int
     """Seed of the draws of all trials."""
     cells: tuple[OutcomeCell, ...]
@@ -108,11 +116,11 @@ class StudyResults:
     versions: dict[str, str] = field(default_factory=dict)
 
     def cell(self, arm: str, robot: str, outcome: str) -> OutcomeCell:
-        """Return one outcome of one arm on one robot."""
+        """Return one outcome of one arm on one robot; without a value if it was not tried there."""
         for cell in self.cells:
             if (cell.arm, cell.robot, cell.outcome) == (arm, robot, outcome):
                 return cell
-        raise KeyError(f"{arm}, {robot}, {outcome}")
+        return OutcomeCell(arm=arm, robot=robot, outcome=outcome, jumps=0)
 
 
 def save_study(path: Path, results: StudyResults) -> None:
@@ -168,17 +176,30 @@ def estimate_text(value: float, low: float, high: float, outcome: str, *, signed
     return f"{texts[0]} ({texts[1]} to {texts[2]})"
 
 
-def outcome_table(results: StudyResults, outcome: str) -> Table:
-    """Return one outcome, a row a robot and a column an arm."""
+def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = False) -> Table:
+    """Return one outcome, a row a robot and a column an arm.
+
+    Args:
+        results: The study.
+        outcome: Name of the outcome.
+        in_series: Whether the rows are the points of the series of conditions. Otherwise they are
+            the robots by themselves.
+    """
     definition = OUTCOMES[outcome]
     columns = [Column(heading="robot")]
     for arm in results.arms:
         columns.append(Column(heading=arm))
     rows: list[tuple[Cell, ...]] = []
+    shown = {cell.robot for cell in results.cells if bool(cell.series) == in_series}
     for robot in results.robots:
+        if robot not in shown:
+            continue
         row: list[Cell] = [robot]
         for arm in results.arms:
             cell = results.cell(arm, robot, outcome)
+            if not cell.jumps:
+                row.append("-")
+                continue
             text = estimate_text(cell.value, cell.low, cell.high, outcome, signed=False)
             row.append(f"{text}, {_seeds_text(cell.seeds)}")
         rows.append(tuple(row))
@@ -187,6 +208,7 @@ def outcome_table(results: StudyResults, outcome: str) -> Table:
         columns=tuple(columns),
         rows=tuple(rows),
         notes=(f"{outcome.replace('_', ' ')}: {definition.meaning}.",),
+        is_detail=in_series,
     )
 
 
@@ -197,12 +219,19 @@ def _seeds_text(count: int) -> str:
 def comparison_table(results: StudyResults) -> Table:
     """Return the comparisons that the study's file asked for."""
     rows: list[tuple[Cell, ...]] = []
-    for comparison in results.comparisons:
+    ordered = sorted(results.comparisons, key=lambda comparison: not comparison.primary)
+    for comparison in ordered:
         robots = ", ".join(comparison.robots)
         if comparison.robots == results.robots and len(results.robots) > 1:
             robots = "all"
+        seeds = " and ".join(map(str, comparison.seeds))
+        if len(comparison.seeds) > 2:
+            seeds = f"{min(comparison.seeds)} to {max(comparison.seeds)}"
+            if min(comparison.seeds) == max(comparison.seeds):
+                seeds = str(comparison.seeds[0])
         rows.append(
             (
+                "primary" if comparison.primary else "secondary",
                 comparison.name,
                 OUTCOMES[comparison.outcome].label,
                 f"{comparison.arm} less {comparison.against}",
@@ -214,7 +243,7 @@ def comparison_table(results: StudyResults) -> Table:
                     comparison.outcome,
                     signed=True,
                 ),
-                " and ".join(map(str, comparison.seeds)),
+                seeds,
                 comparison.verdict,
             )
         )
@@ -230,6 +259,7 @@ def comparison_table(results: StudyResults) -> Table:
     return Table(
         title="Comparisons named before the runs",
         columns=(
+            Column(heading="question"),
             Column(heading="comparison"),
             Column(heading="outcome"),
             Column(heading="difference of"),
@@ -263,10 +293,18 @@ def seed_table(results: StudyResults, outcome: str) -> Table:
 
 
 def study_tables(results: StudyResults) -> list[Table]:
-    """Return the comparisons, if any, and a table of each outcome."""
-    tables = []
+    """Return the comparisons, if any, and the tables of each outcome."""
+    tables = outcome_tables(results)
     if results.comparisons:
-        tables.append(comparison_table(results))
-    for outcome in results.outcomes:
-        tables.append(outcome_table(results, outcome))
+        tables.insert(0, comparison_table(results))
+    return tables
+
+
+def outcome_tables(results: StudyResults) -> list[Table]:
+    """Return a table of each outcome on the robots by themselves, and one of those in series."""
+    tables = []
+    for in_series in (False, True):
+        if any(bool(cell.series) == in_series for cell in results.cells):
+            for outcome in results.outcomes:
+                tables.append(outcome_table(results, outcome, in_series=in_series))
     return tables

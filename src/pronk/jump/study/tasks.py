@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,7 +71,7 @@ class StudyTask:
 
     def key(self, root: Path) -> str:
         """Return the hash of all that the result depends on; the inputs must be there."""
-        hashes = {path: sha256(root / path) for path in sorted(self.inputs)}
+        hashes = {path: file_hash(root / path) for path in sorted(self.inputs)}
         text = json.dumps([self.kind, dict(self.settings), hashes], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -172,7 +173,7 @@ class StudyState:
                 return False
         if record.key != task.key(self.root):
             return False
-        hashes = {path: sha256(self.root / path) for path in task.outputs}
+        hashes = {path: file_hash(self.root / path) for path in task.outputs}
         return hashes == record.outputs
 
     def check_settings(self, tasks: Sequence[StudyTask]) -> None:
@@ -204,9 +205,23 @@ class StudyState:
         else:
             record.status = "done"
             record.reason = ""
-            record.outputs = {path: sha256(self.root / path) for path in task.outputs}
+            record.outputs = {path: file_hash(self.root / path) for path in task.outputs}
         self.set(task.name, record)
         return record
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, which is read again only if its time or size has changed.
+
+    Every robot of a study has a trial of the same policies.
+    """
+    status = path.stat()
+    return _hash_of_version(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=10_000)
+def _hash_of_version(path: Path, _mtime_ns: int, _size: int) -> str:
+    return sha256(path)
 
 
 def copied_input(root: Path, source: Path, stem: str) -> str:

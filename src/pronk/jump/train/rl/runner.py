@@ -333,6 +333,12 @@ class PronkRunner(MjlabOnPolicyRunner):
             "ranges_sha256": motion_command(env).cfg.gains.sha256,
             "start_sha256": self.cfg.get("start_sha256", ""),
         }
+        if motion_command(env).cfg.gains.joints:
+            provenance["by_joint"] = True
+        if "strength" in env.cfg.events:
+            provenance["weakest_drive"] = env.cfg.events["strength"].params["weakest"]
+        if env.cfg.events["gains"].params.get("shape") == "ellipsoid":
+            provenance["ellipsoid"] = True
         if self.cfg.get("recipe_sha256"):
             provenance["recipe_sha256"] = self.cfg["recipe_sha256"]
         unmatched = motion_command(env).cfg.gains.unmatched

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,8 +32,9 @@ from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.export import package_versions
 from pronk.jump.train.rl.networks import EstimatorActor
+from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import without_randomization
+from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
 from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, Act, Estimate, StepListener, evaluate_policy
@@ -89,7 +90,16 @@ def run_evaluation(
     """
     progress("building", 0.0)
     task = load_task(policy.robot)
-    cfg = task.env_cfg(task.robot, gains, iterations=TASKS["all"], seed=plan.seed)
+    draws = policy.draws
+    cfg = task.env_cfg(
+        task.robot,
+        gains,
+        iterations=TASKS["all"],
+        gain_shape="ellipsoid" if draws.ellipsoid and not gains.joints else "box",
+        seed=plan.seed,
+    )
+    if draws.weakest_drive not in (None, 1.0):
+        draw_weak_drives(cfg, draws.weakest_drive)
     env = ManagerBasedRlEnv(cfg=evaluation_cfg(cfg, plan, randomization), device=device)
     progress("building", 1.0)
     with closing(env):
@@ -104,6 +114,7 @@ def run_evaluation(
         "policy": policy.about,
         "gains": {"name": gains.name, "sha256": gains.sha256, "virtual": gains.virtual},
         "randomization": randomization,
+        "by_joint": bool(gains.joints),
         "device": device_facts(device.partition(":")[0], 1),
         "versions": package_versions(),
     }
@@ -127,6 +138,8 @@ class EvaluatedPolicy:
     """The robot that it is trained for, by name or path."""
     about: dict[str, Any]
     """File, hash, and provenance."""
+    draws: DrawSettings = field(default_factory=DrawSettings)
+    """How it was trained to differ in its drives, as far as that is known."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -176,6 +189,7 @@ def load_evaluated_policy(path: Path, device: str) -> EvaluatedPolicy:
         jump=uses_jump_input(state),
         robot=settings.get("robot", "mini_cheetah"),
         about=about,
+        draws=_draws_of(settings),
     )
 
 
@@ -221,6 +235,16 @@ def _exported_policy(path: Path, device: str) -> EvaluatedPolicy:
         jump=contract.jump,
         robot=contract.robot,
         about=about,
+        draws=_draws_of(contract.provenance),
+    )
+
+
+def _draws_of(recorded: Mapping[str, Any]) -> DrawSettings:
+    """Return how a policy was trained to differ in its drives, by settings or provenance."""
+    return DrawSettings(
+        ellipsoid=recorded.get("ellipsoid"),
+        by_joint=recorded.get("by_joint"),
+        weakest_drive=recorded.get("weakest_drive"),
     )
 
 
