@@ -1,7 +1,7 @@
 """Write the virtual robots of the study, and match each by its own sweep.
 
     python examples/studies/match_worth/make_robots.py            # robots/*.yaml from their seeds
-    python examples/studies/match_worth/make_robots.py --match    # and gains/*.yaml: 2 minutes each
+    python examples/studies/match_worth/make_robots.py --match    # and gains/*.yaml: 5 minutes each
 
 Every robot is drawn about the parameters of the virtual Mini Cheetah that ships with pronk. The
 same seeds give the same files. `--robot NAME` does it for one robot alone.
