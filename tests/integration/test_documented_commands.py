@@ -78,6 +78,8 @@ PARSED = {
     "menagerie:NAME": "needs a robot that is downloaded",
     "traj_0.pt": "needs a recording that is not in the repository",
     "--deploy": "needs a policy that was trained elsewhere",
+    "match logs --robot go2": "needs logs of a Go2",
+    "match chirp.csv --robot go2": "needs a log of a Go2",
     "OLD.yaml": "needs an earlier match",
     "NET.pt": "needs an actuator network",
 }

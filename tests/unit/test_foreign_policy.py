@@ -188,7 +188,7 @@ def test_a_wrong_order_of_the_joints_is_named(tmp_path: Path) -> None:
     assert status == ExitStatus.POLICY_FELL, output
     assert any("outside its range" in problem for problem in figures["problems"])
     assert figures["remedies"]
-    assert all("joint_ids_map joint after joint" in text for text in figures["remedies"])
+    assert all("joint_ids_map joint after joint" in text for text in figures["remedies"]), output
 
 
 def test_a_wrong_sign_of_gravity_is_named(tmp_path: Path) -> None:

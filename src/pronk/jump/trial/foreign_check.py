@@ -15,7 +15,7 @@ from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.policy.deploy_yaml import COMMAND_TERMS, DeployFile, Term
-from pronk.policy.foreign import ForeignPolicy, run_foreign
+from pronk.policy.foreign import ForeignPolicy, poses_out_of_range, run_foreign
 from pronk.policy.script import Velocity
 from pronk.robots.robot import RobotSpec
 
@@ -175,18 +175,15 @@ def single_changes(deploy: DeployFile, robot: RobotSpec) -> tuple[DeployChange, 
         DeployChange(text="gravity with the other sign", deploy=replace(deploy, gravity_sign=-1.0))
     ]
     for text, joint_ids in _orders(robot):
-        if joint_ids != deploy.joint_ids:
-            changes.append(
-                DeployChange(
-                    text=f"joint_ids_map {text}", deploy=replace(deploy, joint_ids=joint_ids)
-                )
-            )
+        reordered = replace(deploy, joint_ids=joint_ids)
+        # A robot may lie still in a pose that its joints cannot have: no remedy.
+        if joint_ids != deploy.joint_ids and not poses_out_of_range(reordered, robot):
+            changes.append(DeployChange(text=f"joint_ids_map {text}", deploy=reordered))
     inverse = tuple(int(place) for place in np.argsort(deploy.joint_ids))
     known_orders = [deploy.joint_ids, *(joint_ids for _, joint_ids in _orders(robot))]
-    if inverse not in known_orders:
-        changes.append(
-            DeployChange(text="joint_ids_map inverted", deploy=replace(deploy, joint_ids=inverse))
-        )
+    inverted = replace(deploy, joint_ids=inverse)
+    if inverse not in known_orders and not poses_out_of_range(inverted, robot):
+        changes.append(DeployChange(text="joint_ids_map inverted", deploy=inverted))
     lengths = {term.history_length for term in deploy.terms}
     if max(lengths) > 1:
         order = "oldest" if deploy.newest_first else "newest"
