@@ -23,6 +23,12 @@ STAND_S = 1.0
 """Time at which a run's command begins, after standing [s]."""
 ACCELERATION = 2.0
 """Rate at which the command rises, as a person moves a joystick [m/s^2, rad/s^2]."""
+RESTS_S = 0.5
+"""Time with more than feet on the ground, or leaning, without a break after which a robot has
+fallen [s]: one that lies on its thighs is neither low nor on its side."""
+LEANS_COSINE = math.cos(math.radians(20.0))
+"""Cosine of the tilt beyond which a robot leans [1]: a Go2 on three feet, its fourth leg folded,
+leans by 26 degrees, one that runs 4 m/s by 14 at most."""
 CAPTURE_RATE_HZ = 200.0
 USUAL_SCALES: dict[str, tuple[tuple[float, ...], ...]] = {
     "base_ang_vel": ((1.0,), (0.25,), (0.2,)),
@@ -43,7 +49,8 @@ class ForeignRun:
     """What a policy did on the virtual robot."""
 
     fell_s: float | None
-    """Time of the fall since the policy took over [s]; None without one."""
+    """Time of the fall since the policy took over [s], or of half a second on other parts than the
+    feet or leaning; None without either."""
     lasted_s: float
     """Time until the fall or the end [s]."""
     velocity: tuple[float, float, float]
@@ -111,8 +118,16 @@ def run_on_virtual_robot(
         share = min(1.0, max(0.0, ACCELERATION * (time - STAND_S) / largest))
         return share * np.array(command)
 
+    stood_at = machine.now()
+
     def is_upright() -> bool:
-        return fallen_at(machine.snapshot()) > 0
+        nonlocal stood_at
+        snapshot = machine.snapshot()
+        _, x, y, _ = snapshot.orientation[-1]
+        leans = 1.0 - 2.0 * (x * x + y * y) < LEANS_COSINE
+        if not (leans or snapshot.other_contact.any()):
+            stood_at = machine.now()
+        return fallen_at(snapshot) > 0 and machine.now() - stood_at <= RESTS_S
 
     try:
         lasted_s = run_foreign(machine, policy, commanded, seconds=seconds, running=is_upright)
