@@ -109,6 +109,8 @@ def test_a_contract_that_fits_the_robot_is_accepted() -> None:
     check(contract(), ROBOT, gains_sha256="0f" * 32)
     naive = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12}
     check(contract(gains="naive", gains_sha256="", **naive), ROBOT)
+    # Gains that were matched joint by joint are alike in no group.
+    check(contract(stiffness=tuple(18.0 + 0.1 * index for index in range(12))), ROBOT)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +121,14 @@ def test_a_contract_that_fits_the_robot_is_accepted() -> None:
         ({"policy_rate_hz": 100.0, "decimation": 2}, "policy_rate_hz"),
         ({"timestep_s": 0.002, "decimation": 10}, "timestep_s"),
         ({"default_position": (0.0, 0.0, 3.0) * 4}, "default_position of FR_knee"),
-        ({"stiffness": (20.0,) * 11 + (21.0,)}, "stiffness of HL_knee"),
+        (
+            {
+                "gains": "naive",
+                "stiffness": (17.0,) * 11 + (21.0,),
+                "damping": (0.4,) * 12,
+            },
+            "stiffness of HL_knee",
+        ),
         ({"gains": "naive", "stiffness": (17.0,) * 12}, "damping of FR_hip_roll"),
         ({"gains_sha256": "1e" * 32}, "gains_sha256"),
     ],
