@@ -3,7 +3,7 @@
     python -m benchmarks study runs/match_worth --docs docs/match-worth.md --keep results.json
 
 `study.json`, which `pronk study` writes, is all that is read. The page gets the questions with
-their answers, the first outcome and the figures; `--evidence` names a page for all tables.
+their answers and the figures; `--evidence` names a page for all tables.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ def markdown(table: Table) -> str:
 
 
 def study_section(results: StudyResults, command: str, figures: str) -> str:
-    """Return the section of a page: questions and answers, the first outcome, the figures.
+    """Return the section of a page: questions and answers, and the figures.
+
+    Without figures the first outcome is a table; a page with both is too long.
 
     Args:
         results: The study.
@@ -71,7 +73,8 @@ def study_section(results: StudyResults, command: str, figures: str) -> str:
         if figures:
             words = f"{outcome.replace('_', ' ').capitalize()} by arm and robot, with intervals"
             parts.append(f"![{words}]({figures}/{ROBOTS_FIGURE})")
-        parts.append(markdown(outcome_table(results, outcome)))
+        else:
+            parts.append(markdown(outcome_table(results, outcome)))
     if has_series(results) and figures:
         words = "Outcomes of each arm over torque, delay, friction and gain error, with intervals"
         parts.append(f"![{words}]({figures}/{TOLERANCE_FIGURE})")
