@@ -245,9 +245,9 @@ def test_damage_is_one_sentence_and_no_page(
 
 def test_missing_artefacts_are_named(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="no such folder"):
-        build.write_artefact_page(tmp_path / "nowhere" / "match.npz")
+        match_page.find_gains(tmp_path / "nowhere")
     with pytest.raises(ArtefactError, match=r"gains\.yaml"):
-        build.write_artefact_page(tmp_path / "match.npz")
+        match_page.find_gains(tmp_path)
     gains_file.save_gains(tmp_path / "gains.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match=r"match\.npz"):
         build.write_artefact_page(tmp_path / "match.npz")
@@ -262,6 +262,17 @@ def test_gains_under_another_name_are_found(tmp_path: Path) -> None:
     gains_file.save_gains(tmp_path / "wednesday.yaml", match(legs=1).gains)
     with pytest.raises(ArtefactError, match="several gains files"):
         match_page.find_gains(tmp_path)
+
+
+def test_the_page_names_the_gains_of_its_match_beside_those_of_another(tmp_path: Path) -> None:
+    result = match(legs=1)
+    softer = {}
+    for name, joint in result.gains.joints.items():
+        stiffness = replace(joint.stiffness, value=0.9 * joint.stiffness.value)
+        softer[name] = replace(joint, stiffness=stiffness)
+    gains_file.save_gains(tmp_path / "gains.yaml", replace(result.gains, joints=softer))
+    gains_file.save_gains(tmp_path / "today.yaml", result.gains)
+    assert match_page.find_gains(tmp_path, result.gains).name == "today.yaml"
 
 
 def test_the_command_writes_the_page_and_its_figures(tmp_path: Path) -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pronk.errors import ArtefactError, RobotError
+from pronk.errors import ArtefactError, PronkError, RobotError
 from pronk.identify.match import tables
+from pronk.identify.match.gains import MatchedGains, load_gains
 from pronk.identify.match.predict import Prediction, load_prediction
 from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult, load_match
 from pronk.report import figures
@@ -36,8 +38,8 @@ def match_part(path: Path) -> Part:
     Raises:
         ArtefactError: A file is missing or damaged.
     """
-    gains_path = find_gains(path.parent)
     result = load_match(path)
+    gains_path = find_gains(path.parent, result.gains)
     matched = len(result.matched_joints)
     compared = {}
     for name, joint in result.joints.items():
@@ -76,8 +78,15 @@ def _headline(result: MatchResult, matched: int) -> str:
     return f"{'; '.join(phrases)}."
 
 
-def find_gains(folder: Path) -> Path:
-    """Return the gains file of a folder: `gains.yaml`, or the only YAML file with that schema.
+def find_gains(folder: Path, gains: MatchedGains | None = None) -> Path:
+    """Return the gains file of a folder.
+
+    Args:
+        folder: The folder.
+        gains: Gains of the match whose file is asked for, where there are several files.
+
+    Returns:
+        The file with these gains, or else `gains.yaml`, or the only YAML file with that schema.
 
     Raises:
         ArtefactError: There is none, or several of which none is called `gains.yaml`.
@@ -87,16 +96,35 @@ def find_gains(folder: Path) -> Path:
             f"{folder}: no such folder; give the one that `pronk match --out` wrote to."
         )
     usual = folder / "gains.yaml"
-    if usual.exists():
-        return usual
     candidates = []
-    for path in folder.glob("*.yaml"):
+    for path in sorted(folder.glob("*.yaml")):
         if _GAINS_SCHEMA in path.read_text("utf-8", "replace")[:HEADER_CHARACTERS]:
             candidates.append(path)
-    if len(candidates) == 1:
+    if gains is not None and len(candidates) > 1:
+        same = [path for path in candidates if _holds(path, gains)]
+        if same:
+            candidates = same
+    if usual in candidates or (usual.exists() and not candidates):
+        return usual
+    if len(candidates) == 1 or (candidates and gains is not None):
         return candidates[0]
     what = "several gains files and none is called" if candidates else "no"
     raise ArtefactError(f"{folder}: {what} gains.yaml; `pronk match LOG... --out` writes one.")
+
+
+def _holds(path: Path, gains: MatchedGains) -> bool:
+    """Return whether a gains file holds the gains of a match."""
+    try:
+        stored = load_gains(path)
+    except PronkError:
+        return False
+    if stored.logs != gains.logs or set(stored.joints) != set(gains.joints):
+        return False
+    for name, joint in gains.joints.items():
+        stored_stiffness = stored.joints[name].stiffness.value
+        if not math.isclose(stored_stiffness, joint.stiffness.value, rel_tol=1e-3):
+            return False
+    return True
 
 
 def _content(

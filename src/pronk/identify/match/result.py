@@ -534,8 +534,9 @@ def amplitude_flags(gains: Array) -> tuple[str, ...]:
         return ()
     largest = gains[:, 0].max()
     smallest = gains[:, 0].min()
+    change = "more than tenfold" if spread > 10.0 else f"by {100.0 * spread:.0f} %"
     return (
-        f"amplitude: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
+        f"amplitude: stiffness changes {change} between {smallest:.3g} and "
         f"{largest:.3g} rad, which this model of dry friction does not explain; match at the "
         "amplitude that the policy will use",
     )
