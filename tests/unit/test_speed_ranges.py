@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.jump.train.mdp.speed_ranges import SpeedRanges
+from pronk.jump.train.mdp.speed_ranges import SpeedRanges, fast_commands
 
 pytestmark = pytest.mark.train
 
@@ -58,3 +58,25 @@ def test_robots_that_count() -> None:
     for _ in range(2000):
         ranges.advance(error, ~ALL)
     assert float(ranges.tracking) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_command_is_fast_by_its_share_of_the_range_in_use() -> None:
+    limits = torch.tensor([2.0, 1.0, 2.0])
+    velocity = torch.tensor([[0.0, 0.0], [0.49, 0.0], [-0.5, 0.0], [0.1, 0.25], [0.1, -0.24]])
+    fast = fast_commands(velocity, limits, torch.tensor(0.5), 0.5)
+    assert fast.tolist() == [False, False, True, True, False]
+
+
+def test_robots_that_stand_do_not_let_the_ranges_grow_where_fast_ones_count() -> None:
+    """Eight stand as commanded, one that is commanded to walk does not."""
+    error = torch.zeros(N, 2)
+    error[0, 0] = 2.0
+    velocity = -error
+    limits = torch.tensor([2.0, 1.0, 2.0])
+    by_all = SpeedRanges("cpu")
+    by_fast = SpeedRanges("cpu")
+    for _ in range(400):
+        by_all.advance(error, ALL)
+        by_fast.advance(error, fast_commands(velocity, limits, by_fast.fraction, 0.5))
+    assert float(by_all.grown) > 100.0
+    assert float(by_fast.grown) == 0.0

@@ -29,7 +29,7 @@ from pronk.jump.train.mdp.motion import (
     simulator_state,
     standing_leg,
 )
-from pronk.jump.train.mdp.speed_ranges import SpeedRanges
+from pronk.jump.train.mdp.speed_ranges import SpeedRanges, fast_commands
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 
@@ -54,6 +54,9 @@ class MotionCommandCfg(CommandTermCfg):
     """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3).
 
     They grow up to these, see `pronk.jump.train.mdp.speed_ranges`."""
+    counted_from: float = 0.0
+    """Least command, as a share of the ranges in use, of robots whose tracking lets the ranges
+    grow; with 0 all count, also those that stand or turn."""
     standing: float = 0.1
     """Fraction of the velocity draws that are zero."""
     one_axis: float = 0.4
@@ -273,7 +276,12 @@ class MotionCommand(CommandTerm):
         )
         self.state.advance(inputs, self.step_s)
         if not self.scripted:
-            self.ranges.advance(horizontal - commanded, ~self.state.mode)
+            counted = ~self.state.mode
+            if self.cfg.counted_from > 0.0:
+                counted = counted & fast_commands(
+                    commanded, self._limits, self.ranges.fraction, self.cfg.counted_from
+                )
+            self.ranges.advance(horizontal - commanded, counted)
         return motion
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:

@@ -24,6 +24,19 @@ _SMOOTHING = 0.01
 """Weight of a policy step in the mean tracking performance: a time constant of two seconds."""
 
 
+def fast_commands(velocity: Tensor, limits: Tensor, fraction: Tensor, least: float) -> Tensor:
+    """Return which commands use much of the ranges, bool, (N,).
+
+    Args:
+        velocity: Commanded forward and left velocity [m/s], (N, 2).
+        limits: Half-widths of the whole ranges, forward and left first [m/s], (2,) or more.
+        fraction: Fraction of the ranges in use, ().
+        least: Least share of the range in use of either velocity [1].
+    """
+    share = velocity.abs() / (fraction * limits[:2])
+    return share.amax(dim=-1) >= least
+
+
 class SpeedRanges:
     """Fraction of the velocity ranges in use, computed without waiting for the device."""
 
@@ -44,7 +57,8 @@ class SpeedRanges:
 
         Args:
             error: Error of the horizontal velocity [m/s], (N, 2).
-            counted: The robots outside jump mode, bool, (N,).
+            counted: The robots that count, bool, (N,): those outside jump mode, or the fast ones of
+                them.
         """
         # A robot with a state that is not finite counts as not tracking.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * counted
