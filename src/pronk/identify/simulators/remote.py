@@ -45,7 +45,7 @@ from pronk.identify.simulators.links import Links, SentRobot, links_of
 from pronk.identify.simulators.simulator import Closing, Simulator
 from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
-from pronk.robots.limits import OperatingLimits
+from pronk.robots.limits import OperatingLimits, StandingUp
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 Message = tuple[dict[str, Any], dict[str, Array]]
@@ -233,11 +233,13 @@ def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot
             inertia=np.array(chain["inertia"]),
             gravity=np.array(chain["gravity"]),
         )
+    limits = robot["limits"]
+    stand = StandingUp(**limits["stand"])
     robot_fields = {
         **robot,
         "joints": joints,
         "law": DriveLaw(**robot["law"]),
-        "limits": OperatingLimits(**robot["limits"]),
+        "limits": OperatingLimits(**{**limits, "stand": stand}),
     }
     return SentRobot(**_with_tuples(robot_fields), build_spec=_no_model, links=links)
 
