@@ -86,34 +86,39 @@ def changed_joint(
     )
 
 
-def shipped_robot() -> SimParams:
-    """Return the virtual robot that ships with pronk."""
-    return load_sim_params()
+def scaled_robot(
+    *, seed: int, torque: tuple[float, float], friction: float, belt: float, delay_s: float
+) -> SimParams:
+    """Return a robot whose torque constants are drawn, with the same factors on all joints.
+
+    Args:
+        seed: Seed of the draws.
+        torque: Range of the torque constants [1].
+        friction: Factor on dry and viscous friction [1].
+        belt: Factor on the stiffness of the belts [1].
+        delay_s: Command delay [s].
+    """
+    shipped = load_sim_params()
+    rng = np.random.default_rng(seed)
+    joints = {}
+    for name, joint in shipped.joints.items():
+        torque_scale = rng.uniform(*torque)
+        joints[name] = changed_joint(joint, torque_scale=torque_scale, friction=friction, belt=belt)
+    machine = replace(shipped.machine, command_delay_s=rounded(delay_s))
+    return replace(shipped, joints=joints, machine=machine)
 
 
 def weak_robot() -> SimParams:
     """Return a robot of weak drives: friction twice, belts 0.6, 4 ms more of command delay."""
-    shipped = load_sim_params()
-    rng = np.random.default_rng(WEAK_SEED)
-    joints = {}
-    for name, joint in shipped.joints.items():
-        torque_scale = rng.uniform(*WEAK_TORQUE)
-        joints[name] = changed_joint(joint, torque_scale=torque_scale, friction=2.0, belt=0.6)
-    delay_s = rounded(shipped.machine.command_delay_s + 0.004)
-    return replace(
-        shipped, joints=joints, machine=replace(shipped.machine, command_delay_s=delay_s)
-    )
+    delay_s = load_sim_params().machine.command_delay_s + 0.004
+    return scaled_robot(seed=WEAK_SEED, torque=WEAK_TORQUE, friction=2.0, belt=0.6, delay_s=delay_s)
 
 
 def strong_robot() -> SimParams:
     """Return a robot of strong drives: friction half, belts 1.5, 1 ms of command delay."""
-    shipped = load_sim_params()
-    rng = np.random.default_rng(STRONG_SEED)
-    joints = {}
-    for name, joint in shipped.joints.items():
-        torque_scale = rng.uniform(*STRONG_TORQUE)
-        joints[name] = changed_joint(joint, torque_scale=torque_scale, friction=0.5, belt=1.5)
-    return replace(shipped, joints=joints, machine=replace(shipped.machine, command_delay_s=0.001))
+    return scaled_robot(
+        seed=STRONG_SEED, torque=STRONG_TORQUE, friction=0.5, belt=1.5, delay_s=0.001
+    )
 
 
 def random_robot(seed: int) -> SimParams:
@@ -145,7 +150,7 @@ def random_robot(seed: int) -> SimParams:
 
 
 ROBOTS: dict[str, Callable[[], SimParams]] = {
-    "shipped": shipped_robot,
+    "shipped": load_sim_params,
     "weak": weak_robot,
     "strong": strong_robot,
     "random-1": lambda: random_robot(RANDOM_SEEDS[0]),

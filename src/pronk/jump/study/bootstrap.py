@@ -143,29 +143,6 @@ def mean_interval(
     return SeedEstimate(value=value, low=low, high=high, seeds=(count,))
 
 
-def difference_interval(
-    seeds: Sequence[SeedValues],
-    other_seeds: Sequence[SeedValues],
-    *,
-    is_share: bool,
-    rng_seed: int = 0,
-    resamples: int = RESAMPLES,
-) -> SeedEstimate:
-    """Return the mean over some seeds less that over others, with its interval.
-
-    Args:
-        seeds: Values of the jumps of each seed, by command.
-        other_seeds: The same of the arm that is subtracted.
-        is_share: True for a share. The interval is at least Newcombe's over all jumps.
-        rng_seed: Seed of the resamples.
-        resamples: Number of resamples.
-    """
-    arms = []
-    for weight, values in ((1.0, seeds), (-1.0, other_seeds)):
-        arms.append([WeightedCell(weight=weight, seeds=dict(enumerate(values)))])
-    return contrast_interval(arms, is_share=is_share, rng_seed=rng_seed, resamples=resamples)
-
-
 @dataclass(frozen=True, kw_only=True)
 class WeightedCell:
     """The jumps of an arm on one robot, with their weight in a contrast."""
