@@ -30,10 +30,10 @@ import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, is_dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -45,9 +45,10 @@ from pronk.identify.simulators.links import Links, SentRobot, links_of
 from pronk.identify.simulators.simulator import Closing, Simulator
 from pronk.plugins import load_entry_point
 from pronk.robots.drive_law import DriveLaw
-from pronk.robots.limits import OperatingLimits, StandingUp
-from pronk.robots.robot import Drive, Joint, RobotSpec
+from pronk.robots.limits import OperatingLimits
+from pronk.robots.robot import Joint, RobotSpec
 
+_Kind = TypeVar("_Kind")
 Message = tuple[dict[str, Any], dict[str, Array]]
 """Header of a message, and its arrays by name."""
 
@@ -217,10 +218,7 @@ def _as_json(robot: RobotSpec) -> dict[str, Any]:
 
 def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot:
     """Make a robot of what `_as_json` returns."""
-    joints = []
-    for joint_fields in robot["joints"]:
-        drive = Drive(**joint_fields["drive"])
-        joints.append(Joint(**_with_tuples({**joint_fields, "drive": drive})))
+    joints = [_built(Joint, joint_fields) for joint_fields in robot["joints"]]
     links = {}
     for name, chain in chains.items():
         links[name] = Links(
@@ -233,15 +231,28 @@ def _from_json(robot: Mapping[str, Any], chains: Mapping[str, Any]) -> SentRobot
             inertia=np.array(chain["inertia"]),
             gravity=np.array(chain["gravity"]),
         )
-    limits = robot["limits"]
-    stand = StandingUp(**limits["stand"])
     robot_fields = {
         **robot,
         "joints": joints,
-        "law": DriveLaw(**robot["law"]),
-        "limits": OperatingLimits(**{**limits, "stand": stand}),
+        "law": _built(DriveLaw, robot["law"]),
+        "limits": _built(OperatingLimits, robot["limits"]),
     }
     return SentRobot(**_with_tuples(robot_fields), build_spec=_no_model, links=links)
+
+
+def _built(kind: type[_Kind], fields: Mapping[str, Any]) -> _Kind:
+    """Make a dataclass, and those inside of it, of the fields that `asdict` returns.
+
+    Args:
+        kind: The dataclass.
+        fields: Its fields, as JSON has them.
+    """
+    types = get_type_hints(kind)
+    built = _with_tuples(fields)
+    for name, value in fields.items():
+        if isinstance(value, Mapping) and is_dataclass(types[name]):
+            built[name] = _built(types[name], value)
+    return kind(**built)
 
 
 def _with_tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
