@@ -141,7 +141,7 @@ def check_arm(arm: TrainingArm) -> None:
     Raises:
         PronkError: The gains, the recipe or the phases are impossible.
     """
-    from pronk.jump.train.gains import NAIVE, training_gains
+    from pronk.jump.train.gains import gains_of
     from pronk.jump.train.recipe import load_recipe
     from pronk.robots import load_robot
 
@@ -151,13 +151,7 @@ def check_arm(arm: TrainingArm) -> None:
 
         check_training(settings)
         return
-    training_gains(
-        settings.gains or NAIVE,
-        load_robot(str(settings.robot)),
-        like=settings.ranges_from,
-        allow_unmatched=bool(settings.allow_unmatched),
-        by_joint=bool(settings.draws.by_joint),
-    )
+    gains_of(settings, load_robot(str(settings.robot)))
     if settings.recipe is not None:
         load_recipe(settings.recipe)
 

@@ -17,7 +17,7 @@ from mjlab.scripts.train import TrainConfig, run_train
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256, written_whole
 from pronk.jump.train import devices, provenance
-from pronk.jump.train.gains import NAIVE, TrainingGains, training_gains
+from pronk.jump.train.gains import NAIVE, TrainingGains, gains_of, training_gains
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe
@@ -85,13 +85,7 @@ def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | Non
             task does not have.
     """
     task = load_task(str(settings.robot))
-    gains = training_gains(
-        settings.gains or NAIVE,
-        task.robot,
-        like=settings.ranges_from,
-        allow_unmatched=bool(settings.allow_unmatched),
-        by_joint=bool(settings.draws.by_joint),
-    )
+    gains = gains_of(settings, task.robot)
     recipe = None if settings.recipe is None else load_recipe(settings.recipe)
     _env_cfg(task, gains, settings, recipe)
     return gains, recipe
