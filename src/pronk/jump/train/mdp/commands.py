@@ -29,7 +29,7 @@ from pronk.jump.train.mdp.motion import (
     simulator_state,
     standing_leg,
 )
-from pronk.jump.train.mdp.speed_ranges import SpeedRanges, fast_commands
+from pronk.jump.train.mdp.speed_ranges import DIRECTIONS, SpeedRanges, fast_commands
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 
@@ -56,7 +56,8 @@ class MotionCommandCfg(CommandTermCfg):
     They grow up to these, see `pronk.jump.train.mdp.speed_ranges`."""
     counted_from: float = 0.0
     """Least command, as a share of the ranges in use, of robots whose tracking lets the ranges
-    grow; with 0 all count, also those that stand or turn."""
+    grow: by the worst of the directions forward, back, left and right. With 0 the mean of all
+    decides, also of those that stand or turn."""
     standing: float = 0.1
     """Fraction of the velocity draws that are zero."""
     one_axis: float = 0.4
@@ -126,7 +127,8 @@ class MotionCommand(CommandTerm):
         self._sweep = foot_sweep(self.body, cfg.settings, env.step_dt).to(device)
         self._standing_leg = standing_leg(self.body)
         self.state = JumpState(count, device, cfg.settings)
-        self.ranges = SpeedRanges(device)
+        groups = len(DIRECTIONS) if cfg.counted_from > 0.0 else 1
+        self.ranges = SpeedRanges(device, groups)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)
         moving = 1.0 - cfg.standing
@@ -276,7 +278,7 @@ class MotionCommand(CommandTerm):
         )
         self.state.advance(inputs, self.step_s)
         if not self.scripted:
-            counted = ~self.state.mode
+            counted = ~self.state.mode[None]
             if self.cfg.counted_from > 0.0:
                 counted = counted & fast_commands(
                     commanded, self._limits, self.ranges.fraction, self.cfg.counted_from

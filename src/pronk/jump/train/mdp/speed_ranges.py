@@ -24,26 +24,54 @@ _SMOOTHING = 0.01
 """Weight of a policy step in the mean tracking performance: a time constant of two seconds."""
 
 
+DIRECTIONS = ("forward", "back", "left", "right")
+"""Directions of fast commands, in the order of `fast_commands`."""
+
+
 def fast_commands(velocity: Tensor, limits: Tensor, fraction: Tensor, least: float) -> Tensor:
-    """Return which commands use much of the ranges, bool, (N,).
+    """Return which commands use much of the ranges, by direction.
+
+    A command belongs to the direction in which it uses the larger share of its range.
 
     Args:
         velocity: Commanded forward and left velocity [m/s], (N, 2).
         limits: Half-widths of the whole ranges, forward and left first [m/s], (2,) or more.
         fraction: Fraction of the ranges in use, ().
-        least: Least share of the range in use of either velocity [1].
+        least: Least share of the range in use of that velocity [1].
+
+    Returns:
+        Bool, (4, N), in the order of `DIRECTIONS`.
     """
-    share = velocity.abs() / (fraction * limits[:2])
-    return share.amax(dim=-1) >= least
+    share = velocity / (fraction * limits[:2])
+    ahead, left = share.unbind(dim=-1)
+    along_x = ahead.abs() >= left.abs()
+    return torch.stack(
+        (
+            along_x & (ahead >= least),
+            along_x & (ahead <= -least),
+            ~along_x & (left >= least),
+            ~along_x & (left <= -least),
+        )
+    )
 
 
 class SpeedRanges:
-    """Fraction of the velocity ranges in use, computed without waiting for the device."""
+    """Fraction of the velocity ranges in use, computed without waiting for the device.
 
-    def __init__(self, device: torch.device | str) -> None:
-        """Begin with the smallest ranges."""
-        self.tracking = torch.zeros((), device=device)
-        """Recent mean of the tracking kernel over all robots. ()"""
+    Robots are counted in one group or several. The group that tracks worst decides how fast the
+    ranges grow: a Go2 that ran backwards and sideways, but stood when it was told to run forwards,
+    had a good mean over all fast commands.
+    """
+
+    def __init__(self, device: torch.device | str, groups: int = 1) -> None:
+        """Begin with the smallest ranges.
+
+        Args:
+            device: Device of the state.
+            groups: Number of groups, G.
+        """
+        self.tracking = torch.zeros(groups, device=device)
+        """Recent mean of the tracking kernel over the robots of each group. (G,)"""
         self.grown = torch.zeros((), device=device)
         """Policy steps at the full rate that give the present ranges. ()"""
 
@@ -57,11 +85,14 @@ class SpeedRanges:
 
         Args:
             error: Error of the horizontal velocity [m/s], (N, 2).
-            counted: The robots that count, bool, (N,): those outside jump mode, or the fast ones of
-                them.
+            counted: Robots that count in each group, bool, (G, N): those outside jump mode, or the
+                fast ones of them. The mean of a group without robots stays as it is.
         """
         # A robot with a state that is not finite counts as not tracking.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * counted
-        self.tracking.lerp_(kernel.sum() / counted.sum().clamp_min(1), _SMOOTHING)
+        count = counted.sum(dim=-1)
+        smoothing = _SMOOTHING * (count > 0)
+        self.tracking.lerp_(kernel.sum(dim=-1) / count.clamp_min(1), smoothing)
         span = FULL_RATE_TRACKING - NO_GROWTH_TRACKING
-        self.grown += ((self.tracking - NO_GROWTH_TRACKING) / span).clamp(0.0, 1.0)
+        worst = self.tracking.amin()
+        self.grown += ((worst - NO_GROWTH_TRACKING) / span).clamp(0.0, 1.0)
