@@ -15,7 +15,7 @@ from pronk.errors import PronkError
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.mdp.commands import NAME as COMMAND
 from pronk.jump.train.phases import PHASES, TASKS, changed_phases
-from pronk.jump.train.recipe import SCHEMA, apply_recipe, load_recipe
+from pronk.jump.train.recipe import SCHEMA, apply_recipe, load_recipe, load_recipes
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import ROBOT, config
@@ -102,6 +102,39 @@ def test_what_there_is_not_is_refused_with_what_there_is(
         assert word in str(refusal.value), word
 
 
+@pytest.mark.parametrize(
+    ("good", "faulty", "words"),
+    [
+        ("rewards: {posture: -1}", "rewards: {speed: 3}", "'speed'|tracking_linear"),
+        ("jump_scales: {knees: 2}", "jump_scales: {sparse_jump: 3}", "'sparse_jump'|no jump_scale"),
+        ("jump: {late_s: 0.2}", "jump: {height: 3}", "'height'|late_s"),
+        ("jump: {late_s: 0.2}", "jump: {late_s: 0}", "late_s"),
+        ("jump: {speed_added: 0.2}", "jump: {ready_s: 3}", "ready_s"),
+    ],
+)
+def test_the_layer_that_does_not_apply_is_named(
+    tmp_path: Path, good: str, faulty: str, words: str
+) -> None:
+    paths = []
+    for name, text in (("first", good), ("faulty", faulty), ("last", "rewards: {hop: 0}")):
+        paths.append(tmp_path / f"{name}.yaml")
+        paths[-1].write_text(f"schema: {SCHEMA}\n{text}\n")
+    with pytest.raises(PronkError) as refusal:
+        apply_recipe(config(8, training_gains("naive", ROBOT)), load_recipes(paths))
+    assert str(refusal.value).startswith(str(paths[1]))
+    for word in words.split("|"):
+        assert word in str(refusal.value), word
+
+
+def test_a_number_that_a_later_layer_mends_is_no_fault(tmp_path: Path) -> None:
+    first = written(tmp_path, "jump: {late_s: 0}")
+    second = tmp_path / "second.yaml"
+    second.write_text(f"schema: {SCHEMA}\njump: {{late_s: 0.2}}\n")
+    cfg = config(8, training_gains("naive", ROBOT))
+    apply_recipe(cfg, load_recipes([first, second]))
+    assert cfg.commands[COMMAND].settings.late_s == 0.2
+
+
 def test_the_command_refuses_before_anything_is_written(tmp_path: Path) -> None:
     out = tmp_path / "run"
     bad = written(tmp_path, "rewards: {speed: 3}")
@@ -125,11 +158,11 @@ def test_the_plan_of_a_study_refuses_a_recipe_that_does_not_apply(tmp_path: Path
 
 def test_a_recipe_is_part_of_a_run(tmp_path: Path) -> None:
     path = written(tmp_path, "rewards: {slip: 0}")
-    first = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=path)
+    first = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=(path,))
     stored = first.completed().stored_values()
     again = TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored)
-    assert again.recipe == path
-    other = TrainSettings(task="all", out=tmp_path, resume=True, recipe=Path("other.yaml"))
+    assert again.recipe == (path,)
+    other = TrainSettings(task="all", out=tmp_path, resume=True, recipe=(Path("other.yaml"),))
     with pytest.raises(PronkError, match="leave it out"):
         other.resumed(stored)
     by_joint = TrainSettings(
@@ -140,15 +173,21 @@ def test_a_recipe_is_part_of_a_run(tmp_path: Path) -> None:
     # A run of an earlier version has no such entries.
     for name in ("recipe", "by_joint", "weakest_drive"):
         del stored[name]
-    assert TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored).recipe is None
+    assert TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored).recipe == ()
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_the_shipped_recipes_apply(path: Path) -> None:
-    """Each changes something, and says in its comments what for."""
+    """Each changes something, layers over forward.yaml, and says in its comments what for."""
+    base = path.with_name("forward.yaml")
+    layers = [base] if path == base else [base, path]
     cfg = config(8, training_gains("naive", ROBOT))
     before = repr((list(cfg.rewards), cfg.commands, PHASES))
-    apply_recipe(cfg, load_recipe(path))
+    if path != base:
+        below = config(8, training_gains("naive", ROBOT))
+        apply_recipe(below, load_recipe(base))
+        before = repr((list(below.rewards), below.commands, phases_of(below)))
+    apply_recipe(cfg, load_recipes(layers))
     assert repr((list(cfg.rewards), cfg.commands, phases_of(cfg))) != before
     assert path.read_text().startswith("# ")
     for phase in phases_of(cfg).values():
@@ -163,7 +202,8 @@ def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
 
     from pronk.jump.train.phases import STEPS_PER_ITERATION, curriculum
 
-    cfg = task("rewards: {liftoff_angle: {jump_b: [4, 8]}, posture: -0.5, slip: 0}", tmp_path)
+    text = "rewards: {liftoff_angle: {jump_b: [4, 8]}, posture: -0.5, slip: 0}\n"
+    cfg = task(text + "jump_scales: {tracking_linear: {jump_a: 2}}", tmp_path)
     cfg.curriculum["phases"].params.update(TASKS["all"])
     cfg.scene.num_envs = 2
     env = ManagerBasedRlEnv(cfg, device="cpu")
@@ -172,6 +212,9 @@ def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
         env.curriculum_manager.compute()
         assert env.reward_manager.get_term_cfg("liftoff_angle").weight == pytest.approx(expected)
         assert env.reward_manager.get_term_cfg("posture").weight == -0.5
+        # A term without a factor of its own has that of a phase in this phase alone.
+        scale = env.reward_manager.get_term_cfg("tracking_linear").params.get("jump_scale", 1.0)
+        assert scale == (2.0 if 300 <= iteration < 520 else 1.0)
         assert curriculum(env).total == 1080
     assert "slip" not in env.reward_manager.active_terms
     env.step(training_env.torch.zeros(2, 12))

@@ -186,7 +186,7 @@ def test_the_words_of_a_training_give_its_settings_again(tmp_path: Path) -> None
             out=tmp_path,
             gains="g.yaml",
             draws=DrawSettings(by_joint=True, weakest_drive=0.7),
-            recipe=Path("r.yaml"),
+            recipe=(Path("r.yaml"), Path("s.yaml")),
         ),
         TrainSettings(
             task="all",

@@ -23,6 +23,7 @@ from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 from pronk.cli import main as cli
+from pronk.files import sha256
 from pronk.jump.train.phases import PHASES, TASKS
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
@@ -101,6 +102,41 @@ def test_a_run_writes_policies_checkpoints_and_provenance(finished_run: RunFolde
     assert (finished_run.gains).read_bytes() == GAINS.read_bytes()
     assert record["sessions"][0]["versions"]["torch"] == torch.__version__
     assert any(finished_run.path.glob("events.out.*"))
+
+
+def test_layers_of_a_recipe_train_as_the_merged_file_does(tmp_path: Path) -> None:
+    """The run keeps one file, whose hash is in the policy, and which trains the same again."""
+    first = tmp_path / "first.yaml"
+    second = tmp_path / "second.yaml"
+    first.write_text("schema: pronk/recipe/1\nrewards: {posture: -9, slip: 0}\n")
+    second.write_text("schema: pronk/recipe/1\nrewards: {posture: {walk: [-2, -1]}}\n")
+    words = ("walk", "--gains", "naive", *SMALL, "--phase", "walk=2")
+    merged = RunFolder(tmp_path / "merged")
+    assert train(*words, "--recipe", first, "--recipe", second, "--out", merged.path) == 0
+    record = merged.read()
+    assert [layer["file"] for layer in record["recipe"]["layers"]] == [first.name, second.name]
+    assert record["recipe"]["weights"]["posture"]["walk"] == [-2.0, -1.0]
+    assert record["recipe"]["weights"]["posture"]["jump_a"] == [-9.0, -9.0]
+    digest = sha256(merged.recipe)
+    assert load_policy(merged.path / "policy.onnx").contract.provenance["recipe_sha256"] == digest
+    assert record["recipe"]["sha256"] == digest
+    assert train("walk", "--resume", "--out", merged.path) == 0
+    assert train("walk", "--resume", "--out", merged.path, "--recipe", second) == 2
+    again = RunFolder(tmp_path / "again")
+    assert train(*words, "--recipe", merged.recipe, "--out", again.path) == 0
+    assert again.recipe.read_bytes() == merged.recipe.read_bytes()
+    assert again.read()["recipe"] == record["recipe"]
+    states = [checkpoint.read_checkpoint(run.path / "walk.pt") for run in (merged, again)]
+    weights = [state["actor_state_dict"] for state in states]
+    for name, tensor in weights[0].items():
+        assert torch.equal(tensor, weights[1][name]), name
+    # Without the second layer it is another training.
+    other = RunFolder(tmp_path / "other")
+    assert train(*words, "--recipe", first, "--out", other.path) == 0
+    assert other.recipe.read_bytes() == first.read_bytes()
+    assert other.read()["recipe"]["sha256"] == sha256(first)
+    changed = checkpoint.read_checkpoint(other.path / "walk.pt")["actor_state_dict"]
+    assert any(not torch.equal(tensor, weights[0][name]) for name, tensor in changed.items())
 
 
 @of_one_run

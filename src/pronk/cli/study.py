@@ -152,9 +152,8 @@ def _training_arms(config: StudyConfig, folder: Path, study_file: Path) -> dict[
         try:
             values = parsed_command([*words, *options])
             settings = replace(values["settings"], gains=gains)
-            if settings.recipe is not None:
-                settings = replace(settings, recipe=folder / settings.recipe)
-            settings = settings.completed()
+            recipe = tuple(folder / path for path in settings.recipe)
+            settings = replace(settings, recipe=recipe).completed()
         except PronkError as error:
             raise PronkError(f"{study_file}: arms.{name}: {error}") from None
         if arm.randomization is not None and (settings.draws.ellipsoid or settings.draws.by_joint):
@@ -189,7 +188,7 @@ _NAMED_ELSEWHERE = {
 def _plan_tables(plan: StudyPlan) -> list[Table]:
     """Return what a study runs and asks, and what that takes."""
     from pronk.jump.study.config import comparison_robots
-    from pronk.jump.study.study_results import OTHER_ROBOT, OWN_ROBOT
+    from pronk.jump.study.study_results import OTHER_ROBOT, OWN_ROBOT, compared_outcome
     from pronk.tables import Column, Table
 
     config = plan.config
@@ -217,12 +216,13 @@ def _plan_tables(plan: StudyPlan) -> list[Table]:
     rows = []
     for name, comparison in config.comparisons.items():
         robots = comparison_robots(comparison, plan.arms_by_robot)
-        compared = f"{comparison.arm} less {comparison.against}"
+        compared = " less ".join(comparison.sides)
         if comparison.own:
             compared = f"{OWN_ROBOT} less {OTHER_ROBOT}: {', '.join(comparison.own)}"
         question = "primary" if comparison.primary else "secondary"
         shown = "all" if len(robots) == len(plan.robots) > 1 else ", ".join(robots)
-        rows.append((question, name, comparison.outcome, compared, shown))
+        outcome = compared_outcome(comparison.outcome, comparison.command_names)
+        rows.append((question, name, outcome, compared, shown))
     comparisons = Table(
         title="Comparisons",
         columns=(

@@ -29,10 +29,10 @@ def comparison_sentence(comparison: ComparedArms) -> str:
     text = estimate_text(
         comparison.value, comparison.low, comparison.high, comparison.outcome, signed=True
     )
-    outcome = comparison.outcome.replace("_", " ")
     return (
-        f"{comparison.name}: {outcome} of {comparison.arm} less {comparison.against}, on "
-        f"{', '.join(comparison.robots)}: {text} {definition.unit}, {comparison.verdict}."
+        f"{comparison.name} ({comparison.outcome_words}): {comparison.arm} less "
+        f"{comparison.against}, on {', '.join(comparison.robots)}: {text} {definition.unit}, "
+        f"{comparison.verdict}."
     )
 
 

@@ -12,6 +12,7 @@
     outcomes: [landed, height, distance]
     comparisons:
       a match: {outcome: landed, arm: matched, against: nominal, robots: [shipped]}
+      a match forwards: {outcome: distance, arm: matched, against: nominal, commands: ["2,0"]}
 
 Paths are relative to the file.
 """
@@ -108,12 +109,15 @@ class RobotConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonConfig:
-    """A difference that is asked for before the runs: of two arms, or of own and other robots."""
+    """A difference that is asked for before the runs: of arms, or of own and other robots."""
 
     outcome: str
-    arm: str = ""
-    against: str = ""
-    """Arm that is subtracted."""
+    arm: str | tuple[str, ...] = ()
+    """An arm, or several over which the outcome is averaged, each with one weight."""
+    against: str | tuple[str, ...] = ()
+    """Arm, or mean of several, that is subtracted."""
+    commands: tuple[str, ...] = ()
+    """Commands of the trial that count, as in `TrialConfig.commands`; all if empty."""
     robots: tuple[str, ...] = ()
     """Robots over which the outcome is averaged, each with one weight; all if empty."""
     own: dict[str, str] = field(default_factory=dict)
@@ -133,15 +137,39 @@ class ComparisonConfig:
                     "two robots or more."
                 )
             return
-        if not (self.arm and self.against):
-            raise PronkError("expected arm and against, two arms, or own, arms with their robots.")
-        if self.arm == self.against:
-            raise PronkError(f"arm and against are both {self.arm}.")
+        if not (self.plus and self.minus):
+            raise PronkError(
+                "expected arm and against, each an arm or a list of arms, or own, arms with their "
+                "robots."
+            )
+        for name in self.plus:
+            if name in self.minus:
+                raise PronkError(f"arm and against both have {name}; expected different arms.")
+
+    @property
+    def plus(self) -> tuple[str, ...]:
+        """Names of the arms whose mean counts."""
+        return _names(self.arm)
+
+    @property
+    def minus(self) -> tuple[str, ...]:
+        """Names of the arms whose mean is subtracted."""
+        return _names(self.against)
 
     @property
     def arms(self) -> tuple[str, ...]:
         """Names of all arms that it compares."""
-        return tuple(self.own) or (self.arm, self.against)
+        return tuple(self.own) or (*self.plus, *self.minus)
+
+    @property
+    def sides(self) -> tuple[str, str]:
+        """What is compared, and against what, in words."""
+        return _side_words(self.plus), _side_words(self.minus)
+
+    @property
+    def command_names(self) -> tuple[str, ...]:
+        """Names of the commands that count; all of the trial if empty."""
+        return tuple(case.name for case in parse_cases(self.commands))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,11 +253,18 @@ class StudyConfig:
         for name, comparison in self.comparisons.items():
             place = f"comparisons.{name}"
             _check_known(f"{place}.outcome", [comparison.outcome], OUTCOMES)
+            if comparison.commands:
+                try:
+                    names = comparison.command_names
+                except PronkError as error:
+                    raise PronkError(f"{place}.commands: {error}") from None
+                commands = [case.name for case in self.trial.cases()]
+                _check_known(f"{place}.commands", names, commands)
             if comparison.own:
                 _check_known(f"{place}.own", list(comparison.own), self.arms)
                 continue
-            _check_known(f"{place}.arm", [comparison.arm], self.arms)
-            _check_known(f"{place}.against", [comparison.against], self.arms)
+            _check_known(f"{place}.arm", comparison.plus, self.arms)
+            _check_known(f"{place}.against", comparison.minus, self.arms)
         for name, robot in self.robots.items():
             if robot.arms:
                 _check_known(f"robots.{name}.arms", robot.arms, self.arms)
@@ -285,9 +320,23 @@ def comparison_robots(
         return comparison.robots
     shared = []
     for robot, arms in arms_by_robot.items():
-        if comparison.arm in arms and comparison.against in arms:
+        if all(arm in arms for arm in comparison.arms):
             shared.append(robot)
     return tuple(shared)
+
+
+def _names(side: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the arms of one side of a comparison."""
+    if isinstance(side, str):
+        return (side,) if side else ()
+    return side
+
+
+def _side_words(arms: Sequence[str]) -> str:
+    """Return the arms of one side of a comparison as words."""
+    if len(arms) == 1:
+        return arms[0]
+    return f"mean of {', '.join(arms)}"
 
 
 def _check_jumps(place: str, jumps: int) -> None:

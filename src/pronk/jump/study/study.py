@@ -486,7 +486,7 @@ def collect_results(
         if comparison.own:
             comparisons += own_and_other(jumps, name, comparison)
         else:
-            comparisons.append(_compared(jumps, name, comparison, robots))
+            comparisons.append(compared_arms(jumps, name, comparison, robots))
     trial = plan.config.trial
     failed = []
     for status in statuses.values():
@@ -575,17 +575,22 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
     )
 
 
-def _compared(
+def compared_arms(
     jumps: Jumps, name: str, comparison: ComparisonConfig, robots: Sequence[str]
 ) -> ComparedArms:
-    """Return the difference of two arms, over the seeds that were tried on all of the robots."""
+    """Return the difference of two arms or of two means of arms.
+
+    An arm counts by its seeds that were tried on all of the robots. The means weigh arms alike,
+    and each arm has a scatter of its own: what the arms of one side differ by, on average, makes
+    the interval of their mean no wider.
+    """
     weights = {}
     for robot in robots:
-        weights[comparison.arm, robot] = 1.0 / len(robots)
-        weights[comparison.against, robot] = -1.0 / len(robots)
-    return _contrast(
-        jumps, weights, name, comparison, (comparison.arm, comparison.against), tuple(robots)
-    )
+        for arm in comparison.plus:
+            weights[arm, robot] = 1.0 / len(robots) / len(comparison.plus)
+        for arm in comparison.minus:
+            weights[arm, robot] = -1.0 / len(robots) / len(comparison.minus)
+    return _contrast(jumps, weights, name, comparison, comparison.sides, tuple(robots))
 
 
 def own_and_other(jumps: Jumps, name: str, comparison: ComparisonConfig) -> list[ComparedArms]:
@@ -638,11 +643,13 @@ def _contrast(
         words: What is compared, and against what.
         robots: Names of the robots.
     """
+    commands = comparison.command_names
     cells_by_arm: dict[str, list[WeightedCell]] = {}
     for (arm, robot), weight in weights.items():
         values = {}
         for seed, runs in jumps[arm, robot].items():
-            values[seed] = values_by_command(runs, comparison.outcome)
+            counted = [run for run in runs if not commands or run.case in commands]
+            values[seed] = values_by_command(counted, comparison.outcome)
         cells_by_arm.setdefault(arm, []).append(WeightedCell(weight=weight, seeds=values))
     is_share = OUTCOMES[comparison.outcome].is_share
     estimate = contrast_interval(list(cells_by_arm.values()), is_share=is_share)
@@ -652,6 +659,7 @@ def _contrast(
         arm=words[0],
         against=words[1],
         robots=robots,
+        commands=commands,
         value=estimate.value,
         low=estimate.low,
         high=estimate.high,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -59,23 +60,36 @@ class OutcomeCell:
         return sum(math.isfinite(value) for value in values)
 
 
+def compared_outcome(outcome: str, commands: Sequence[str]) -> str:
+    """Return the words for an outcome of some commands; all if empty."""
+    return f"{outcome}, {', '.join(commands)}" if commands else outcome
+
+
 @dataclass(frozen=True, kw_only=True)
 class ComparedArms:
-    """The difference of two arms in one outcome, as the study's file asked for it."""
+    """The difference of arms in one outcome, as the study's file asked for it."""
 
     name: str
     outcome: str
     arm: str
+    """The arm, or the words for several."""
     against: str
     robots: tuple[str, ...]
+    commands: tuple[str, ...] = ()
+    """Names of the commands that count; empty for all of the trial."""
     value: float = math.nan
-    """Mean of the arm less that of the other, in the unit of the outcome; of a share -1 to 1."""
+    """Mean of one side less that of the other, in the unit of the outcome; of a share -1 to 1."""
     low: float = math.nan
     high: float = math.nan
     seeds: tuple[int, ...] = ()
     """Number of seeds of each arm that has a part in it."""
     primary: bool = False
     """True for a question that the study was made to answer."""
+
+    @property
+    def outcome_words(self) -> str:
+        """The outcome, and the commands if not all of them count."""
+        return compared_outcome(self.outcome.replace("_", " "), self.commands)
 
     @property
     def verdict(self) -> str:
@@ -233,7 +247,7 @@ def comparison_table(results: StudyResults) -> Table:
             (
                 "primary" if comparison.primary else "secondary",
                 comparison.name,
-                OUTCOMES[comparison.outcome].label,
+                compared_outcome(OUTCOMES[comparison.outcome].label, comparison.commands),
                 f"{comparison.arm} less {comparison.against}",
                 robots,
                 estimate_text(

@@ -3,7 +3,7 @@
 An arm is a way to train, by its gains and options; each arm is trained from every seed. The folder
 of a study holds
 
-    inputs/                  copies of the gains, named by their content
+    inputs/                  copies of gains and recipes, named by their content
     trainings/ARM/seed-N/    the folder of one run, as `pronk train` writes it
     logs/, state.json        what each task printed, and which are done
     trainings.json           every training, and the spread over seeds of each arm
@@ -23,7 +23,7 @@ from typing import Any
 from pronk.errors import PronkError
 from pronk.files import sha256, write_text
 from pronk.jump.study.schedule import TaskStatus
-from pronk.jump.study.tasks import StudyTask, copied_input
+from pronk.jump.study.tasks import StudyTask, copied_input, written_input
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.training_progress import read_progress
@@ -142,18 +142,18 @@ def check_arm(arm: TrainingArm) -> None:
         PronkError: The gains, the recipe or the phases are impossible.
     """
     from pronk.jump.train.gains import gains_of
-    from pronk.jump.train.recipe import load_recipe
+    from pronk.jump.train.recipe import load_recipes
     from pronk.robots import load_robot
 
     settings = replace(arm.settings, seed=0).completed()
-    if settings.recipe is not None and importlib.util.find_spec("mjlab") is not None:
+    if settings.recipe and importlib.util.find_spec("mjlab") is not None:
         from pronk.jump.train.run import check_training
 
         check_training(settings)
         return
     gains_of(settings, load_robot(str(settings.robot)))
-    if settings.recipe is not None:
-        load_recipe(settings.recipe)
+    if settings.recipe:
+        load_recipes(settings.recipe)
 
 
 def training_tasks(
@@ -187,10 +187,10 @@ def training_tasks(
                 settings = replace(settings, ranges_from=Path(copy))
             else:
                 settings = replace(settings, gains=copy)
-        if settings.recipe is not None:
-            copy = copied_input(root, settings.recipe, "recipe")
+        if settings.recipe:
+            copy = _recipe_input(root, settings.recipe)
             inputs.append(copy)
-            settings = replace(settings, recipe=Path(copy))
+            settings = replace(settings, recipe=(Path(copy),))
         if settings.init_checkpoint is not None:
             checkpoint = settings.init_checkpoint
             if checkpoint.is_dir():
@@ -204,6 +204,15 @@ def training_tasks(
         for arm, arm_inputs in prepared:
             tasks.append(_training_task(arm, seed, arm_inputs, place))
     return tasks
+
+
+def _recipe_input(root: Path, recipe: Sequence[Path]) -> str:
+    """Copy a recipe to the inputs, several layers merged to one file; return its path there."""
+    from pronk.jump.train.recipe import load_recipes, recipe_text
+
+    if len(recipe) == 1:
+        return copied_input(root, recipe[0], "recipe")
+    return written_input(root, recipe_text(load_recipes(recipe)).encode(), "recipe", ".yaml")
 
 
 def _training_task(

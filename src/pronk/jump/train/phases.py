@@ -224,6 +224,9 @@ class Curriculum:
             if name in phase.weights:
                 term.weight = _between(phase.weights[name], done)
             term.params.update(self._params[name])
+            if "jump_scale" not in self._params[name]:
+                # That of the phase before.
+                term.params.pop("jump_scale", None)
             if name in phase.jump_scales:
                 term.params["jump_scale"] = _between(phase.jump_scales[name], done)
         command = motion_command(env)

@@ -3,7 +3,7 @@
 params/env.yaml, params/agent.yaml   every setting, as mjlab writes them
 provenance.json                      settings, sessions, figures of each phase
 gains.yaml                           copy of the gains, where the run has a file of gains
-recipe.yaml                          copy of the recipe, where the run has one
+recipe.yaml                          copy of the recipe, where the run has one; of several, merged
 model_*.pt, PHASE.pt                 checkpoints
 events.out.*                         TensorBoard
 train.log                            what mjlab, Warp and rsl_rl print
@@ -48,7 +48,7 @@ class RunFolder:
 
     @property
     def recipe(self) -> Path:
-        """The copy of the recipe."""
+        """The copy of the recipe, or what several were merged to."""
         return self.path / "recipe.yaml"
 
     def checkpoint(self) -> Path:

@@ -10,19 +10,27 @@
       late_s: 0.25
 
 What a recipe does not name stays as the task has it. `pronk train --recipe FILE` applies it to the
-configuration of any robot's task, after the robot's own changes.
+configuration of any robot's task, after the robot's own changes. Several files are layers of one
+recipe: a later one takes precedence phase by phase in each term, and number by number in `jump`.
+The merged recipe has the same schema, and names its files:
+
+    layers:
+    - {file: forward.yaml, sha256: ...}
+    - {file: landing.yaml, sha256: ...}
 """
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
+import yaml
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import read_yaml, sha256
@@ -31,6 +39,8 @@ from pronk.jump.train.phases import PHASES, Span
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
+
+    from pronk.jump.train.mdp.jump import JumpSettings
 
 SCHEMA = "pronk/recipe/1"
 SPEED_ADDED = "speed_added"
@@ -45,6 +55,19 @@ Spans = Mapping[str, Mapping[str, Span]]
 """Values at the beginning and at the end of a phase, by term and phase."""
 
 
+Section = Literal["rewards", "jump_scales", "jump"]
+"""Section of a file with names of terms or numbers."""
+
+
+class RecipeLayer(msgspec.Struct, kw_only=True, frozen=True, forbid_unknown_fields=True):
+    """A file that a merged recipe is made of."""
+
+    file: str
+    """Name without its folder."""
+    sha256: str
+    """Hash of the file."""
+
+
 class _File(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Content of a file."""
 
@@ -52,6 +75,7 @@ class _File(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     rewards: dict[str, _Value] = {}
     jump_scales: dict[str, _Value] = {}
     jump: dict[str, float] = {}
+    layers: tuple[RecipeLayer, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +89,13 @@ class Recipe:
     jump: Mapping[str, float] = field(default_factory=dict)
     """Fields of `JumpSettings`, `SPEED_ADDED` and `GUIDANCE_SWEEP`."""
     source: str = ""
-    """The file, for messages."""
+    """The file, or all files that were merged, for messages."""
     sha256: str = ""
-    """Hash of the file."""
+    """Hash of the file; of a merged recipe that of its `recipe_text`."""
+    layers: tuple[RecipeLayer, ...] = ()
+    """The files of a merged recipe, the first one first; empty otherwise."""
+    parts: tuple[Recipe, ...] = field(default=(), compare=False)
+    """The recipes that were merged, for messages; empty if it was read from one file."""
 
     @property
     def removed(self) -> tuple[str, ...]:
@@ -79,15 +107,41 @@ class Recipe:
                 names.append(name)
         return tuple(names)
 
+    @property
+    def files(self) -> tuple[RecipeLayer, ...]:
+        """All files that it is made of, with their hashes."""
+        if self.layers:
+            return self.layers
+        return (RecipeLayer(file=Path(self.source).name, sha256=self.sha256),)
+
+    def has_name(self, section: Section, name: str) -> bool:
+        """Return whether a section names a term or a number."""
+        names: dict[Section, Mapping[str, Any]] = {
+            "rewards": self.weights,
+            "jump_scales": self.jump_scales,
+            "jump": self.jump,
+        }
+        return name in names[section]
+
+    def source_of(self, section: Section, name: str) -> str:
+        """Return the file whose value of a term or a number holds: the last one that names it."""
+        for part in reversed(self.parts):
+            if part.has_name(section, name):
+                return part.source
+        return self.source
+
     def record(self) -> dict[str, Any]:
         """Return what the provenance of a run holds of the recipe."""
-        return {
-            "file": Path(self.source).name,
+        record: dict[str, Any] = {
+            "file": " + ".join(layer.file for layer in self.files),
             "sha256": self.sha256,
             "weights": _plain(self.weights),
             "jump_scales": _plain(self.jump_scales),
             "jump": dict(self.jump),
         }
+        if self.layers:
+            record["layers"] = [msgspec.to_builtins(layer) for layer in self.layers]
+        return record
 
 
 def load_recipe(path: Path) -> Recipe:
@@ -113,7 +167,112 @@ def load_recipe(path: Path) -> Recipe:
         jump=_numbers(file.jump, f"{path}: jump"),
         source=str(path),
         sha256=sha256(path),
+        layers=file.layers,
     )
+
+
+def load_recipes(paths: Sequence[Path]) -> Recipe:
+    """Read a recipe of one file or of several layers, the first one first.
+
+    Raises:
+        ArtefactError: A file is missing, or is no recipe.
+    """
+    return merge_recipes([load_recipe(path) for path in paths])
+
+
+def merge_recipes(recipes: Sequence[Recipe]) -> Recipe:
+    """Merge recipes; later ones take precedence in each phase of a term and each number of `jump`.
+
+    Args:
+        recipes: One or more. A single one is returned as it is.
+    """
+    if len(recipes) == 1:
+        return recipes[0]
+    weights: dict[str, dict[str, Span]] = {}
+    jump_scales: dict[str, dict[str, Span]] = {}
+    jump: dict[str, float] = {}
+    layers: list[RecipeLayer] = []
+    for recipe in recipes:
+        _update_spans(weights, recipe.weights)
+        _update_spans(jump_scales, recipe.jump_scales)
+        jump.update(recipe.jump)
+        layers += recipe.files
+    merged = Recipe(
+        weights=weights,
+        jump_scales=jump_scales,
+        jump=jump,
+        source=", ".join(recipe.source for recipe in recipes),
+        layers=tuple(layers),
+        parts=tuple(recipes),
+    )
+    return replace(merged, sha256=hashlib.sha256(recipe_text(merged).encode()).hexdigest())
+
+
+def _update_spans(spans: dict[str, dict[str, Span]], changes: Spans) -> None:
+    """Take over values by term and phase; other phases of these terms stay."""
+    for name, by_phase in changes.items():
+        spans.setdefault(name, {}).update(by_phase)
+
+
+def recipe_text(recipe: Recipe) -> str:
+    """Return a merged recipe as the text of a file, which `load_recipe` reads.
+
+    Files of the same names and content give the same text, wherever they lie.
+    """
+    body = {
+        "schema": SCHEMA,
+        "rewards": _file_values(recipe.weights),
+        "jump_scales": _file_values(recipe.jump_scales),
+        "jump": {name: _file_number(value) for name, value in recipe.jump.items()},
+        "layers": [_OneLineDict(msgspec.to_builtins(layer)) for layer in recipe.layers],
+    }
+    comment = (
+        "# Merged by pronk train from the files in layers; a later one takes precedence in each\n"
+        "# phase of a term. Leave layers out of a copy that you change.\n"
+    )
+    return comment + yaml.dump(
+        body, Dumper=_RecipeDumper, sort_keys=False, width=10_000, allow_unicode=True
+    )
+
+
+class _OneLineDict(dict[str, Any]):
+    """A dictionary on one line of YAML."""
+
+
+class _RecipeDumper(yaml.SafeDumper):
+    """Writer of recipes."""
+
+
+def _represent_dict(dumper: yaml.SafeDumper, entry: _OneLineDict) -> yaml.Node:
+    return dumper.represent_mapping("tag:yaml.org,2002:map", entry.items(), flow_style=True)
+
+
+_RecipeDumper.add_representer(_OneLineDict, _represent_dict)
+
+
+def _file_values(spans: Spans) -> dict[str, Any]:
+    """Return values by term and phase as a file has them, phases in their order."""
+    values: dict[str, Any] = {}
+    for name, by_phase in spans.items():
+        ordered = [by_phase[phase] for phase in PHASES if phase in by_phase]
+        first = ordered[0] if ordered else (0.0, 0.0)
+        if len(ordered) == len(PHASES) and set(ordered) == {(first[0], first[0])}:
+            values[name] = _file_number(first[0])
+            continue
+        entry = _OneLineDict()
+        for phase in PHASES:
+            if phase in by_phase:
+                start, end = by_phase[phase]
+                numbers = [_file_number(start), _file_number(end)]
+                entry[phase] = numbers[0] if start == end else numbers
+        values[name] = entry
+    return values
+
+
+def _file_number(value: float) -> float:
+    """Return a number as a file has it: 16 and not 16.0."""
+    is_short = value.is_integer() and abs(value) < 2.0**53
+    return int(value) if is_short else value
 
 
 def apply_recipe(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
@@ -131,12 +290,16 @@ def apply_recipe(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
 
     candidates = candidate_terms()
     known = [*cfg.rewards, *candidates]
-    for section, names in (("rewards", recipe.weights), ("jump_scales", recipe.jump_scales)):
+    sections: tuple[tuple[Section, Spans], ...] = (
+        ("rewards", recipe.weights),
+        ("jump_scales", recipe.jump_scales),
+    )
+    for section, names in sections:
         for name in names:
             if name not in known:
                 raise ArtefactError(
-                    f"{recipe.source}: {section} has no term {name!r}; the terms are "
-                    f"{', '.join(known)}."
+                    f"{recipe.source_of(section, name)}: {section} has no term {name!r}; the terms "
+                    f"are {', '.join(known)}."
                 )
     for name in recipe.weights:
         if name in candidates and name not in cfg.rewards and name not in recipe.removed:
@@ -145,8 +308,8 @@ def apply_recipe(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
         if name not in cfg.rewards or not _has_jump_scale(cfg.rewards[name].func):
             scaled = [name for name, term in cfg.rewards.items() if _has_jump_scale(term.func)]
             raise ArtefactError(
-                f"{recipe.source}: the term {name!r} has no jump_scale here; those that have one "
-                f"are {', '.join(scaled)}."
+                f"{recipe.source_of('jump_scales', name)}: the term {name!r} has no jump_scale "
+                f"here; those that have one are {', '.join(scaled)}."
             )
     for name in recipe.removed:
         cfg.rewards.pop(name, None)
@@ -168,13 +331,35 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     for name in settings:
         if name not in names:
             raise ArtefactError(
-                f"{recipe.source}: jump has no number {name!r}; the numbers are "
+                f"{recipe.source_of('jump', name)}: jump has no number {name!r}; the numbers are "
                 f"{', '.join([*names, SPEED_ADDED, GUIDANCE_SWEEP])}."
             )
     try:
         command.settings = replace(command.settings, **settings)
     except PronkError as error:
-        raise ArtefactError(f"{recipe.source}: jump: {error}") from None
+        source = _source_of_bad_jump(recipe, command.settings)
+        raise ArtefactError(f"{source}: jump: {error}") from None
+
+
+def _source_of_bad_jump(recipe: Recipe, settings: JumpSettings) -> str:
+    """Return the file with which the numbers of a recipe ceased to make a jump.
+
+    Numbers may be impossible together only, so each layer is added to those before it. One that a
+    later layer mends is not meant.
+    """
+    source = ""
+    numbers: dict[str, float] = {}
+    for part in recipe.parts:
+        numbers.update(part.jump)
+        numbers.pop(SPEED_ADDED, None)
+        numbers.pop(GUIDANCE_SWEEP, None)
+        try:
+            replace(settings, **numbers)
+        except PronkError:
+            source = source or part.source
+        else:
+            source = ""
+    return source or recipe.source
 
 
 def _has_jump_scale(func: Callable[..., Any]) -> bool:

@@ -15,12 +15,18 @@ import torch
 from mjlab.scripts.train import TrainConfig, run_train
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.files import sha256, written_whole
+from pronk.files import sha256, write_text, written_whole
 from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, gains_of, training_gains
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
-from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe
+from pronk.jump.train.recipe import (
+    Recipe,
+    apply_recipe,
+    load_recipe,
+    load_recipes,
+    recipe_text,
+)
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import JumpRunnerCfg
 from pronk.jump.train.settings import TrainSettings
@@ -86,7 +92,7 @@ def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | Non
     """
     task = load_task(str(settings.robot))
     gains = gains_of(settings, task.robot)
-    recipe = None if settings.recipe is None else load_recipe(settings.recipe)
+    recipe = load_recipes(settings.recipe) if settings.recipe else None
     _env_cfg(task, gains, settings, recipe)
     return gains, recipe
 
@@ -102,9 +108,11 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     if gains_file is not None:
         with written_whole(folder.gains) as temporary_path:
             shutil.copyfile(gains_file, temporary_path)
-    if settings.recipe is not None:
+    if recipe is not None and len(settings.recipe) > 1:
+        write_text(folder.recipe, recipe_text(recipe))
+    elif settings.recipe:
         with written_whole(folder.recipe) as temporary_path:
-            shutil.copyfile(settings.recipe, temporary_path)
+            shutil.copyfile(settings.recipe[0], temporary_path)
     start_sha256 = ""
     if start is not None:
         checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
@@ -232,7 +240,9 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
             gains_text += f" (NO MATCH of {', '.join(gains['unmatched'])})"
     if settings.draws.by_joint:
         gains_text += " by joint"
-    recipe_text = "" if settings.recipe is None else f", recipe {settings.recipe}"
+    recipe_words = ""
+    if settings.recipe:
+        recipe_words = f", recipe {' + '.join(map(str, settings.recipe))}"
     device_text = "cpu"
     if len(gpus) == 1:
         device_text = "cuda"
@@ -240,7 +250,7 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
         device_text = f"each of {len(gpus)} GPUs"
     return (
         f"training {settings.task} of {settings.robot}: {', '.join(phases)} iterations, "
-        f"{settings.envs} robots on {device_text}, {gains_text}{recipe_text}, seed "
+        f"{settings.envs} robots on {device_text}, {gains_text}{recipe_words}, seed "
         f"{settings.seed}; run folder {settings.out}"
     )
 

@@ -91,8 +91,9 @@ class TrainSettings:
     phase: tuple[str, ...] = ()
     """PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."""
     draws: Annotated[DrawSettings, tyro.conf.arg(name="")] = field(default_factory=DrawSettings)
-    recipe: Path | None = None
-    """YAML file with changed weights of rewards, as those in examples/recipes."""
+    recipe: tuple[Path, ...] = ()
+    """YAML file with changed weights of rewards, as those in examples/recipes. Repeat it for
+    layers: what a later file names takes precedence, phase by phase."""
     devices: Annotated[DeviceSettings, tyro.conf.arg(name="")] = field(
         default_factory=DeviceSettings
     )
@@ -124,6 +125,10 @@ class TrainSettings:
             raise PronkError(
                 f"--init-checkpoint {self.init_checkpoint} goes with jump; {self.task} begins with "
                 "random weights."
+            )
+        if len(set(self.recipe)) != len(self.recipe):
+            raise PronkError(
+                f"--recipe {', '.join(map(str, self.recipe))}: one is given twice; once is enough."
             )
         _ = self.iterations  # checks the phases
 
@@ -205,10 +210,10 @@ class TrainSettings:
             is_given = value is not None and value != []
             stored_value = stored.get(name)
             if is_given and value != stored_value:
-                stored_text = "none" if stored_value is None else stored_value
                 raise PronkError(
-                    f"--resume: --{name.replace('_', '-')} is {value}, but the run in {self.out} "
-                    f"has {stored_text}; leave it out to continue that run, or give a new --out."
+                    f"--resume: --{name.replace('_', '-')} is {_option_text(value)}, but the run "
+                    f"in {self.out} has {_option_text(stored_value)}; leave it out to continue "
+                    "that run, or give a new --out."
                 )
         return replace(
             self,
@@ -226,7 +231,7 @@ class TrainSettings:
                 by_joint=stored.get("by_joint", False),
                 weakest_drive=stored.get("weakest_drive", 1.0),
             ),
-            recipe=_optional_path(stored.get("recipe")),
+            recipe=_recipe_files(stored.get("recipe")),
             allow_unmatched=stored.get("allow_unmatched", False),
             phase=tuple(stored["phase"]),
         )
@@ -244,15 +249,39 @@ class TrainSettings:
             "ellipsoid": self.draws.ellipsoid,
             "by_joint": self.draws.by_joint,
             "weakest_drive": self.draws.weakest_drive,
-            "recipe": _optional_text(self.recipe),
+            "recipe": self._stored_recipe(),
             "allow_unmatched": self.allow_unmatched,
             "phase": list(self.phase),
         }
+
+    def _stored_recipe(self) -> str | list[str] | None:
+        """Return the file of the recipe, as earlier versions stored it, or several files."""
+        files = [str(path) for path in self.recipe]
+        if len(files) > 1:
+            return files
+        return files[0] if files else None
 
 
 def _optional_path(text: str | None) -> Path | None:
     """Return a path, or None where there is none."""
     return None if text is None else Path(text)
+
+
+def _recipe_files(stored: str | list[str] | None) -> tuple[Path, ...]:
+    """Return the files of the recipe of a run."""
+    if stored is None:
+        return ()
+    files = [stored] if isinstance(stored, str) else stored
+    return tuple(Path(file) for file in files)
+
+
+def _option_text(value: Any) -> str:
+    """Return the value of an option for a message; several with commas between them."""
+    if value is None or value == []:
+        return "none"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return str(value)
 
 
 def _optional_text(path: Path | None) -> str | None:
