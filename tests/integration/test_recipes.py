@@ -69,6 +69,12 @@ def test_a_candidate_is_added_only_where_it_has_a_weight(tmp_path: Path) -> None
     assert cfg.rewards["liftoff_angle"].weight == 0.0, "the phase gives it its weight"
 
 
+def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
+    before = config(8, training_gains("naive", ROBOT)).actions["joint_position"].scale
+    cfg = task("task: {action_scale: 0.42}", tmp_path)
+    assert cfg.actions["joint_position"].scale == 0.42 != before
+
+
 def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1}"
     command = task(text, tmp_path).commands[COMMAND]
@@ -87,10 +93,12 @@ def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
         ("rewards: {posture: {walk: [1, 2, 3]}}", "rewards"),
         ("rewards: {posture: fast}", "rewards"),
         ("rewards: {posture: .nan}", "finite"),
-        ("weights: {posture: 1}", "weights|rewards, jump_scales and jump"),
+        ("weights: {posture: 1}", "weights|rewards, jump_scales, jump and task"),
         ("jump: {height: 3}", "'height'|late_s|speed_added|guidance_sweep"),
         ("jump: {late_s: 0}", "late_s"),
         ("jump: {ready_s: 3}", "ready_s"),
+        ("task: {scale: 3}", "'scale'|action_scale"),
+        ("task: {action_scale: 0}", "action_scale|more than 0"),
     ],
 )
 def test_what_there_is_not_is_refused_with_what_there_is(
@@ -182,13 +190,13 @@ def test_the_shipped_recipes_apply(path: Path) -> None:
     base = path.with_name("forward.yaml")
     layers = [base] if path == base else [base, path]
     cfg = config(8, training_gains("naive", ROBOT))
-    before = repr((list(cfg.rewards), cfg.commands, PHASES))
+    before = repr((list(cfg.rewards), cfg.commands, cfg.actions, PHASES))
     if path != base:
         below = config(8, training_gains("naive", ROBOT))
         apply_recipe(below, load_recipe(base))
-        before = repr((list(below.rewards), below.commands, phases_of(below)))
+        before = repr((list(below.rewards), below.commands, below.actions, phases_of(below)))
     apply_recipe(cfg, load_recipes(layers))
-    assert repr((list(cfg.rewards), cfg.commands, phases_of(cfg))) != before
+    assert repr((list(cfg.rewards), cfg.commands, cfg.actions, phases_of(cfg))) != before
     assert path.read_text().startswith("# ")
     for phase in phases_of(cfg).values():
         weights = {name: (term.weight,) for name, term in cfg.rewards.items()}

@@ -45,6 +45,7 @@ RECIPES = st.builds(
     weights=TERMS,
     jump_scales=TERMS,
     jump=st.dictionaries(st.sampled_from(["late_s", "speed_added", "ready_s"]), NUMBERS),
+    task=st.dictionaries(st.just("action_scale"), NUMBERS),
     source=st.sampled_from(["a/first.yaml", "b/zwei.yaml", "c/# three: 3.yaml"]),
     sha256=st.sampled_from(["0" * 64, "1e" * 32]),
 )
@@ -56,6 +57,7 @@ def content(recipe: Recipe) -> Any:
         list(recipe.weights.items()),
         list(recipe.jump_scales.items()),
         list(recipe.jump.items()),
+        list(recipe.task.items()),
     )
 
 

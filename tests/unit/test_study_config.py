@@ -242,6 +242,19 @@ def test_the_study_of_the_examples_is_as_large_as_it_says() -> None:
         assert (path.parent / robot.sim_params).is_file()
 
 
+@pytest.mark.parametrize("name", ["recipes.yaml", "go2/study.yaml"])
+def test_a_study_of_recipes_is_balanced(name: str) -> None:
+    """Sixteen trainings; a comparison has all of them, half on each side."""
+    path = Path(__file__).parents[2] / "examples" / "studies" / name
+    config = load_study(path)
+    assert len(config.arms) * len(config.seed_numbers) == 16
+    for comparison in config.comparisons.values():
+        assert len(comparison.arm) == len(comparison.against) == len(config.arms) / 2
+        assert {*comparison.arm, *comparison.against} == set(config.arms)
+    for arm in config.arms.values():
+        assert (path.parent / arm.gains).is_file()
+
+
 def test_configurations_are_checked_when_they_are_built() -> None:
     for build in (
         lambda: ArmConfig(),

@@ -8,10 +8,13 @@
       orientation: 1
     jump:                         # fields of `JumpSettings`, `speed_added`, `guidance_sweep`
       late_s: 0.25
+    task:                         # `action_scale`
+      action_scale: 0.42
 
 What a recipe does not name stays as the task has it. `pronk train --recipe FILE` applies it to the
 configuration of any robot's task, after the robot's own changes. Several files are layers of one
-recipe: a later one takes precedence phase by phase in each term, and number by number in `jump`.
+recipe: a later one takes precedence phase by phase in each term, and number by number in `jump`
+and `task`.
 The merged recipe has the same schema, and names its files:
 
     layers:
@@ -48,6 +51,9 @@ SPEED_ADDED = "speed_added"
 rewarded for in jump mode (`MotionCommandCfg.jump_speed_added`) [m/s]."""
 GUIDANCE_SWEEP = "guidance_sweep"
 """Another one: `MotionCommandCfg.guidance_sweep`."""
+ACTION_SCALE = "action_scale"
+"""Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
+which a policy explores, is in units of it."""
 
 _Value = float | dict[str, float | tuple[float, float]]
 """A number, or one by phase: a number, or its values at the beginning and at the end."""
@@ -55,7 +61,7 @@ Spans = Mapping[str, Mapping[str, Span]]
 """Values at the beginning and at the end of a phase, by term and phase."""
 
 
-Section = Literal["rewards", "jump_scales", "jump"]
+Section = Literal["rewards", "jump_scales", "jump", "task"]
 """Section of a file with names of terms or numbers."""
 
 
@@ -75,6 +81,7 @@ class _File(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     rewards: dict[str, _Value] = {}
     jump_scales: dict[str, _Value] = {}
     jump: dict[str, float] = {}
+    task: dict[str, float] = {}
     layers: tuple[RecipeLayer, ...] = ()
 
 
@@ -88,6 +95,8 @@ class Recipe:
     """Factors of the weights in jump mode, likewise."""
     jump: Mapping[str, float] = field(default_factory=dict)
     """Fields of `JumpSettings`, `SPEED_ADDED` and `GUIDANCE_SWEEP`."""
+    task: Mapping[str, float] = field(default_factory=dict)
+    """`ACTION_SCALE`."""
     source: str = ""
     """The file, or all files that were merged, for messages."""
     sha256: str = ""
@@ -120,6 +129,7 @@ class Recipe:
             "rewards": self.weights,
             "jump_scales": self.jump_scales,
             "jump": self.jump,
+            "task": self.task,
         }
         return name in names[section]
 
@@ -138,6 +148,7 @@ class Recipe:
             "weights": _plain(self.weights),
             "jump_scales": _plain(self.jump_scales),
             "jump": dict(self.jump),
+            "task": dict(self.task),
         }
         if self.layers:
             record["layers"] = [msgspec.to_builtins(layer) for layer in self.layers]
@@ -158,13 +169,14 @@ def load_recipe(path: Path) -> Recipe:
         file = msgspec.convert(body, _File)
     except msgspec.ValidationError as error:
         raise ArtefactError(
-            f"{path}: {error}; expected sections rewards, jump_scales and jump, with numbers, or "
-            "numbers by phase, as in {jump_a: 16, jump_b: [16, 10]}."
+            f"{path}: {error}; expected sections rewards, jump_scales, jump and task, with "
+            "numbers, or numbers by phase, as in {jump_a: 16, jump_b: [16, 10]}."
         ) from None
     return Recipe(
         weights=_spans(file.rewards, f"{path}: rewards"),
         jump_scales=_spans(file.jump_scales, f"{path}: jump_scales"),
         jump=_numbers(file.jump, f"{path}: jump"),
+        task=_numbers(file.task, f"{path}: task"),
         source=str(path),
         sha256=sha256(path),
         layers=file.layers,
@@ -181,7 +193,7 @@ def load_recipes(paths: Sequence[Path]) -> Recipe:
 
 
 def merge_recipes(recipes: Sequence[Recipe]) -> Recipe:
-    """Merge recipes; later ones take precedence in each phase of a term and each number of `jump`.
+    """Merge recipes; later ones take precedence in each phase of a term and in each number.
 
     Args:
         recipes: One or more. A single one is returned as it is.
@@ -191,16 +203,19 @@ def merge_recipes(recipes: Sequence[Recipe]) -> Recipe:
     weights: dict[str, dict[str, Span]] = {}
     jump_scales: dict[str, dict[str, Span]] = {}
     jump: dict[str, float] = {}
+    task: dict[str, float] = {}
     layers: list[RecipeLayer] = []
     for recipe in recipes:
         _update_spans(weights, recipe.weights)
         _update_spans(jump_scales, recipe.jump_scales)
         jump.update(recipe.jump)
+        task.update(recipe.task)
         layers += recipe.files
     merged = Recipe(
         weights=weights,
         jump_scales=jump_scales,
         jump=jump,
+        task=task,
         source=", ".join(recipe.source for recipe in recipes),
         layers=tuple(layers),
         parts=tuple(recipes),
@@ -224,6 +239,7 @@ def recipe_text(recipe: Recipe) -> str:
         "rewards": _file_values(recipe.weights),
         "jump_scales": _file_values(recipe.jump_scales),
         "jump": {name: _file_number(value) for name, value in recipe.jump.items()},
+        "task": {name: _file_number(value) for name, value in recipe.task.items()},
         "layers": [_OneLineDict(msgspec.to_builtins(layer)) for layer in recipe.layers],
     }
     comment = (
@@ -284,7 +300,7 @@ def apply_recipe(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
 
     Raises:
         ArtefactError: It names a term or a number that there is none of, or its numbers make no
-            jump.
+            jump or no action.
     """
     from pronk.jump.train.tasks.reward_weights import candidate_terms
 
@@ -314,6 +330,7 @@ def apply_recipe(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     for name in recipe.removed:
         cfg.rewards.pop(name, None)
     _change_jump(cfg, recipe)
+    _change_task(cfg, recipe)
     changes = {"weights": _plain(recipe.weights), "jump_scales": _plain(recipe.jump_scales)}
     cfg.curriculum[PHASES_NAME].params["changes"] = changes
 
@@ -339,6 +356,23 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     except PronkError as error:
         source = _source_of_bad_jump(recipe, command.settings)
         raise ArtefactError(f"{source}: jump: {error}") from None
+
+
+def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
+    """Change the scale of the actions."""
+    from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
+
+    action = cfg.actions[NAME]
+    assert isinstance(action, DelayedJointPositionActionCfg)
+    for name, value in recipe.task.items():
+        source = recipe.source_of("task", name)
+        if name != ACTION_SCALE:
+            raise ArtefactError(
+                f"{source}: task has no number {name!r}; the only one is {ACTION_SCALE}."
+            )
+        if not value > 0.0:
+            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected more than 0 rad.")
+        action.scale = value
 
 
 def _source_of_bad_jump(recipe: Recipe, settings: JumpSettings) -> str:
