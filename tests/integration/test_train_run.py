@@ -250,3 +250,19 @@ def test_the_reward_rises(tmp_path: Path) -> None:
     runner.learn(30)
     assert statistics.mean(runner.logger.rewbuffer) > first_reward + 1.0
     env.close()
+
+
+def test_the_first_iteration_has_the_weights_of_its_phase(tmp_path: Path) -> None:
+    """The runner replaces mjlab's reward manager, whose weights were those of the phase."""
+    cfg = load_env_cfg("Pronk-Jump-MiniCheetah")
+    cfg.scene.num_envs = 2
+    cfg.curriculum["phases"].params.update(TASKS["together"])
+    learning = load_rl_cfg("Pronk-Jump-MiniCheetah")
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    PronkRunner(env, asdict(learning), str(tmp_path), "cpu")
+    env.unwrapped.curriculum_manager.compute()  # as at the beginning of an iteration
+    weights = {}
+    for name in PHASES["jump_a"].weights:
+        weights[name] = (env.unwrapped.reward_manager.get_term_cfg(name).weight,) * 2
+    assert weights == PHASES["jump_a"].weights
+    env.close()

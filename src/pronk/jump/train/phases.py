@@ -178,6 +178,10 @@ class Curriculum:
             self._weights[name] = term.weight
             self._params[name] = dict(term.params)
 
+    def restart(self) -> None:
+        """Set the phase again when next called, as a reward manager that was replaced needs it."""
+        self._iteration = -1
+
     @property
     def total(self) -> int:
         """Number of iterations of all phases."""

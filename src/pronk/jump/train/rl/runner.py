@@ -82,6 +82,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         """
         StackedRewardManager.install(env.unwrapped)
         self.curriculum = curriculum(env.unwrapped)
+        self.curriculum.restart()
         steps = train_cfg["num_steps_per_env"]
         if steps != self.curriculum.steps_per_iteration:
             raise PronkError(
