@@ -357,3 +357,25 @@ def test_one_accelerometer_reading_that_is_no_number_is_a_fault_and_poisons_no_m
         safety.sensors.observe(once(state, k))
     assert np.isfinite(safety.sensors.force).all()
     assert safety.sensors.lean < 0.2
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.1])
+def test_a_fast_joint_whose_states_arrive_in_bursts_does_not_drift(drift: float) -> None:
+    """Nine of ten states arrive 0.85 periods after the one before, the tenth late.
+
+    The second time the position drifts by 0.1 rad a second, which is found.
+    """
+    history = SensorHistory(12)
+    period = 0.002
+    base = still()
+    largest = 0.0
+    for k in range(5000):
+        t = k * period
+        arrival = period * (k - 0.15 * (k % 10))
+        # Half a second of 2 rad/s one way, and back: a step of 1 rad is monotone in a window.
+        velocity = np.full(12, 2.0 if t % 1.0 < 0.5 else -2.0)
+        position = base.position + 2.0 * (0.5 - abs(t % 1.0 - 0.5)) + drift * t
+        state = replace(base, time=arrival, sequence=k, position=position, velocity=velocity)
+        history.observe(state)
+        largest = max(largest, float(history.slow_drift.max()))
+    assert (largest > LIMITS.sensors.drift) is (drift > 0.0)
