@@ -379,3 +379,17 @@ def test_a_fast_joint_whose_states_arrive_in_bursts_does_not_drift(drift: float)
         history.observe(state)
         largest = max(largest, float(history.slow_drift.max()))
     assert (largest > LIMITS.sensors.drift) is (drift > 0.0)
+
+
+def test_a_count_that_jumps_does_not_make_joints_drift() -> None:
+    """The robot's count of states jumps by 1,000 once, with no pause."""
+    history = SensorHistory(12)
+    base = still()
+    for k in range(3000):
+        t = 0.002 * k
+        velocity = np.full(12, 2.0 if t % 1.0 < 0.5 else -2.0)
+        position = base.position + 2.0 * (0.5 - abs(t % 1.0 - 0.5))
+        sequence = k if k < 1000 else k + 1000
+        state = replace(base, time=t, sequence=sequence, position=position, velocity=velocity)
+        history.observe(state)
+        assert history.slow_drift.max() < LIMITS.sensors.drift, k

@@ -204,13 +204,14 @@ class SensorHistory:
             self.restarts = 0
         self.clock.observe(state.time, state.robot_time)
         self._voltages.append(state.bus_voltage)
-        self._late += seconds - self._period * (state.sequence - before.sequence)
+        states = state.sequence - before.sequence
+        self._late += seconds - self._period * states
         self._late_window.append(self._late)
         self._late_spread = max(self._late_window) - min(self._late_window)
-        states = state.sequence - before.sequence
         if states > 0:
-            excess_s = seconds - states * self._mean_period
-            self._mean_period += min(self._period / PERIOD_AVERAGE_S, 1.0) * excess_s
+            # A count that jumps by far more than was lost would spoil the mean for seconds.
+            excess_s = max(seconds - states * self._mean_period, -LONGEST_GAP_S)
+            self._mean_period += self._period / PERIOD_AVERAGE_S * excess_s
         self._observe_trunk(before, state, seconds)
         self._observe_joints(before, state, seconds)
 
@@ -285,8 +286,8 @@ class SensorHistory:
         over a longer window, of the steps between states that arrived on time, each as long as the
         mean period; its uncertainty is that of one such time. In arrays of 2n entries, entry i
         belongs to the position of joint i and entry n + i to its velocity. `compared` is
-        (`_travel`, position): what should
-        not move while the position, or the velocity, is constant. `_lowest` and `_highest` are its
+        (`_travel`, position): what should not move while the position, or the velocity, is
+        constant. `_lowest` and `_highest` are its
         range since that quantity changed last. Then
 
             moved = _highest - _lowest - uncertainties - offset
@@ -497,8 +498,8 @@ def position_drifts(history: SensorHistory, limits: Limits) -> str:
 
     Rule: `|sum(change of position - velocity dt)|` over half a second, of the states that arrived
     on time, with the mean period as dt and less the uncertainty of a time of arrival, is more than
-    `drift`, 0.035 rad. A drift of
-    both together does not show. Largest: 0.0141 rad in 3.0 h.
+    `drift`, 0.035 rad. A drift of both together does not show. Largest: 0.0141 rad in 3.0 h, before
+    the mean period was taken.
     """
     if (history.slow_drift > limits.sensors.drift).any():
         i = int(np.argmax(history.slow_drift))
