@@ -29,6 +29,7 @@ from pronk.jump.train.recipe import (
     load_recipe,
     load_recipes,
     merge_recipes,
+    recipe_content,
     recipe_text,
 )
 from pronk.jump.train.settings import TrainSettings
@@ -246,3 +247,36 @@ def test_a_study_names_the_layer_of_an_arm_that_is_wrong(tmp_path: Path) -> None
     for word in ("arms.changed", "wrong.yaml", "'run'"):
         assert word in text, word
     assert "base.yaml" not in text
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_a_run_and_a_study_keep_the_same_file(tmp_path: Path, layers: int) -> None:
+    """Whatever the number of files, the copy has the hash that provenance and policy name."""
+    texts = (
+        "rewards: {hop: -2}  # \u00e4",
+        "rewards: {hop: {jump_b: [-1, 0]}}",
+        "jump: {late_s: 0.2}",
+    )
+    paths = []
+    for number, text in enumerate(texts[:layers]):
+        path = tmp_path / f"layer-{number}.yml"
+        # Line ends of another system.
+        path.write_bytes(f"schema: {SCHEMA}\r\n{text}\r\n".encode())
+        paths.append(path)
+    kept = recipe_content(paths)
+    assert hashlib.sha256(kept).hexdigest() == load_recipes(paths).sha256
+    settings = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=tuple(paths))
+    arm = TrainingArm(name="layers", settings=settings)
+    (task,) = training_tasks([arm], [1], tmp_path / "study", TrainingPlace(device="cpu"))
+    (copy,) = task.inputs
+    assert (tmp_path / "study" / copy).read_bytes() == kept
+
+
+def test_no_training_of_a_study_gets_a_file_that_is_no_recipe(tmp_path: Path) -> None:
+    path = tmp_path / "gains.yaml"
+    path.write_text("schema: pronk/gains/2\n")
+    settings = TrainSettings(task="all", out=tmp_path, gains="naive", recipe=(path,))
+    arm = TrainingArm(name="arm", settings=settings)
+    with pytest.raises(PronkError, match=SCHEMA):
+        training_tasks([arm], [1], tmp_path / "study", TrainingPlace(device="cpu"))
+    assert not (tmp_path / "study").exists()

@@ -172,6 +172,8 @@ def training_tasks(
         root: Folder of the study.
         place: The devices.
     """
+    from pronk.jump.train.recipe import recipe_content
+
     prepared = []
     for arm in arms:
         settings = arm.settings
@@ -188,7 +190,9 @@ def training_tasks(
             else:
                 settings = replace(settings, gains=copy)
         if settings.recipe:
-            copy = _recipe_input(root, settings.recipe)
+            # One name for the merged file; a single file keeps its ending.
+            suffix = settings.recipe[0].suffix if len(settings.recipe) == 1 else ".yaml"
+            copy = written_input(root, recipe_content(settings.recipe), "recipe", suffix)
             inputs.append(copy)
             settings = replace(settings, recipe=(Path(copy),))
         if settings.init_checkpoint is not None:
@@ -204,15 +208,6 @@ def training_tasks(
         for arm, arm_inputs in prepared:
             tasks.append(_training_task(arm, seed, arm_inputs, place))
     return tasks
-
-
-def _recipe_input(root: Path, recipe: Sequence[Path]) -> str:
-    """Copy a recipe to the inputs, several layers merged to one file; return its path there."""
-    from pronk.jump.train.recipe import load_recipes, recipe_text
-
-    if len(recipe) == 1:
-        return copied_input(root, recipe[0], "recipe")
-    return written_input(root, recipe_text(load_recipes(recipe)).encode(), "recipe", ".yaml")
 
 
 def _training_task(

@@ -251,6 +251,20 @@ def recipe_text(recipe: Recipe) -> str:
     )
 
 
+def recipe_content(paths: Sequence[Path]) -> bytes:
+    """Return the one file as which a recipe is kept: a single file as it is, layers merged.
+
+    Its SHA-256 is that of the recipe that `load_recipes` reads from the same files.
+
+    Raises:
+        ArtefactError: A file is missing, or is no recipe.
+    """
+    recipe = load_recipes(paths)
+    if len(paths) == 1:
+        return paths[0].read_bytes()
+    return recipe_text(recipe).encode()
+
+
 class _OneLineDict(dict[str, Any]):
     """A dictionary on one line of YAML."""
 

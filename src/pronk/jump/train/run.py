@@ -15,7 +15,7 @@ import torch
 from mjlab.scripts.train import TrainConfig, run_train
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.files import sha256, write_text, written_whole
+from pronk.files import sha256, written_whole
 from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, gains_of, training_gains
 from pronk.jump.train.phases import STEPS_PER_ITERATION
@@ -25,7 +25,7 @@ from pronk.jump.train.recipe import (
     apply_recipe,
     load_recipe,
     load_recipes,
-    recipe_text,
+    recipe_content,
 )
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import JumpRunnerCfg
@@ -108,11 +108,9 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     if gains_file is not None:
         with written_whole(folder.gains) as temporary_path:
             shutil.copyfile(gains_file, temporary_path)
-    if recipe is not None and len(settings.recipe) > 1:
-        write_text(folder.recipe, recipe_text(recipe))
-    elif settings.recipe:
+    if settings.recipe:
         with written_whole(folder.recipe) as temporary_path:
-            shutil.copyfile(settings.recipe[0], temporary_path)
+            temporary_path.write_bytes(recipe_content(settings.recipe))
     start_sha256 = ""
     if start is not None:
         checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
