@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -283,6 +284,45 @@ def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
     assert evaluation.about["by_joint"] is True
     # A policy of which nothing is recorded is evaluated by group.
     assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is None
+
+
+def test_the_shipped_policy_acts_for_thousands_of_robots(tmp_path: Path) -> None:
+    """As many as `pronk evaluate` has by default, whose layers do not fit in memory at once."""
+    pytest.importorskip("onnxruntime")
+    shipped = Path(__file__).parents[2] / "policies" / "matched" / "policy.onnx"
+    policy = adapter.load_evaluated_policy(shipped, "cpu")
+    count = 14_000
+    torch.manual_seed(3)
+    measured = torch.randn(count, 105)
+    jump = torch.randint(2, (count, 1)).float()
+    obs = TensorDict({"measured": measured, "jump": jump}, [count])
+    contact, velocity = policy.estimate(obs)
+    actions = policy.act(obs)
+    assert (contact.shape, velocity.shape, actions.shape) == ((count, 4), (count, 3), (count, 12))
+    for begin in (0, 6_999, count - 5):
+        part = slice(begin, begin + 5)
+        few = TensorDict({"measured": measured[part], "jump": jump[part]}, [5])
+        assert torch.equal(policy.act(few), actions[part])
+        assert torch.equal(policy.estimate(few)[1], velocity[part])
+
+
+def test_more_robots_than_memory_holds_are_refused(trained: tuple[Path, Any]) -> None:
+    policy = adapter.load_evaluated_policy(trained[0], "cpu")
+    gains = training_gains("naive", ROBOT)
+    plan = replace(SHORT, robots=10**9)
+    if not math.isfinite(adapter.available_memory()):
+        pytest.skip("the free memory of this host is not known")
+    with pytest.raises(PronkError, match="--robots 1000000000") as refusal:
+        adapter.run_evaluation(policy, gains, plan, device="cpu")
+    fitting = int(str(refusal.value).split("--robots ")[-1].split()[0])
+    assert replace(plan, robots=fitting).memory_bytes(DT) <= 2.0 * adapter.available_memory()
+
+
+def test_the_free_memory_of_linux_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "meminfo"
+    file.write_text("MemTotal:  900 kB\nMemFree:  7 kB\nMemAvailable:   512 kB\n")
+    assert adapter.available_memory(file) == 512 * 1024
+    assert math.isinf(adapter.available_memory(tmp_path / "none"))
 
 
 # --- The command ---------------------------------------------------------------------------------

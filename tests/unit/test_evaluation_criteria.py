@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pronk.cli.evaluate import PaceReport
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.trial.criteria import cost_of_jumping, evaluation_checks
 from pronk.jump.trial.results import Spread
@@ -189,3 +190,41 @@ def test_an_evaluation_lasts_as_long_as_its_longest_command() -> None:
     assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
     with pytest.raises(PronkError, match="robots"):
         sim.EvaluationPlan(robot=ROBOT, robots=0)
+
+
+def test_more_robots_and_longer_plans_need_more_memory() -> None:
+    plan = sim.EvaluationPlan(robot=ROBOT, robots=10)
+    assert replace(plan, robots=30).memory_bytes(DT) == pytest.approx(3 * plan.memory_bytes(DT))
+    longer = replace(plan, walk_s=2.0 * plan.walk_s).memory_bytes(DT) - plan.memory_bytes(DT)
+    # Position, orientation, velocities (13 float32), four feet and the rest of the robot (bool).
+    assert longer >= plan.size * (13 * 4 + 5) * plan.walk_s / DT
+
+
+@pytest.mark.parametrize(("step_s", "hours"), [(0.1, 0.0), (10.0, 2.8)])
+def test_an_evaluation_that_takes_long_says_so_once(
+    capsys: pytest.CaptureFixture[str], step_s: float, hours: float
+) -> None:
+    """By the pace of its steps, of which the first compiles and does not count."""
+    now = 0.0
+    shares = []
+
+    def clock() -> float:
+        return now
+
+    pace = PaceReport(lambda stage, share: shares.append(share), 1000, clock)
+    pace("building", 0.0)
+    pace("building", 1.0)
+    now += 1e4
+    for step in range(1000):
+        pace("walking", step / 1000)
+        now += 1e4 if step == 0 else step_s
+    assert len(shares) == 1002
+    text = capsys.readouterr().err
+    if not hours:
+        assert text == ""
+        return
+    assert text.count("--robots") == 1
+    words = text.split()
+    assert float(words[words.index("h") - 1]) == pytest.approx(hours, abs=0.1)
+    robots = int(words[words.index("--robots", words.index("h")) + 1])
+    assert robots == pytest.approx(1000 * 600 / (hours * 3600), abs=2)

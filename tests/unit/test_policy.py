@@ -426,3 +426,58 @@ def test_a_network_that_doubles_a_tensor_is_refused_before_the_memory_is_taken(
     with pytest.raises(ArtefactError):
         load_policy(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak_before < 300 << 10
+
+
+def widened(path: Path, width: int) -> Path:
+    """The same policy with a hidden layer of zeros, of `width` numbers an observation."""
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(path)
+    graph = model.graph
+    node = onnx.helper.make_node
+    graph.node[-1].output[0] = "acted"
+    zeros = np.zeros((1, width), np.float32)
+    graph.initializer.append(onnx.numpy_helper.from_array(zeros, "zeros"))
+    graph.initializer.append(onnx.numpy_helper.from_array(np.array([1]), "axis"))
+    graph.node.append(node("ReduceMax", ["acted", "axis"], ["most"], keepdims=1))
+    graph.node.append(node("Mul", ["most", "zeros"], ["hidden"]))
+    graph.node.append(node("ReduceSum", ["hidden", "axis"], ["nothing"], keepdims=1))
+    graph.node.append(node("Add", ["acted", "nothing"], ["action"]))
+    onnx.save(model, path)
+    return path
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 20_000])
+def test_any_number_of_observations_is_inferred(tmp_path: Path, count: int) -> None:
+    """Each has the outputs that it has alone; their hidden layers are not all there at once."""
+    policy = load_policy(widened(write_policy(tmp_path), 10_000))
+    rng = np.random.default_rng(count)
+    measured = rng.normal(size=(count, MEASURED_SIZE)).astype(np.float32)
+    jump = rng.integers(2, size=(count, 1)).astype(np.float32)
+    inference = policy.infer(measured, jump)
+    assert inference.action.shape == (count, 12)
+    assert inference.contact.shape == (count, 4)
+    assert inference.linear_velocity.shape == (count, 3)
+    expected = np.hstack([measured, jump]) @ WEIGHTS
+    outputs = [inference.action, inference.contact, inference.linear_velocity]
+    assert np.hstack(outputs) == pytest.approx(expected, abs=1e-5)
+    for index in rng.integers(count, size=min(count, 20)):
+        alone = policy.infer(measured[index : index + 1], jump[index : index + 1])
+        assert np.array_equal(alone.action[0], inference.action[index])
+        assert np.array_equal(alone.contact[0], inference.contact[index])
+
+
+def test_a_network_for_one_observation_at_a_time_says_so(tmp_path: Path) -> None:
+    """Its batch axis has a name, but inside it there is one of fixed size."""
+    onnx = pytest.importorskip("onnx")
+    path = write_policy(tmp_path)
+    model = onnx.load(path)
+    graph = model.graph
+    graph.node[-1].output[0] = "acted"
+    graph.initializer.append(onnx.numpy_helper.from_array(np.array([1, 12]), "shape"))
+    graph.node.append(onnx.helper.make_node("Reshape", ["acted", "shape"], ["row"]))
+    graph.node.append(onnx.helper.make_node("Add", ["acted", "row"], ["action"]))
+    onnx.save(model, path)
+    policy = load_policy(path)
+    policy.infer(np.zeros((1, MEASURED_SIZE)))
+    with pytest.raises(ArtefactError, match="5"):
+        policy.infer(np.zeros((5, MEASURED_SIZE)))

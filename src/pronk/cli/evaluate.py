@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import time
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +44,8 @@ class TrainingSimOptions:
     """Draw each joint about its own gains, as `pronk train` does; as the policy was trained if left
     out, about those of its group where that is not known."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """auto: a GPU if there is one. On the CPU take a few robots."""
+    """auto: a GPU if there is one. On the CPU take a few robots: the time grows with their number,
+    and is said once it is known."""
     allow_unmatched: bool = False
     """Also take a gains.yaml with joints that are no match."""
 
@@ -130,9 +133,60 @@ def evaluate_command(
             device=simulation_device,
             randomization=simulated.randomization,
             before=errors_before,
-            progress=report,
+            progress=PaceReport(report, evaluated.robots),
         )
     save_evaluation(out, evaluation)
     for table in evaluation_tables(evaluation):
         console.show(table, wide=wide)
     console.say(f"wrote {out}")
+
+
+class PaceReport:
+    """Progress of an evaluation, with a warning once it is known to take long."""
+
+    LONG_S = 600.0
+    """Time to go beyond which the warning is given [s]."""
+    MEASURED_S = 20.0
+    """Time over which the pace is measured [s]."""
+
+    def __init__(
+        self,
+        report: Callable[[str, float], None],
+        robots: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin without a pace.
+
+        Args:
+            report: Called with the name of a stage and the fraction of it that is over.
+            robots: Robots for each command.
+            clock: The time [s].
+        """
+        self._report = report
+        self._robots = robots
+        self._clock = clock
+        self._start: tuple[str, float, float] | None = None
+        """Stage, fraction and time from which the pace is measured."""
+        self._is_known = False
+
+    def __call__(self, stage: str, share: float) -> None:
+        """Show the fraction of a stage that is over."""
+        self._report(stage, share)
+        now = self._clock()
+        if self._start is None or self._start[0] != stage:
+            # The first step of a stage compiles what it needs, so that the pace begins behind it.
+            self._start = (stage, share, now) if share > 0.0 else None
+            return
+        _, start_share, start_time = self._start
+        seconds = now - start_time
+        if self._is_known or seconds < self.MEASURED_S or share <= start_share:
+            return
+        self._is_known = True
+        left_s = seconds * (1.0 - share) / (share - start_share)
+        if left_s > self.LONG_S:
+            fewer = max(int(self._robots * self.LONG_S / left_s), 1)
+            console.warn(
+                f"about {left_s / 3600.0:.1f} h to go at the pace of the first {seconds:.0f} s, "
+                f"with {self._robots} robots a command; Ctrl-C and --robots {fewer} take about "
+                f"{self.LONG_S / 60.0:.0f} minutes, a GPU less"
+            )

@@ -75,7 +75,7 @@ class EvaluationRun:
     """A plan under way in an environment."""
 
     def __init__(self, env: ManagerBasedRlEnv, plan: EvaluationPlan) -> None:
-        """Prepare, with memory of 58 bytes a robot and sample.
+        """Prepare, with memory of `RECORDED_BYTES` a robot and sample.
 
         Args:
             env: The environment, built with `evaluation_cfg` for the plan.
