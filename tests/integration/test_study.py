@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,12 @@ from pronk.jump.study.config import RandomizationConfig
 from pronk.jump.study.outcomes import OUTCOMES
 from pronk.jump.study.study import randomized_gains, read_trial
 from pronk.jump.study.study_results import load_study_results
-from pronk.jump.study.trainings import spread_over_seeds, training_words
+from pronk.jump.study.trainings import (
+    SPREADS,
+    spread_over_seeds,
+    training_words,
+    trainings_table,
+)
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.trial.condition_trial import run_conditions
 from pronk.jump.trial.conditions import Condition
@@ -74,7 +80,10 @@ def test_every_policy_jumps_on_every_robot(study: Path) -> None:
     (comparison,) = results.comparisons
     heights = {row["arm"]: row["height"] for row in rows if row["robot"] == "shipped"}
     assert comparison.value == float(heights["matched"]) - float(heights["nominal"])
-    assert comparison.verdict == "too few seeds"
+    assert comparison.seeds == (1, 1)
+    assert math.isnan(comparison.low)
+    for arm in ("matched", "nominal"):
+        assert arm in comparison.verdict
     page = (study / "out" / "report.html").read_text()
     assert "a match" in page
     assert "virtual robot" in page
@@ -216,6 +225,28 @@ def test_the_spread_over_seeds_leaves_out_what_is_missing() -> None:
         "n": 2,
     }
     assert spread_over_seeds([{"reward": None}], "reward")["mean"] is None
+
+
+def test_an_arm_with_one_finished_training_is_named_as_without_spread() -> None:
+    figures = {"reward": 3.0, "episode_steps": 4.0, "speed_range": 1.0}
+    rates = {"steps_per_second": 100.0, "seconds": 5.0}
+    arms = []
+    for name, finished in (("whole", 2), ("lone", 1), ("failed", 0)):
+        runs = []
+        for seed in range(2):
+            state = "done" if seed < finished else "failed"
+            runs.append({"seed": seed, "state": state, **figures, **rates})
+        done = runs[:finished]
+        spreads = {
+            figure: spread_over_seeds(done, figure) for figure in runs[0] if figure in SPREADS
+        }
+        arms.append({"name": name, "trainings": runs, "spread_over_seeds": spreads})
+    table = trainings_table({"arms": arms})
+    (note,) = [note for note in table.notes if "n = 1" in note]
+    assert "lone" in note
+    assert "whole" not in note
+    assert "failed" not in note
+    assert [row[1] for row in table.rows] == ["2/2", "1/2", "0/2"]
 
 
 def test_randomization_is_about_the_gains_that_are_trained_with() -> None:

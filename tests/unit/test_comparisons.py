@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import shlex
 from dataclasses import replace
@@ -209,3 +210,100 @@ def test_impossible_comparisons_are_refused(
 def test_an_arm_against_itself_is_refused() -> None:
     with pytest.raises(PronkError, match="both have a"):
         ComparisonConfig(outcome="height", arm="a", against="a")
+
+
+def with_finished(jumps: Jumps, seeds_by_arm: dict[str, tuple[int, ...]]) -> Jumps:
+    """The same jumps, of some arms those of some seeds alone."""
+    finished = {}
+    for (arm, robot), by_seed in jumps.items():
+        seeds = seeds_by_arm.get(arm, tuple(by_seed))
+        finished[arm, robot] = {seed: by_seed[seed] for seed in seeds}
+    return finished
+
+
+@pytest.mark.parametrize(
+    ("seeds", "lone"), [({"b": (1,)}, ("b",)), ({"b": (2,), "a": (1,)}, ("b", "a"))]
+)
+def test_an_arm_with_one_seed_gives_a_value_and_the_reason_why_there_is_no_interval(
+    tmp_path: Path, seeds: dict[str, tuple[int, ...]], lone: tuple[str, ...]
+) -> None:
+    """The scatter of that arm is unknown; it is not taken for none, also in a mean of arms."""
+    design = {"a": (), "b": ("height",), "c": ("far",)}
+    complete = factorial_jumps(design)
+    jumps = with_finished(complete, seeds)
+    comparison = ComparisonConfig(outcome="height", arm=("b", "c"), against="a", commands=("2,0",))
+    full = compared_arms(complete, "all", comparison, ["shipped"])
+    compared = compared_arms(jumps, "few", comparison, ["shipped"])
+    assert full.verdict == "more"
+    expected = 0.5 * (0.08 + 0.04)
+    for arm, offset in (("b", 0.25), ("a", -0.5)):
+        if arm in seeds:
+            expected += offset * SCATTER * (1.0 if seeds[arm] == (1,) else -1.0)
+    assert compared.value == pytest.approx(expected)
+    assert math.isnan(compared.low)
+    assert math.isnan(compared.high)
+    # What has nothing to do with these arms keeps its interval.
+    without = replace(comparison, arm="c", against="a")
+    other = compared_arms(jumps, "other", without, ["shipped"])
+    assert math.isfinite(other.low) == ("a" not in lone)
+    results = StudyResults(
+        title="Known",
+        robot="mini_cheetah",
+        arms=tuple(design),
+        robots=("shipped",),
+        outcomes=("height",),
+        commands=("forward 2", "back 2"),
+        jumps=3,
+        trial_seed=0,
+        cells=(),
+        comparisons=(full, compared),
+    )
+    save_study(tmp_path / "study.json", results)
+    loaded = load_study_results(tmp_path / "study.json")
+    table = comparison_table(loaded)
+    (row_of_few,) = [cells for cells in table.rows if "few" in cells]
+    sentence = comparison_sentence(loaded.comparisons[1])
+    for text in (str(row_of_few[-1]), sentence.split("no interval")[1]):
+        for arm in design:
+            assert (f" {arm} " in text.replace(",", " ")) == (arm in lone), (arm, text)
+        assert "n = 1" in text
+    assert any("n = 1" in note for note in table.notes)
+    assert not any(
+        "n = 1" in note for note in comparison_table(replace(loaded, comparisons=(full,))).notes
+    )
+
+
+def test_an_arm_without_any_seed_is_named() -> None:
+    jumps = with_finished(factorial_jumps({"a": (), "b": ("height",)}), {"b": ()})
+    comparison = ComparisonConfig(outcome="height", arm="b", against="a")
+    compared = compared_arms(jumps, "none", comparison, ["shipped"])
+    assert math.isnan(compared.value)
+    assert compared.verdict.startswith("no value")
+    assert compared.verdict.endswith(" b")
+
+
+def test_results_without_the_names_of_arms_are_read_too(tmp_path: Path) -> None:
+    """As an earlier pronk wrote them."""
+    jumps = with_finished(factorial_jumps({"a": (), "b": ("height",)}), {"b": (1,)})
+    comparison = ComparisonConfig(outcome="height", arm="b", against="a")
+    compared = compared_arms(jumps, "old", comparison, ["shipped"])
+    results = StudyResults(
+        title="Known",
+        robot="mini_cheetah",
+        arms=("a", "b"),
+        robots=("shipped",),
+        outcomes=("height",),
+        commands=("forward 2", "back 2"),
+        jumps=3,
+        trial_seed=0,
+        cells=(),
+        comparisons=(compared,),
+    )
+    path = tmp_path / "study.json"
+    save_study(path, results)
+    body = json.loads(path.read_text())
+    del body["comparisons"][0]["counted_arms"]
+    path.write_text(json.dumps(body))
+    (old,) = load_study_results(path).comparisons
+    assert old.value == compared.value
+    assert "no interval" in old.verdict

@@ -195,3 +195,24 @@ def test_primary_comparisons_come_first(results: StudyResults) -> None:
         ("primary", "asked"),
         ("secondary", "a match"),
     ]
+
+
+def test_tables_say_why_a_single_seed_has_no_interval(
+    results: StudyResults, tmp_path: Path
+) -> None:
+    lone = {"low": math.nan, "high": math.nan, "by_seed": {"1": 0.4, "2": None}, "value": 0.4}
+    changed = []
+    for cell in results.cells:
+        is_lone = (cell.arm, cell.robot) == ("matched", "shipped")
+        changed.append(replace(cell, **lone) if is_lone else cell)
+    few = replace(results, cells=tuple(changed))
+    (table, *_) = outcome_tables(few)
+    by_robot = {row[0]: row[1:] for row in table.rows}
+    assert str(by_robot["shipped"][1]).startswith("40.0, 1 seed")
+    (note,) = [note for note in table.notes if "n = 1" in note]
+    assert "matched on shipped" in note
+    assert "nominal" not in note
+    for table in outcome_tables(results):
+        assert not any("n = 1" in note for note in table.notes)
+    save_study(tmp_path / "study.json", few)
+    assert "n = 1" in write_study_page(tmp_path).read_text()

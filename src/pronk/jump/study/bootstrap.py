@@ -9,6 +9,12 @@ are therefore stretched by sqrt(n / (n - 1)) t / z (after Hesterberg, "What Teac
 About the Bootstrap", 2015, who moves the quantile instead, which the smallest and largest seed
 bound). Jumps are in the distribution twice, in the scatter of seeds and by themselves, so intervals
 are a little too wide rather than too narrow where seeds do not differ.
+
+An arm with a single seed has an estimate but no interval, and neither has a contrast in which it
+counts. Drawn again and again the seed is always the same one, so that the arm's scatter over seeds
+would be left out as if it were zero. Against n seeds of an arm that scatters as much the interval
+would be sqrt(1 / (n + 1)) times as wide as it should be: 0.41 times with five. The scatter of other
+arms is not put in its place, since arms do not scatter alike.
 """
 
 from __future__ import annotations
@@ -167,7 +173,7 @@ def contrast_interval(
 
     Args:
         arms: The cells of each arm, one for each robot. A seed without a value in one of them
-            is left out of its arm.
+            is left out of its arm. The contrast has no interval if an arm is left with one seed.
         is_share: True for shares. The interval is then at least that of the jumps alone, by the
             Wilson intervals of the cells after Newcombe (Zou and Donner, "Construction of
             confidence limits about effect measures", 2008).

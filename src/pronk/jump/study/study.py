@@ -664,6 +664,7 @@ def _contrast(
         low=estimate.low,
         high=estimate.high,
         seeds=estimate.seeds,
+        counted_arms=tuple(cells_by_arm),
         primary=comparison.primary,
     )
 

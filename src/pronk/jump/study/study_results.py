@@ -32,6 +32,13 @@ OTHER_ROBOT = "arms of other robots"
 """What that is compared with."""
 
 
+NO_INTERVAL = (
+    "A single seed (n = 1) has a value but no interval: how far policies of other seeds lie from "
+    "it is not known."
+)
+"""Note of tables with values of a single seed."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class OutcomeCell:
     """One outcome of one arm on one robot, mean over seeds."""
@@ -82,7 +89,9 @@ class ComparedArms:
     low: float = math.nan
     high: float = math.nan
     seeds: tuple[int, ...] = ()
-    """Number of seeds of each arm that has a part in it."""
+    """Number of seeds, with a value on every robot, of each arm that has a part in it."""
+    counted_arms: tuple[str, ...] = ()
+    """Names of these arms, in the same order; empty in results of an earlier pronk."""
     primary: bool = False
     """True for a question that the study was made to answer."""
 
@@ -92,10 +101,33 @@ class ComparedArms:
         return compared_outcome(self.outcome.replace("_", " "), self.commands)
 
     @property
+    def few_seeds(self) -> str:
+        """Why there is no interval: the arms with fewer than two seeds; empty if there is one."""
+        if math.isfinite(self.low):
+            return ""
+        arms_by_count: dict[int, list[str]] = {0: [], 1: []}
+        for arm, count in zip(self.counted_arms, self.seeds, strict=False):
+            if count < 2:
+                arms_by_count[count].append(arm)
+        where = " on every robot here" if len(self.robots) > 1 else ""
+        reasons = []
+        if arms_by_count[0]:
+            reasons.append(f"no seed with a value{where} of {', '.join(arms_by_count[0])}")
+        if arms_by_count[1]:
+            each = " each" if len(arms_by_count[1]) > 1 else ""
+            reasons.append(
+                f"one seed{where}{each} of {', '.join(arms_by_count[1])} (n = 1), which shows no "
+                "scatter over seeds"
+            )
+        return "; ".join(reasons) or "fewer than two seeds of an arm"
+
+    @property
     def verdict(self) -> str:
-        """What the interval allows to say."""
+        """What the interval allows to say, or why there is none."""
+        if not math.isfinite(self.value):
+            return f"no value: {self.few_seeds}"
         if not math.isfinite(self.low):
-            return "too few seeds"
+            return f"no interval: {self.few_seeds}"
         if self.low > 0.0:
             return "more"
         if self.high < 0.0:
@@ -204,6 +236,7 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
     for arm in results.arms:
         columns.append(Column(heading=arm))
     rows: list[tuple[Cell, ...]] = []
+    single_seed = []
     shown = {cell.robot for cell in results.cells if bool(cell.series) == in_series}
     for robot in results.robots:
         if robot not in shown:
@@ -216,12 +249,17 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
                 continue
             text = estimate_text(cell.value, cell.low, cell.high, outcome, signed=False)
             row.append(f"{text}, {_seeds_text(cell.seeds)}")
+            if cell.seeds == 1:
+                single_seed.append(f"{arm} on {robot}")
         rows.append(tuple(row))
+    notes = [f"{outcome.replace('_', ' ')}: {definition.meaning}."]
+    if single_seed:
+        notes.append(f"{NO_INTERVAL} Here: {'; '.join(single_seed)}.")
     return Table(
         title=f"{definition.label}: mean over seeds (95 % interval)",
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=(f"{outcome.replace('_', ' ')}: {definition.meaning}.",),
+        notes=tuple(notes),
         is_detail=in_series,
     )
 
@@ -265,6 +303,12 @@ def comparison_table(results: StudyResults) -> Table:
         "Intervals: hierarchical bootstrap over seeds and jumps, widened for few seeds; of shares "
         "at least as wide as the jumps alone make them."
     ]
+    if any(comparison.few_seeds for comparison in results.comparisons):
+        notes.append(
+            f"{NO_INTERVAL} Nor has a comparison in which that arm counts, also in a mean of arms: "
+            "seeds are drawn within each arm, and an interval without the scatter of one of them "
+            "would be too narrow. Train another seed of the arm, or compare without it."
+        )
     if len(results.comparisons) > 1:
         notes.append(
             f"Each of the {len(results.comparisons)} intervals covers the truth with 95 % by "

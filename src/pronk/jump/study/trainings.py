@@ -360,8 +360,11 @@ def summarize_trainings(
 def trainings_table(summary: Mapping[str, Any]) -> Table:
     """Return the spread over seeds of each arm of a summary."""
     rows: list[tuple[Cell, ...]] = []
+    single = []
     for arm in summary["arms"]:
         finished = [run for run in arm["trainings"] if run["state"] in ("done", "kept")]
+        if len(finished) == 1:
+            single.append(arm["name"])
         spreads = arm["spread_over_seeds"]
         rows.append(
             (
@@ -373,6 +376,14 @@ def trainings_table(summary: Mapping[str, Any]) -> Table:
                 spreads["steps_per_second"]["mean"],
                 spreads["seconds"]["mean"],
             )
+        )
+    notes = [
+        "reward, episode, speed range: of the last iteration, in the training simulator. "
+        "steps/s, wall clock: means of one training."
+    ]
+    if single:
+        notes.append(
+            f"One finished training (n = 1) has no spread over seeds: {', '.join(single)}."
         )
     return Table(
         title="Trainings: mean +- standard deviation over seeds (smallest to largest)",
@@ -386,10 +397,7 @@ def trainings_table(summary: Mapping[str, Any]) -> Table:
             Column(heading="wall clock", unit="s", digits=0),
         ),
         rows=tuple(rows),
-        notes=(
-            "reward, episode, speed range: of the last iteration, in the training simulator. "
-            "steps/s, wall clock: means of one training.",
-        ),
+        notes=tuple(notes),
     )
 
 
