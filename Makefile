@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# As tests/conftest.py groups and orders them.
+DEAL := --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test test-slow docs lint clean
 
@@ -14,12 +16,12 @@ test: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live and not slow" --durations=30
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live and not slow" --durations=30
 
 # Trainings, whole trials and processes in real time.
 test-slow: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadgroup -m "slow and not live" --durations=10
-	OMP_NUM_THREADS=1 $(BIN)/pytest -m live --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "slow and not live" --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) tests/live --durations=10
 
 # The documentation site, in build/docs.
 docs: $(VENV)/.docs

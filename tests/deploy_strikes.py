@@ -40,6 +40,7 @@ from pronk.policy.script import STILL, Velocity
 from pronk.processes import die_with_parent
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
+from tests.dds_domain import own_domain
 from tests.linear_policy import stiff_go2, write_swaying
 
 WALKING_ROBOT = "mini_cheetah"
@@ -129,7 +130,7 @@ def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]
     if link == "sim":
         yield Address.parse("sim://ground"), None
         return
-    options: dict[str, Any] = {"domain": 100 + os.getpid() % 50}
+    options: dict[str, Any] = {"domain": own_domain()}
     if link.startswith("lcm"):
         options = {"port": free_port()}
     context = get_context("spawn")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from joint_mechanisms import (
     simulate_mechanisms,
     with_fault,
 )
+from pronk.arrays import Array
 from pronk.identify.match.checks import unwrapped, wrong_unit
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
@@ -35,24 +37,63 @@ def drawn(seed: int, faults: tuple[str, ...]) -> list[Mechanism]:
     return [draw_mechanism(rng, fault) for fault in faults]
 
 
-def matched(mechanisms: list[Mechanism], folder: Path, seed: int = 0) -> list[JointGains]:
-    """The gains that a match finds from the log of each joint."""
-    rng = np.random.default_rng(seed)
+HONEST = drawn(3, ("",) * 12)
+WRONG_LIMIT = drawn(5, ("saturation, limit wrong",) * 3)
+NO_LIMIT = drawn(2, tuple(fault for fault in FAULTS[4:] if fault != "speed limit"))
+STATED = drawn(29, ("", "", "", "saturation, limit known"))
+(AT_REST,) = drawn(31, ("",))
+BY_MOTOR = [with_fault(joint, "compliance, motor encoder", 0.6) for joint in drawn(8, ("",) * 3)]
+BY_LINK = [with_fault(joint, "compliance, link encoder", 0.6) for joint in drawn(8, ("",) * 3)]
+NO_COMPLIANCE = drawn(11, FAULTS[4:])
+(EXPLAINED,) = drawn(17, ("",))
+UNEXPLAINED = [
+    with_fault(EXPLAINED, "velocity feed-forward", 0.9),
+    with_fault(EXPLAINED, "backlash", 0.9),
+]
+PARTLY_EXPLAINED = [
+    with_fault(EXPLAINED, "backlash", 0.3),
+    with_fault(EXPLAINED, "stribeck", 0.9),
+    with_fault(EXPLAINED, "dead band", 0.5),
+    with_fault(EXPLAINED, "integral", 0.1),
+]
+LATE = with_fault(drawn(21, ("",))[0], "delayed command column", 0.3)
+EARLY = replace(LATE, delay_s=0.0)
+(TURNED,) = drawn(23, ("",))
+(RUBBING,) = drawn(4, ("",))
+RUBBING = replace(RUBBING, frictionloss=0.05 * RUBBING.stiffness * RUBBING.amplitude)
+
+
+@cache
+def motions() -> dict[Mechanism, tuple[Array, Array]]:
+    """Command and reading of every joint of this module [rad], each of shape (steps,).
+
+    A step of the integration takes as long for all of them as for one.
+    """
+    mechanisms = [*HONEST, *WRONG_LIMIT, *NO_LIMIT, *STATED, AT_REST, *BY_MOTOR, *BY_LINK]
+    mechanisms += [*NO_COMPLIANCE, *UNEXPLAINED, *PARTLY_EXPLAINED, LATE, EARLY, TURNED, RUBBING]
     command = chirp_commands(mechanisms)
     reading = simulate_mechanisms(mechanisms, command)
+    found = {}
+    for number, joint in enumerate(mechanisms):
+        found[joint] = (command[:, number], reading[:, number])
+    return found
+
+
+def matched(mechanisms: list[Mechanism], folder: Path) -> list[JointGains]:
+    """The gains that a match finds from the log of each joint."""
+    rng = np.random.default_rng(0)
     gains = []
     for number, joint in enumerate(mechanisms):
         robot = mechanism_robot(joint, folder / str(number))
-        log = mechanism_log(joint, command[:, number], reading[:, number], rng)
+        log = mechanism_log(joint, *motions()[joint], rng)
         gains.append(match([log.segmented()], robot).gains.joints["j"])
     return gains
 
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Mechanism, JointGains]]:
-    mechanisms = drawn(3, ("",) * 12)
-    gains = matched(mechanisms, tmp_path_factory.mktemp("honest"))
-    return list(zip(mechanisms, gains, strict=True))
+    gains = matched(HONEST, tmp_path_factory.mktemp("honest"))
+    return list(zip(HONEST, gains, strict=True))
 
 
 def test_joints_of_any_size_are_not_flagged(honest: list[tuple[Mechanism, JointGains]]) -> None:
@@ -78,8 +119,7 @@ def test_their_true_gains_are_in_the_total_interval(
 
 
 def test_a_wrong_torque_limit_is_named_first_and_gives_no_wrong_gains(tmp_path: Path) -> None:
-    mechanisms = drawn(5, ("saturation, limit wrong",) * 3)
-    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+    for mechanism, gains in zip(WRONG_LIMIT, matched(WRONG_LIMIT, tmp_path), strict=True):
         first = gains.flags[0]
         assert first.startswith("effort limit:")
         assert not any("So would look" in flag for flag in gains.flags)
@@ -94,22 +134,17 @@ def test_a_wrong_torque_limit_is_named_first_and_gives_no_wrong_gains(tmp_path: 
 
 
 def test_no_other_mechanism_is_taken_for_a_torque_limit(tmp_path: Path) -> None:
-    faults = tuple(fault for fault in FAULTS[4:] if fault != "speed limit")
-    mechanisms = drawn(2, faults)
-    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+    for mechanism, gains in zip(NO_LIMIT, matched(NO_LIMIT, tmp_path), strict=True):
         limited = [flag for flag in gains.flags if flag.startswith("effort limit")]
         assert limited == [], mechanism
 
 
 def test_stated_gains_do_not_tell_a_torque_limit(tmp_path: Path) -> None:
-    mechanisms = drawn(29, ("", "", "", "saturation, limit known"))
-    command = chirp_commands(mechanisms)
-    reading = simulate_mechanisms(mechanisms, command)
     rng = np.random.default_rng(0)
-    for number, joint in enumerate(mechanisms):
-        log = mechanism_log(joint, command[:, number], reading[:, number], rng)
-        error = command[:, number] - reading[:, number]
-        asked = float(np.abs(joint.stiffness * error).max())
+    for number, joint in enumerate(STATED):
+        command, reading = motions()[joint]
+        log = mechanism_log(joint, command, reading, rng)
+        asked = float(np.abs(joint.stiffness * (command - reading)).max())
         if not joint.fault:
             joint = replace(joint, effort_limit=1.3 * asked)
         # The gains that are stated ask for 1.6 times what those of the drive do.
@@ -123,20 +158,18 @@ def test_stated_gains_do_not_tell_a_torque_limit(tmp_path: Path) -> None:
 
 
 def test_a_joint_at_rest_is_not_taken_for_one_in_degrees(tmp_path: Path) -> None:
-    (joint,) = drawn(31, ("",))
-    command = chirp_commands([joint])
-    reading = simulate_mechanisms([joint], command)
-    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
-    robot = mechanism_robot(joint, tmp_path)
+    log = mechanism_log(AT_REST, *motions()[AT_REST], np.random.default_rng(0))
+    robot = mechanism_robot(AT_REST, tmp_path)
     (shaken,) = replace(log, position=log.position / 55.0).segmented().excitations("j")
     (in_degrees,) = replace(log, command=np.rad2deg(log.command)).segmented().excitations("j")
     assert wrong_unit(shaken, robot.joint("j")) == ""
     assert "degrees" in wrong_unit(in_degrees, robot.joint("j"))
 
 
-@pytest.mark.parametrize("fault", ["compliance, motor encoder", "compliance, link encoder"])
-def test_a_compliance_is_named_with_its_stiffness(fault: str, tmp_path: Path) -> None:
-    mechanisms = [with_fault(joint, fault, 0.6) for joint in drawn(8, ("", "", ""))]
+@pytest.mark.parametrize("mechanisms", [BY_MOTOR, BY_LINK], ids=["motor encoder", "link encoder"])
+def test_a_compliance_is_named_with_its_stiffness(
+    mechanisms: list[Mechanism], tmp_path: Path
+) -> None:
     for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
         assert not gains.matched
         named = [flag for flag in gains.flags if "compliance:" in flag]
@@ -147,18 +180,12 @@ def test_a_compliance_is_named_with_its_stiffness(fault: str, tmp_path: Path) ->
 
 
 def test_no_other_mechanism_is_taken_for_a_compliance(tmp_path: Path) -> None:
-    mechanisms = drawn(11, FAULTS[4:])
-    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+    for mechanism, gains in zip(NO_COMPLIANCE, matched(NO_COMPLIANCE, tmp_path), strict=True):
         assert not any("compliance:" in flag for flag in gains.flags), mechanism
 
 
 def test_what_a_fit_leaves_unexplained_is_said_without_a_cause(tmp_path: Path) -> None:
-    (joint,) = drawn(17, ("",))
-    mechanisms = [
-        with_fault(joint, "velocity feed-forward", 0.9),
-        with_fault(joint, "backlash", 0.9),
-    ]
-    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+    for mechanism, gains in zip(UNEXPLAINED, matched(UNEXPLAINED, tmp_path), strict=True):
         warnings = [flag for flag in gains.flags if "So would look" in flag]
         assert len(warnings) == 1, mechanism
         assert "friction" in warnings[0]
@@ -166,38 +193,26 @@ def test_what_a_fit_leaves_unexplained_is_said_without_a_cause(tmp_path: Path) -
 
 
 def test_intervals_hold_the_gains_where_the_motion_is_not_all_explained(tmp_path: Path) -> None:
-    (joint,) = drawn(17, ("",))
-    mechanisms = [
-        with_fault(joint, "backlash", 0.3),
-        with_fault(joint, "stribeck", 0.9),
-        with_fault(joint, "dead band", 0.5),
-        with_fault(joint, "integral", 0.1),
-    ]
-    for mechanism, gains in zip(mechanisms, matched(mechanisms, tmp_path), strict=True):
+    all_gains = matched(PARTLY_EXPLAINED, tmp_path)
+    for mechanism, gains in zip(PARTLY_EXPLAINED, all_gains, strict=True):
         warned = any("So would look" in flag for flag in gains.flags)
         inside = []
         fitted_gains = (gains.stiffness, gains.damping)
-        for fitted, true in zip(fitted_gains, equivalent_gains(joint), strict=True):
+        for fitted, true in zip(fitted_gains, equivalent_gains(EXPLAINED), strict=True):
             low, high = fitted.total95
             inside.append(low <= true <= high)
         assert warned or all(inside), mechanism
 
 
 def test_a_late_command_column_is_named_where_the_rest_is_explained(tmp_path: Path) -> None:
-    (joint,) = drawn(21, ("",))
-    late = with_fault(joint, "delayed command column", 0.3)
-    early = replace(late, delay_s=0.0)
-    for gains in matched([late, early], tmp_path):
+    for gains in matched([LATE, EARLY], tmp_path):
         (flag,) = (flag for flag in gains.flags if flag.startswith("lead:"))
         assert "command column" in flag
         assert gains.delay_s.value == 0.0
 
 
-def test_a_reading_that_wraps_is_unwrapped(tmp_path: Path) -> None:
-    (joint,) = drawn(23, ("",))
-    command = chirp_commands([joint])
-    reading = simulate_mechanisms([joint], command)
-    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
+def test_a_reading_that_wraps_is_unwrapped() -> None:
+    log = mechanism_log(TURNED, *motions()[TURNED], np.random.default_rng(0))
     turned = np.angle(np.exp(1j * (log.position + np.pi)))
     wrapped = replace(log, command=log.command + np.pi, position=turned)
     assert np.ptp(turned) > 6.0
@@ -208,12 +223,8 @@ def test_a_reading_that_wraps_is_unwrapped(tmp_path: Path) -> None:
 
 
 def test_the_dead_band_of_dry_friction_is_beside_the_gains(tmp_path: Path) -> None:
-    (joint,) = drawn(4, ("",))
-    joint = replace(joint, frictionloss=0.05 * joint.stiffness * joint.amplitude)
-    command = chirp_commands([joint])
-    reading = simulate_mechanisms([joint], command)
-    log = mechanism_log(joint, command[:, 0], reading[:, 0], np.random.default_rng(0))
-    result = match([log.segmented()], mechanism_robot(joint, tmp_path))
+    log = mechanism_log(RUBBING, *motions()[RUBBING], np.random.default_rng(0))
+    result = match([log.segmented()], mechanism_robot(RUBBING, tmp_path))
     (note,) = dead_band_notes(result)
     band = float(note.split("[deg]: j ")[1].split(".  ")[0].split(". ")[0])
-    assert band == pytest.approx(np.rad2deg(2.0 * 0.05 * joint.amplitude), rel=0.1)
+    assert band == pytest.approx(np.rad2deg(2.0 * 0.05 * RUBBING.amplitude), rel=0.1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
+from dds_domain import own_domain
 from pronk.deploy.bench.dds_server import DdsServerTransport
 from pronk.deploy.bench.server import RobotServer
 from pronk.deploy.links.dds.codec import decode_dds_command, encode_dds_command, joint_map
@@ -46,9 +46,8 @@ HOLD = hold_of(ROBOT)
 PITCH = ROBOT.joint_names.index("FR_hip_pitch")
 
 
-def own_network(shift: int = 0) -> DdsNetwork:
-    """Two test processes on one computer must not reach each other."""
-    return DdsNetwork(domain=2 + (2 * os.getpid() + shift) % 70)
+SERVED = DdsNetwork(domain=own_domain())
+"""Where the server of the fixture is."""
 
 
 def live(domain: int, end: Connection) -> None:
@@ -66,7 +65,7 @@ def server() -> Iterator[Connection]:
     """A server in another process, whose own controller holds the joints at first."""
     context = multiprocessing.get_context("spawn")
     end, other = context.Pipe()
-    process = context.Process(target=live, args=(own_network().domain, other), daemon=True)
+    process = context.Process(target=live, args=(SERVED.domain, other), daemon=True)
     process.start()
     assert end.recv() == "ready"
     yield end
@@ -83,7 +82,7 @@ def turned(angle: float) -> Command:
 
 
 def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
-    network = own_network()
+    network = SERVED
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="normal"):
         DdsMachine(ROBOT, domain=network.domain).connect()
@@ -166,7 +165,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(server: Connection) -> None:
 
 
 def test_mode_switcher_and_bench_services() -> None:
-    network = own_network(1)
+    network = DdsNetwork(domain=own_domain())
     wire = DdsServerTransport(ROBOT, domain=network.domain, mode="mcf")
     client, bench = (
         ServiceClient(Participant(network), name) for name in (SWITCHER, "pronk_bench")
@@ -190,7 +189,7 @@ def test_mode_switcher_and_bench_services() -> None:
 
 
 def test_rival_is_received() -> None:
-    wire = DdsServerTransport(ROBOT, domain=own_network(1).domain)
+    wire = DdsServerTransport(ROBOT, domain=own_domain())
     wire.contend(turned(0.1))
     met: list[Command] = []
     assert eventually(lambda: bool(met.extend(wire.poll()) or met))
@@ -198,7 +197,7 @@ def test_rival_is_received() -> None:
 
 
 def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
-    network = own_network(1)
+    network = DdsNetwork(domain=own_domain())
     wires = [DdsServerTransport(ROBOT, domain=network.domain) for _ in range(2)]
     states = itertools.cycle(connected(legs=("FR",)).wait(8.0))
     both_speak = Event()
@@ -223,7 +222,7 @@ def test_a_second_robot_stops_the_commands_and_is_refused() -> None:
 
 def test_networks() -> None:
     with pytest.raises(HardwareError, match="rt/lowstate"):
-        DdsMachine(ROBOT, domain=own_network(1).domain).connect()
+        DdsMachine(ROBOT, domain=own_domain()).connect()
     assert DdsNetwork().domain == 77
     assert DdsNetwork(interface="eth7").domain == 0
     for domain in (0, 233, -1):
@@ -232,4 +231,4 @@ def test_networks() -> None:
     with pytest.raises(HardwareError, match="no_such_interface"):
         Participant(DdsNetwork(interface="no_such_interface", domain=150))
     with pytest.raises(HardwareError, match="dance"):
-        DdsServerTransport(ROBOT, domain=own_network(1).domain, mode="dance")
+        DdsServerTransport(ROBOT, domain=own_domain(), mode="dance")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dds_domain import own_domain
 from deploy_runs import DAMPED_S, FRESH, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
 from pronk.deploy.links.address import Address
@@ -35,7 +36,7 @@ pytest.importorskip("cyclonedds")
 def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
     """A virtual robot of its own, and another program's listener and sender at its wire."""
     lcm = request.param == "lcm"
-    word, number = ("port", free_port()) if lcm else ("domain", 150 + os.getpid() % 50)
+    word, number = ("port", free_port()) if lcm else ("domain", own_domain())
     with (
         simulated("--realtime", "--link", request.param, f"--{word}", str(number)),
         over_lcm(number) if lcm else over_dds(number) as wire,

@@ -7,7 +7,6 @@ They are other people's and are not in the repository: the test is skipped witho
 from __future__ import annotations
 
 import multiprocessing
-import os
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 pytest.importorskip("onnxruntime")
 
+from dds_domain import own_domain
 from pronk.arrays import Array
 from pronk.deploy.bench.dds_server import DdsServerTransport
 from pronk.deploy.bench.server import RobotServer
@@ -41,7 +41,7 @@ FOLDER = Path(__file__).parents[3] / "shared" / "data" / "go2_policies"
 FAST = "go2_moe_cts_fast_flat_v4_fz_54k"
 OTHER = "kaiwu2025_v6-2_124004"
 needs_policies = pytest.mark.skipif(not FOLDER.exists(), reason=f"needs {FOLDER}")
-DOMAIN = 2 + (2 * os.getpid() + 1) % 70
+DOMAIN = own_domain()
 """Domain of this process: two test processes on one computer must not reach each other."""
 PATIENT = Freshness(share=0.02, longest_gap_s=10.0)
 """A computer that runs tests side by side is busy; what is tested here is not that."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 pytest.importorskip("onnxruntime")
 pytest.importorskip("cyclonedds")
 
+from dds_domain import own_domain
 from deploy_runs import FRESH, PATIENT, QUICK, hold, met, notified, simulated
 from hopper import write_hopper
 from pronk.deploy.links.address import Address
@@ -42,7 +42,7 @@ def go2_hopper(path: Path) -> Path:
 
 
 def test_a_go2_stands_up_jumps_and_sits_down(tmp_path: Path) -> None:
-    domain = 100 + os.getpid() % 50
+    domain = own_domain()
     words = ["go2", "--link", "dds", "--base", "ground", "--domain", str(domain), "--realtime"]
     with simulated(*words):
         plan = RunPlan(

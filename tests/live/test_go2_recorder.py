@@ -7,7 +7,6 @@ addresses and not by multicast, which is the one thing that differs from a robot
 from __future__ import annotations
 
 import multiprocessing
-import os
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from multiprocessing.connection import Connection
@@ -19,6 +18,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 pytest.importorskip("unitree_sdk2py")
 
+from dds_domain import own_domain
 from pronk.deploy.bench.dds_server import DdsServerTransport
 from pronk.deploy.bench.server import RobotServer
 from pronk.deploy.links.dds.link import ON_LOOPBACK
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.live
 
 GO2 = load_robot("go2")
 RECORDER = Path(__file__).parents[2] / "examples" / "recorders" / "unitree_go2.py"
-DOMAIN = 2 + (2 * os.getpid() + 7) % 70
+DOMAIN = own_domain()
 """Domain of this process: two test processes on one computer must not reach each other."""
 JOINT = "FL_hip_pitch"
 AMPLITUDES = (0.25, 0.125)

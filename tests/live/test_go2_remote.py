@@ -8,7 +8,6 @@ limits on time are wide, so that a busy computer is not taken for a fault.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ pytest.importorskip("cyclonedds")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("onnx")
 
+from dds_domain import own_domain
 from deploy_runs import FRESH, PATIENT, QUICK
 from foreign_policy import write_foreign
 from pronk.deploy.bench.dds_server import DdsServerTransport
@@ -47,7 +47,7 @@ pytestmark = pytest.mark.live
 
 GO2 = load_robot("go2")
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "go2_policies"
-DOMAIN = 2 + (2 * os.getpid() + 5) % 70
+DOMAIN = own_domain()
 """Domain of this process: two test processes on one computer must not reach each other."""
 LONGEST_S = 120.0
 """Longest wait for a mode [s]."""

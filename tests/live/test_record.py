@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dds_domain import own_domain
 from deploy_runs import FRESH, free_port
 from pronk.cli.sweep import record_wire
 from pronk.deploy.links.address import Address
@@ -74,11 +75,6 @@ def virtual_robot(*words: str) -> Iterator[None]:
         running.communicate()
 
 
-def free_domain(shift: int) -> int:
-    """Two test processes on one computer must not reach each other."""
-    return 100 + (3 * os.getpid() + shift) % 70
-
-
 def swept_and_recorded(
     robot_name: str, joint: str, address: Address, out: Path
 ) -> tuple[JointLog, JointLog, dict[str, Any]]:
@@ -113,6 +109,14 @@ def assert_alike(sweep_gains: JointGains, recorded_gains: JointGains) -> None:
         assert difference < max(0.05, interval / first.value)
 
 
+def missed_share(sweep_log: JointLog, recorded: JointLog, joint: str) -> float:
+    """Return the share of the commands of a sweep that its recording has not as they were sent."""
+    sent = np.unique(sweep_log.command[:, sweep_log.column(joint)])
+    heard = recorded.command[:, recorded.column(joint)]
+    missed = [target for target in sent if np.abs(heard - target).min() > 1e-6]
+    return len(missed) / len(sent)
+
+
 @pytest.mark.parametrize(("robot_name", "scheme"), [("go2", "dds"), ("mini_cheetah", "lcm")])
 def test_a_recorded_sweep_gives_the_gains_of_the_sweep(
     robot_name: str, scheme: str, tmp_path: Path
@@ -121,7 +125,7 @@ def test_a_recorded_sweep_gives_the_gains_of_the_sweep(
     robot = load_robot(robot_name)
     reason = ""
     for attempt in range(ATTEMPTS):
-        place = {"port": free_port()} if scheme == "lcm" else {"domain": free_domain(attempt)}
+        place = {"port": free_port()} if scheme == "lcm" else {"domain": own_domain()}
         ((option, number),) = place.items()
         out = tmp_path / str(attempt)
         out.mkdir()
@@ -135,9 +139,14 @@ def test_a_recorded_sweep_gives_the_gains_of_the_sweep(
             # The sweep's own supervision ends it where a busy computer stops robot or servo.
             reason = str(error)
             continue
-        if summary["longest_gap_s"] < PAUSE_S:
+        if summary["longest_gap_s"] >= PAUSE_S:
+            reason = f"no state for {summary['longest_gap_s']:.1f} s"
+            continue
+        missed = missed_share(sweep_log, recorded, joint)
+        # Nor has a recorder that did not run for a while received all; one that loses never does.
+        if missed < 0.2 or attempt == ATTEMPTS - 1:
             break
-        reason = f"no state for {summary['longest_gap_s']:.1f} s"
+        reason = f"{missed:.0%} of the commands missed"
     else:
         pytest.skip(f"this computer is too busy for a sweep in real time: {reason}")
     assert summary["virtual"]
@@ -149,10 +158,7 @@ def test_a_recorded_sweep_gives_the_gains_of_the_sweep(
     assert recorded.stiffness[column] == pytest.approx(robot.joint(joint).stiffness, rel=1e-5)
     assert (recorded.torque is None) == (scheme == "lcm")
     # Commands as they were sent.
-    sent = np.unique(sweep_log.command[:, sweep_log.column(joint)])
-    heard = recorded.command[:, column]
-    missed = [target for target in sent if np.abs(heard - target).min() > 1e-6]
-    assert len(missed) < 0.2 * len(sent)
+    assert missed < 0.2
     assert_alike(
         match([sweep_log], robot).gains.joints[joint],
         match([recorded], robot).gains.joints[joint],
@@ -181,7 +187,7 @@ def test_nothing_is_sent_over_lcm_and_missing_commands_are_named(tmp_path: Path)
 
 
 def test_no_writer_is_opened_on_dds_and_missing_states_are_named(tmp_path: Path) -> None:
-    domain = free_domain(1)
+    domain = own_domain()
     participant = Participant(DdsNetwork(domain=domain))
     commands = participant.reader(COMMANDS, LowCmd)
     states = participant.writer("rt/lowstate", LowState)
@@ -209,7 +215,7 @@ def test_a_recording_ends_by_time(tmp_path: Path) -> None:
     from pronk.jump.virtual.robot import hold_of
     from pronk.robots.machine import State
 
-    domain = free_domain(2)
+    domain = own_domain()
     robot = load_robot("go2")
     joints = joint_map(robot)
     participant = Participant(DdsNetwork(domain=domain))
