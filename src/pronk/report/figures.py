@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch, Rectangle
 from matplotlib.ticker import LogLocator, NullLocator
-from scipy import stats
+from scipy import special
 
 from pronk.arrays import Array, ComplexArray
 from pronk.identify.match.compared import ComparedResponses
@@ -28,7 +28,7 @@ from pronk.report.style import Look, drawing, key, legend
 
 _LOWEST_HZ = 0.1
 """Lowest frequency that is drawn [Hz]."""
-_CHI2_95 = float(stats.chi2.ppf(0.95, 2))
+_CHI2_95 = float(special.chdtri(2, 1.0 - 0.95))
 """Squared radius of the 95 % ellipse of a bivariate normal distribution."""
 _AMPLITUDE_COLOURS = (style.MEASURED, style.MATCHED, style.NAIVE, style.ZERO_ARMATURE)
 _AMPLITUDE_DASHES = ("-", (0, (5, 2)), (0, (6, 2, 1, 2)), ":")

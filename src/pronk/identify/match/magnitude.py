@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.optimize import least_squares
 
 from pronk.arrays import Array, ComplexArray
@@ -259,14 +259,14 @@ def gain_interval(fit: MagnitudeFit) -> GainInterval:
         relative = _NOISE_BANDWIDTH * misfit * (influence * white_share) @ influence.T
         covariance = relative * np.outer(optimum, optimum)
         repeat_gains = optimum[None, :]
-        quantile = float(stats.norm.ppf(0.975))
+        quantile = float(special.ndtri(0.975))
         flags = ("one repeat: the interval assumes white noise",)
     else:
         # Residuals are simulated less measured: a larger response needs larger gains there.
         change = target.error_db(target.measured.repeats[:, target.fit_mask]) / deviation_db
         repeat_gains = optimum * np.exp(change @ influence.T)
         covariance = jackknife(repeat_gains / (count - 1))
-        quantile = float(stats.t.ppf(0.975, count - 1))
+        quantile = float(special.stdtrit(count - 1, 0.975))
         if count == 2:
             flags = ("two repeats: the interval is wide, three or more narrow it",)
     half_width = quantile * np.sqrt(np.diag(covariance))

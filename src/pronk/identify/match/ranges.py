@@ -30,7 +30,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from pronk.arrays import Array
 from pronk.identify.match.gains import FittedValue, GroupGains, JointGains
@@ -322,7 +322,7 @@ def interval_points(gains: JointGains, level: float = 0.95, floor: float = 0.0) 
     if not np.isfinite(covariance).all():
         covariance = np.zeros((2, 2))
     covariance = covariance + np.diag((SMALLEST_DEVIATION * center) ** 2)
-    radius = np.sqrt(stats.chi2.ppf(level, 2))
+    radius = np.sqrt(special.chdtri(2, 1.0 - level))
     if floor > 0.0:
         half_widths = radius * np.sqrt(np.diag(covariance))
         scales = np.ones(2)

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from pronk.arrays import Array, Mask
 from pronk.errors import LogError
@@ -246,6 +245,8 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
         The frequency; infinity if the coherence does not fall, or if the recording is too narrow to
         show it.
     """
+    from scipy import signal  # slow to import
+
     rate_hz = (len(time) - 1) / (time[-1] - time[0])
     width = min(round(COHERENCE_SEGMENT_S * rate_hz), len(time))
     frequency_hz, power = signal.welch(command, rate_hz, nperseg=width)
@@ -278,6 +279,8 @@ def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
         A mask, shape (n,), that is false where the command is, over two seconds, mostly above the
         trusted frequency; and that frequency [Hz], infinite if there is none.
     """
+    from scipy import signal  # slow to import
+
     column = log.column(joint)
     command = log.command[:, column]
     limit_hz = trusted_frequency(log.time, command, log.position[:, column])

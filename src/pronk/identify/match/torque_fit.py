@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal, stats
+from scipy import special
 
 from pronk.arrays import Array, Mask
 from pronk.errors import LogError
@@ -142,6 +142,8 @@ class Motion:
 
 def low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> Array:
     """Filter values along their first axis without phase shift."""
+    from scipy import signal  # slow to import
+
     sections = signal.butter(3, cutoff_hz, fs=rate_hz, output="sos")
     return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
 
@@ -406,7 +408,7 @@ def _solve(
     covariance = right.T @ (jackknife(moves) + drawn.T @ drawn) @ right / np.outer(size, size)
     # Share of each (scaled) parameter that moves along combinations without effect.
     hidden = np.sqrt(np.maximum(1.0 - np.sum(right**2, axis=0), 0.0))
-    quantile = float(stats.t.ppf(0.975, len(moves) - 1))
+    quantile = float(special.stdtrit(len(moves) - 1, 0.975))
     solution = _Solution(model=model, x=x, covariance=covariance, hidden=hidden, quantile=quantile)
     joints: dict[str, dict[str, TorqueParameter]] = {}
     for index, joint in enumerate(model.joints):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from pronk.arrays import Array
 from pronk.identify.match.parameters import GAINS, PARAMETERS
@@ -157,7 +157,7 @@ def estimate_parameters(
     Returns:
         The parameters; intervals are symmetric about the searched numbers.
     """
-    quantile = float(stats.t.ppf(0.975, freedom))
+    quantile = float(special.stdtrit(freedom, 0.975))
     deviation = np.sqrt(np.diag(covariance))
     sd = {}
     ci95 = {}
@@ -204,7 +204,7 @@ def total_intervals(
         95 % interval of each fitted parameter.
     """
     deviation = np.sqrt(np.diag(jackknife(part_moves)))
-    quantile = float(stats.t.ppf(0.975, len(part_moves) - 1))
+    quantile = float(special.stdtrit(len(part_moves) - 1, 0.975))
     intervals = {}
     for name, center, part_deviation in zip(fitted, x, deviation, strict=True):
         parameter = PARAMETERS[name]

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.signal import ShortTimeFFT, get_window
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.identify.logs.joint_log import Excitation
@@ -110,6 +109,8 @@ def segment_layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Segment
         ShortExcitationError: The grid is too short for two segments, or the band holds no
             frequency.
     """
+    from scipy.signal import ShortTimeFFT, get_window  # slow to import
+
     rate_hz = grid.rate_hz
     samples = round(estimator.length_s * rate_hz)
     span = grid.count / rate_hz

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import ArtefactError, LogError, PronkError
@@ -275,9 +275,9 @@ class FrequencyResponse:
             spread = np.abs(self.repeats - self.repeats.mean(axis=0))
             # Real and imaginary parts share the variance: halve it for one direction.
             deviation = np.sqrt((spread**2).sum(axis=0) / (2.0 * (count - 1)))
-            quantile = float(stats.t.ppf(0.5 + level / 2.0, 2 * (count - 1)))
+            quantile = float(special.stdtrit(2 * (count - 1), 0.5 + level / 2.0))
             return np.asarray(quantile * deviation / np.sqrt(count) / self.gain)
-        return np.asarray(float(stats.norm.ppf(0.5 + level / 2.0)) * self.deviation())
+        return np.asarray(float(special.ndtri(0.5 + level / 2.0)) * self.deviation())
 
     def gain_interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Return the lower and the upper bound of the absolute gain, shapes (f,)."""
