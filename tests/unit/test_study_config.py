@@ -84,7 +84,6 @@ def test_a_plan_counts_trainings_trials_and_jumps(tmp_path: Path) -> None:
     assert figures["env_steps"] == 6 * 1080 * 24 * 4096
     assert figures["trials"] == 12
     assert figures["jumps"] == 12 * 4 * 5
-    assert figures["gpu_hours"] > 0.0
     assert list(figures["comparisons"]) == ["a match"]
     assert not out.exists()
 

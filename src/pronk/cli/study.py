@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pronk.jump.study.config import StudyConfig
-    from pronk.jump.study.place import ChosenPlace
+    from pronk.jump.study.place import ChosenPlace, PlannedGpus
     from pronk.jump.study.schedule import TaskStatus
     from pronk.jump.study.study import StudyPlan
     from pronk.jump.study.tasks import StudyTask
+    from pronk.jump.study.training_time import TrainingTime
     from pronk.jump.study.trainings import TrainingArm
     from pronk.tables import Table
 
@@ -51,11 +52,12 @@ def study(
         out: Folder of the study: trainings, trials, tables and the page.
         arms: Train and try these arms alone, for now; the results hold what is there of the others.
             With commas between several, or repeat it.
-        plan: Print trainings, GPU hours, cores and comparisons, and stop.
+        plan: Print trainings, their time on the GPUs of this host or on --gpus, cores and
+            comparisons, and stop.
         device: Device of trainings. auto: GPUs if there are any. The CPU is for tests.
     """
     from pronk.jump.study.config import load_study
-    from pronk.jump.study.place import choose_place
+    from pronk.jump.study.place import choose_place, planned_gpus
     from pronk.jump.study.study import (
         collect_results,
         plan_figures,
@@ -83,14 +85,21 @@ def study(
         except PronkError as error:
             raise PronkError(f"{study_file}: arms.{name}: {error}") from None
     if plan:
-        tables = _plan_tables(selection)
+        gpus = planned_gpus(place, device)
+        estimate = None
+        if selection.trainings and gpus.count is not None:
+            estimate = selection.time_on(gpus.count, gpus.per_gpu)
+        tables = _plan_tables(selection, gpus, estimate)
         for table in tables:
             console.show(table)
         words = ["pronk", "study", str(study_file), "--out", str(out)]
         for arm_name in arms:
             words += ["--arms", arm_name]
+        if device != "auto":
+            words += ["--device", device]
         return console.Outcome(
-            figures={**plan_figures(selection), "tables": tables}, following=[shlex.join(words)]
+            figures={**plan_figures(selection, estimate), "tables": tables},
+            following=[shlex.join([*words, *place.words])],
         )
     is_trained = selection.trainings > 0
     chosen = choose_place(place, "cpu" if not is_trained and device == "auto" else device)
@@ -135,13 +144,18 @@ def _training_arms(config: StudyConfig, folder: Path, study_file: Path) -> dict[
             continue
         words = ["train", training.task, "--robot", robot, "--envs", str(training.envs)]
         words += ["--save-interval", str(training.save_interval), "--out", "trainings"]
+        options = [*shlex.split(training.options), *shlex.split(arm.options)]
+        phases_of_options = set()
+        for word in options:
+            phases_of_options.add(word.removeprefix("--phase=").partition("=")[0])
         for phase, iterations in training.phases.items():
-            words += ["--phase", f"{phase}={iterations}"]
+            # An arm's own takes precedence.
+            if phase not in phases_of_options:
+                words += ["--phase", f"{phase}={iterations}"]
         gains = "naive" if arm.gains == "naive" else str(folder / str(arm.gains))
         words += ["--gains", gains]
         if arm.ranges_from is not None:
             words += ["--ranges-from", str(folder / arm.ranges_from)]
-        options = [*shlex.split(training.options), *shlex.split(arm.options)]
         for word in options:
             option = word.partition("=")[0]
             if option in _NAMED_ELSEWHERE:
@@ -185,33 +199,61 @@ _NAMED_ELSEWHERE = {
 """Options of `pronk train` that a study has elsewhere, and where."""
 
 
-def _plan_tables(plan: StudyPlan) -> list[Table]:
-    """Return what a study runs and asks, and what that takes."""
+def _plan_tables(plan: StudyPlan, gpus: PlannedGpus, estimate: TrainingTime | None) -> list[Table]:
+    """Return what a study runs and asks, and what that takes.
+
+    Args:
+        plan: The study.
+        gpus: The GPUs that it is planned for.
+        estimate: Time of the trainings on them; None where it is not known.
+    """
     from pronk.jump.study.config import comparison_robots
     from pronk.jump.study.study_results import OTHER_ROBOT, OWN_ROBOT, compared_outcome
-    from pronk.tables import Column, Table
+    from pronk.tables import Cell, Column, Table
 
     config = plan.config
+    amount_rows: list[tuple[Cell, ...]] = [
+        ("arms", ", ".join(arm.name for arm in plan.arms)),
+        ("seeds", ", ".join(map(str, config.seed_numbers))),
+        ("robots", _robots_text(plan)),
+        ("commands", ", ".join(case.name for case in config.trial.cases())),
+        ("trainings", plan.trainings),
+    ]
+    notes = []
+    if plan.trainings:
+        amount_rows.append(("iterations of a training", _iterations_text(plan)))
+        amount_rows.append(("robots in a training", f"{config.training.envs:,}"))
+        amount_rows.append(("environment steps", f"{plan.env_steps:,}"))
+        time_text = f"not known ({gpus.words})"
+        hours_text = "not known"
+        if estimate is not None:
+            amount_rows.append(("GPUs", f"{estimate.gpus} ({gpus.words})"))
+            at_once = f"up to {estimate.per_gpu}"
+            if not gpus.is_per_gpu_given:
+                at_once += " (assumed; found while they run, or --per-gpu)"
+            amount_rows.append(("trainings on a GPU at once", at_once))
+            time_text = _range_text(estimate.low_s / 60.0, estimate.high_s / 60.0, "minutes")
+            hours_text = _range_text(*estimate.gpu_hours, "h")
+        amount_rows.append(("time of the trainings", time_text))
+        amount_rows.append(("GPU hours", hours_text))
+        notes += _time_notes(plan, estimate)
+    amount_rows += [
+        ("trials (policy on robot)", plan.trials),
+        ("jumps", plan.jumps),
+        ("core hours of trials", f"{plan.core_hours:.2f}"),
+    ]
+    notes.append("Core hours: at 3 s a jump. A training needs one core beside its share of a GPU.")
+    single_seed = [arm.name for arm in plan.arms if len(plan.seeds(arm)) == 1]
+    if single_seed:
+        notes.append(
+            f"One seed (n = 1) of {', '.join(single_seed)}: no intervals, also of comparisons in "
+            "which it counts; two seeds are the fewest."
+        )
     amounts = Table(
         title=config.title,
         columns=(Column(heading="what"), Column(heading="how much")),
-        rows=(
-            ("arms", ", ".join(arm.name for arm in plan.arms)),
-            ("seeds", ", ".join(map(str, config.seed_numbers))),
-            ("robots", _robots_text(plan)),
-            ("commands", ", ".join(case.name for case in config.trial.cases())),
-            ("trainings", plan.trainings),
-            ("environment steps", f"{plan.env_steps:,}"),
-            ("GPU hours", f"{plan.gpu_hours:.2f}"),
-            ("trials (policy on robot)", plan.trials),
-            ("jumps", plan.jumps),
-            ("core hours of trials", f"{plan.core_hours:.2f}"),
-        ),
-        notes=(
-            "GPU hours: at 340,000 steps/s of four trainings of 4,096 robots on one H200 under "
-            "MPS; 16 trainings of the recipe take four GPUs about 22 minutes. Core hours: at 3 s a "
-            "jump. A training needs one core beside its share of a GPU.",
-        ),
+        rows=tuple(amount_rows),
+        notes=tuple(notes),
     )
     rows = []
     for name, comparison in config.comparisons.items():
@@ -235,6 +277,65 @@ def _plan_tables(plan: StudyPlan) -> list[Table]:
         rows=tuple(rows),
     )
     return [amounts, comparisons] if rows else [amounts]
+
+
+def _iterations_text(plan: StudyPlan) -> str:
+    """Return the iterations of a training, of each number the arms that have it."""
+    arms_by_iterations: dict[int, list[str]] = {}
+    for arm in plan.arms:
+        if arm.training is not None:
+            arms_by_iterations.setdefault(arm.training.iterations, []).append(arm.name)
+    if len(arms_by_iterations) == 1:
+        return f"{next(iter(arms_by_iterations)):,}"
+    parts = []
+    for iterations, names in arms_by_iterations.items():
+        parts.append(f"{iterations:,} ({', '.join(names)})")
+    return ", ".join(parts)
+
+
+def _range_text(low: float, high: float, unit: str) -> str:
+    """Return a range of estimates with two or three digits."""
+    digits = 0 if high >= 10.0 else 1 if high >= 1.0 else 2
+    texts = [f"{low:,.{digits}f}", f"{high:,.{digits}f}"]
+    if texts[0] == texts[1]:
+        return f"{texts[0]} {unit}"
+    return f"{texts[0]} to {texts[1]} {unit}"
+
+
+def _time_notes(plan: StudyPlan, estimate: TrainingTime | None) -> list[str]:
+    """Return what the time of the trainings rests on, or why there is none."""
+    from pronk.jump.study.training_time import MEASURED_ENVS, RATES, SOURCE, START_S
+
+    if estimate is None:
+        return [
+            "The time of trainings is estimated for GPUs alone. No rate was measured on the CPU, "
+            "which is for tests."
+        ]
+    rates = ", ".join(f"{rate:,.0f} each of {count}" for count, rate in RATES.items())
+    notes = [
+        f"Time: by steps/s measured with {MEASURED_ENVS:,} Mini Cheetahs in a training on H200 "
+        f"under MPS, by the number of trainings on a GPU: {rates} ({SOURCE}; of 2 interpolated), "
+        f"and {START_S[0]:.0f} to {START_S[1]:.0f} s of a training for building, compiling and "
+        "export. An environment step is one policy step of one robot. Other GPUs have other "
+        "rates. Trainings that are done already count too."
+    ]
+    at_once = min(estimate.per_gpu, -(-plan.trainings // estimate.gpus))
+    if at_once > max(RATES):
+        notes.append(
+            f"{at_once} trainings on a GPU were not measured: taken to reach together what "
+            f"{max(RATES)} do."
+        )
+    if plan.config.training.envs != MEASURED_ENVS:
+        notes.append(
+            f"{plan.config.training.envs:,} robots in a training were not measured: the time is "
+            f"between that of as many iterations and that of as many environment steps of "
+            f"{MEASURED_ENVS:,} robots."
+        )
+    for arm in plan.arms:
+        if arm.training is not None and arm.training.settings.devices.compile:
+            notes.append("--compile is not counted: it was measured for one training alone.")
+            break
+    return notes
 
 
 def _robots_text(plan: StudyPlan) -> str:

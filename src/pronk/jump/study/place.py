@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -56,6 +57,20 @@ class StudyPlace:
     def is_given(self) -> bool:
         """True if any of the options was given."""
         return (self.gpus, self.per_gpu, self.jobs, self.cluster) != (None, None, None, None)
+
+    @property
+    def words(self) -> list[str]:
+        """The options as on the command line."""
+        words = []
+        for option, value in (
+            ("--gpus", self.gpus),
+            ("--per-gpu", self.per_gpu),
+            ("--jobs", self.jobs),
+            ("--cluster", self.cluster),
+        ):
+            if value is not None:
+                words += [option, str(value)]
+        return words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +139,61 @@ def choose_place(place: StudyPlace, device: Literal["auto", "cpu", "cuda"]) -> C
     jobs = place.jobs or int(cores)
     training = TrainingPlace(device="cpu", cores=cores / jobs)
     return ChosenPlace(training=training, cores=cores)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedGpus:
+    """The GPUs for which a study is planned; they need not be in this host."""
+
+    count: int | None
+    """Number of GPUs; None where the trainings would have none, or it is not known."""
+    per_gpu: int = CLUSTER_PER_GPU
+    """Trainings on one GPU at once."""
+    is_per_gpu_given: bool = False
+    """False where it is the number that was measured, for want of another."""
+    words: str
+    """Where the number of GPUs comes from, or why there is none, in a few words."""
+
+
+def planned_gpus(place: StudyPlace, device: Literal["auto", "cpu", "cuda"]) -> PlannedGpus:
+    """Return the GPUs to plan for: those that are named, or those of this host.
+
+    Args:
+        place: The options.
+        device: auto: GPUs if there are any.
+
+    Raises:
+        PronkError: GPUs that are no numbers.
+    """
+    from pronk.jump.train.devices import visible_gpus
+
+    count = None
+    if device == "cpu":
+        if place.gpus is not None:
+            raise PronkError(f"--gpus {place.gpus} goes with a GPU; leave it or --device cpu out.")
+        words = "--device cpu"
+    elif place.cluster is not None:
+        words = "those of the cluster are not counted before; plan with --gpus 0,1,2,3 for four"
+    elif place.gpus is not None and place.gpus != "all":
+        numbers = [word.strip() for word in place.gpus.split(",")]
+        are_numbers = all(number.isdigit() for number in numbers)
+        if not are_numbers or len(set(numbers)) != len(numbers):
+            raise PronkError(
+                f"--gpus {place.gpus!r}: expected different numbers, as in 0,1, or all."
+            )
+        count = len(numbers)
+        words = f"--gpus {place.gpus}"
+    elif find_spec("torch") is not None and visible_gpus():
+        count = len(visible_gpus())
+        words = "those of this host"
+    else:
+        words = "no GPU here; --gpus 0,1,2,3 plans for a host with four"
+    return PlannedGpus(
+        count=count,
+        per_gpu=place.per_gpu or CLUSTER_PER_GPU,
+        is_per_gpu_given=place.per_gpu is not None,
+        words=words,
+    )
 
 
 @contextmanager

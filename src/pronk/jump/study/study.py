@@ -54,6 +54,7 @@ from pronk.jump.study.tasks import (
     copied_input,
     written_input,
 )
+from pronk.jump.study.training_time import TrainingSize, TrainingTime, training_time
 from pronk.jump.study.trainings import (
     TrainingArm,
     TrainingPlace,
@@ -80,8 +81,6 @@ from pronk.robots.robot import RobotSpec
 TRIALS = "trials"
 NOMINAL_CONDITION = b"schema: pronk/conditions/1\nconditions:\n- name: nominal\n"
 """File of conditions of a trial whose robot is in its `--sim-params`."""
-STEPS_PER_SECOND_AND_GPU = 340_000
-"""Rate at which `--plan` counts: four trainings of 4,096 robots on one H200 under MPS."""
 SECONDS_A_JUMP = 3.0
 """Time of a jump on one core by which `--plan` counts [s]; docs/try.md."""
 
@@ -166,10 +165,21 @@ class StudyPlan:
         """Names of the arms that are tried on each robot."""
         return {robot.name: robot.arms for robot in self.robots}
 
-    @property
-    def gpu_hours(self) -> float:
-        """Estimated time on one GPU with four trainings side by side [h]."""
-        return self.env_steps / STEPS_PER_SECOND_AND_GPU / 3600.0
+    def time_on(self, gpus: int, per_gpu: int) -> TrainingTime:
+        """Return the estimated time of all trainings; there has to be one.
+
+        Args:
+            gpus: Number of GPUs.
+            per_gpu: Most trainings on one GPU at once.
+        """
+        sizes = []
+        # In the order of `training_tasks`.
+        for _ in self.config.seed_numbers:
+            for arm in self.arms:
+                if arm.training is not None:
+                    training = arm.training
+                    sizes.append(TrainingSize(env_steps=training.env_steps, envs=training.envs))
+        return training_time(sizes, gpus, per_gpu)
 
     @property
     def core_hours(self) -> float:
@@ -691,12 +701,25 @@ def runs_csv(plan: StudyPlan, jumps: Jumps) -> str:
     return text.getvalue()
 
 
-def plan_figures(plan: StudyPlan) -> dict[str, Any]:
-    """Return the figures of a plan for `--json`."""
+def plan_figures(plan: StudyPlan, estimate: TrainingTime | None) -> dict[str, Any]:
+    """Return the figures of a plan for `--json`.
+
+    Args:
+        plan: The study.
+        estimate: Time of its trainings; None where it is not known.
+    """
+    seconds = None
+    gpu_hours = None
+    if estimate is not None:
+        seconds = [estimate.low_s, estimate.high_s]
+        gpu_hours = list(estimate.gpu_hours)
     return {
         "trainings": plan.trainings,
         "env_steps": plan.env_steps,
-        "gpu_hours": plan.gpu_hours,
+        "training_seconds": seconds,
+        "gpu_hours": gpu_hours,
+        "gpus": None if estimate is None else estimate.gpus,
+        "per_gpu": None if estimate is None else estimate.per_gpu,
         "trials": plan.trials,
         "jumps": plan.jumps,
         "core_hours": plan.core_hours,

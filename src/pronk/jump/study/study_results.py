@@ -109,14 +109,14 @@ class ComparedArms:
         for arm, count in zip(self.counted_arms, self.seeds, strict=False):
             if count < 2:
                 arms_by_count[count].append(arm)
-        where = " on every robot here" if len(self.robots) > 1 else ""
+        place = " on every robot here" if len(self.robots) > 1 else ""
         reasons = []
         if arms_by_count[0]:
-            reasons.append(f"no seed with a value{where} of {', '.join(arms_by_count[0])}")
+            reasons.append(f"no seed with a value{place} of {', '.join(arms_by_count[0])}")
         if arms_by_count[1]:
-            each = " each" if len(arms_by_count[1]) > 1 else ""
+            seed_words = "one seed each" if len(arms_by_count[1]) > 1 else "one seed"
             reasons.append(
-                f"one seed{where}{each} of {', '.join(arms_by_count[1])} (n = 1), which shows no "
+                f"{seed_words}{place} of {', '.join(arms_by_count[1])} (n = 1), which shows no "
                 "scatter over seeds"
             )
         return "; ".join(reasons) or "fewer than two seeds of an arm"

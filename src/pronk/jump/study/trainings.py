@@ -52,13 +52,23 @@ class TrainingArm:
         return file_name(self.name).replace(" ", "_")
 
     @property
-    def env_steps(self) -> int:
-        """Number of environment steps of one training."""
+    def envs(self) -> int:
+        """Number of robots."""
+        return self.settings.envs or 4096
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations of one training."""
         iterations = self.settings.iterations
         total = sum(iterations.values())
         if self.settings.task == "jump":
             total -= iterations["walk"]
-        return total * STEPS_PER_ITERATION * (self.settings.envs or 4096)
+        return total
+
+    @property
+    def env_steps(self) -> int:
+        """Number of environment steps of one training."""
+        return self.iterations * STEPS_PER_ITERATION * self.envs
 
 
 @dataclass(frozen=True, kw_only=True)
