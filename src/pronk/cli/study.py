@@ -191,6 +191,7 @@ _NAMED_ELSEWHERE = {
     "--minutes": "a study stops by Ctrl-C",
     "--device": "it is an option of `pronk study`",
     "--gpu-ids": "give --gpus to `pronk study`",
+    "--hosts": "give --cluster to `pronk study`",
     "--gpus": "give it to `pronk study`",
     "--per-gpu": "give it to `pronk study`",
     "--jobs": "give it to `pronk study`",

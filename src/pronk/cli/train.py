@@ -38,6 +38,7 @@ def train_command(
     Example:
         pronk train all --gains gains.yaml --out runs/matched
         pronk train all --gains naive --gains gains.yaml --seeds 1-4 --gpus all --out runs/study
+        pronk train all --gains gains.yaml --hosts node1,node2 --gpu-ids all --out /shared/matched
 
     Args:
         settings: What is trained.
@@ -54,7 +55,7 @@ def train_command(
 
     from pronk.jump.train.run import run_training
 
-    resume = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
+    resume = _resume_command(settings)
     try:
         record = run_training(settings, report=console.say)
     except KeyboardInterrupt:
@@ -143,12 +144,30 @@ def _check_many(settings: TrainSettings, many: ManyOptions, gains: tuple[str, ..
         raise PronkError(
             "--gpu-ids spreads one training over GPUs; give --gpus for several trainings."
         )
+    if settings.devices.hosts is not None:
+        raise PronkError(
+            "--hosts spreads one training over machines; give --cluster for several trainings."
+        )
     if settings.session.minutes is not None:
         raise PronkError("--minutes goes with a single training; stop several by Ctrl-C.")
     if settings.resume:
         raise PronkError(
             "several trainings need no --resume: the command that began them goes on in its folder."
         )
+
+
+def _resume_command(settings: TrainSettings) -> str:
+    """Return the command that continues a run on the same devices."""
+    words = ["pronk", "train", settings.task, "--resume", "--out", str(settings.out)]
+    if settings.devices.device != "auto":
+        words += ["--device", settings.devices.device]
+    if settings.devices.gpu_ids is not None:
+        words += ["--gpu-ids", settings.devices.gpu_ids]
+    if settings.devices.hosts is not None:
+        words += ["--hosts", settings.devices.hosts]
+    if settings.devices.compile:
+        words.append("--compile")
+    return shlex.join(words)
 
 
 def _show_phases(phases: Mapping[str, Mapping[str, Any]]) -> None:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import re
 import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-from mjlab.scripts.train import TrainConfig, run_train
+from mjlab.scripts.train import TrainConfig
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256, written_whole
 from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, gains_of, training_gains
+from pronk.jump.train.hosts import Host, check_hosts
+from pronk.jump.train.launch import LOCAL_HOST, launch, train_process
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
@@ -30,12 +29,9 @@ from pronk.jump.train.recipe import (
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import JumpRunnerCfg
 from pronk.jump.train.settings import TrainSettings
-from pronk.jump.train.tasks import JUMP_TASK, Task, load_task
+from pronk.jump.train.tasks import Task, load_task
 from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives
 from pronk.robots.robot import RobotSpec
-
-COPIED_VARIABLES = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
-"""Environment variables that the processes of several GPUs get, beside torchrunx's own."""
 
 
 def run_training(
@@ -65,16 +61,33 @@ def run_training(
     else:
         folder.check_fresh()
         settings = settings.completed()
-    gpus = devices.find_devices(settings.devices.device, settings.devices.gpu_ids)
+    hosts: tuple[Host, ...] = ()
+    is_over = settings.resume and record["finished"]
+    if settings.devices.host_names and not is_over:
+        if not settings.resume:
+            check_training(settings)
+        report(f"asking {', '.join(settings.devices.host_names)} whether they can train together")
+        hosts = check_hosts(
+            settings.devices.host_names,
+            robot=str(settings.robot),
+            device=settings.devices.device,
+            gpu_ids=settings.devices.gpu_ids,
+            out=settings.out,
+        )
+        gpus = hosts[0].facts.gpus
+    else:
+        gpus = devices.find_devices(settings.devices.device, settings.devices.gpu_ids)
     # Hide all other GPUs from this process and its children, before any uses CUDA.
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)
+    processes = max(len(gpus), 1) * max(len(hosts), 1)
     if not settings.resume:
         record = _begin(folder, settings)
-    report(_summary(settings, record, gpus))
+    report(_summary(settings, record, gpus, hosts))
     if record["finished"]:
         return record
+    _check_processes(folder, settings, processes)
     report("building the robots and compiling kernels")
-    return _train_session(folder, settings, processes=max(len(gpus), 1))
+    return _train_session(folder, settings, hosts, processes)
 
 
 def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | None]:
@@ -95,6 +108,22 @@ def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | Non
     recipe = load_recipes(settings.recipe) if settings.recipe else None
     _env_cfg(task, gains, settings, recipe)
     return gains, recipe
+
+
+def _check_processes(folder: RunFolder, settings: TrainSettings, processes: int) -> None:
+    """Refuse to go on with another number of processes, and so of robots, than the run has."""
+    last_checkpoint = checkpoint.latest_checkpoint(folder.path)
+    if last_checkpoint is None:
+        return
+    infos = checkpoint.read_checkpoint(last_checkpoint)["infos"] or {}
+    # Earlier versions did not record it, and a run that begins with a walking policy has not begun.
+    processes_before = infos.get("processes", processes)
+    if processes != processes_before:
+        raise PronkError(
+            f"--resume: the run in {folder.path} has {processes_before} processes of "
+            f"{settings.envs} robots each, and this would be {processes}; give --gpu-ids and "
+            "--hosts as before, or a new --out."
+        )
 
 
 def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
@@ -221,7 +250,9 @@ def _env_cfg(
     return cfg
 
 
-def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, ...]) -> str:
+def _summary(
+    settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, ...], hosts: tuple[Host, ...]
+) -> str:
     """Return one line on what is trained."""
     phases = []
     for name, iterations in settings.iterations.items():
@@ -242,7 +273,11 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
     if settings.recipe:
         recipe_words = f", recipe {' + '.join(map(str, settings.recipe))}"
     device_text = "cpu"
-    if len(gpus) == 1:
+    if len(hosts) > 1:
+        processes = len(hosts) * max(len(gpus), 1)
+        kind = "GPUs" if gpus else "processes"
+        device_text = f"each of {processes} {kind} of {len(hosts)} hosts"
+    elif len(gpus) == 1:
         device_text = "cuda"
     elif len(gpus) > 1:
         device_text = f"each of {len(gpus)} GPUs"
@@ -253,34 +288,31 @@ def _summary(settings: TrainSettings, record: dict[str, Any], gpus: tuple[str, .
     )
 
 
-def _train_session(folder: RunFolder, settings: TrainSettings, processes: int) -> dict[str, Any]:
+def _train_session(
+    folder: RunFolder, settings: TrainSettings, hosts: tuple[Host, ...], processes: int
+) -> dict[str, Any]:
     """Train in this process, or in one for each GPU; returns the provenance of the run."""
     begin = time.monotonic()
     config = _train_config(folder, settings)
     record = folder.read()
     session = provenance.new_session()
     session["compiled"] = settings.devices.compile  # which rounds otherwise
+    session["processes"] = processes
+    if hosts:
+        session["hosts"] = [host.record() for host in hosts]
     record["sessions"].append(session)
     folder.write(record)
     log_dir = folder.path.resolve()
     try:
-        if processes == 1:
-            _train_process(config, log_dir)
+        if hosts:
+            launch(config, log_dir, settings.devices.host_names, hosts[0].processes)
+        elif processes > 1:
+            launch(config, log_dir, (LOCAL_HOST,), processes)
         else:
-            import torchrunx
-
-            os.environ.setdefault("TORCHRUNX_LOG_DIR", str(log_dir / "torchrunx"))
-            launcher = torchrunx.Launcher(
-                hostnames=["localhost"],
-                workers_per_host=processes,
-                backend=None,  # rsl_rl makes the process group itself
-                copy_env_vars=(*torchrunx.DEFAULT_ENV_VARS_FOR_COPY, *COPIED_VARIABLES),
-            )
-            launcher.run(_train_process, config, log_dir)
+            train_process(config, log_dir)
     finally:
         session["seconds"] = time.monotonic() - begin
-        is_gpu = os.environ["CUDA_VISIBLE_DEVICES"] != ""
-        session["device"] = devices.device_facts("cuda" if is_gpu else "cpu", processes)
+        session["device"] = _session_device(hosts, processes)
         last_checkpoint = checkpoint.latest_checkpoint(folder.path)
         if last_checkpoint is not None:
             state = checkpoint.read_checkpoint(last_checkpoint)
@@ -290,6 +322,17 @@ def _train_session(folder: RunFolder, settings: TrainSettings, processes: int) -
             session["stopped"] = infos.get("stopped", "")
         folder.write(record)
     return record
+
+
+def _session_device(hosts: tuple[Host, ...], processes: int) -> dict[str, Any]:
+    """Return the record of the devices of all processes, which are alike."""
+    if not hosts:
+        is_gpu = os.environ["CUDA_VISIBLE_DEVICES"] != ""
+        return devices.device_facts("cuda" if is_gpu else "cpu", processes)
+    device = dict(hosts[0].facts.device)
+    if "count" in device:
+        device["count"] = processes
+    return device
 
 
 def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
@@ -315,23 +358,4 @@ def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
         agent.stop_at = time.time() + 60.0 * settings.session.minutes
     if checkpoint.latest_checkpoint(folder.path) is not None:
         agent.resume = True
-        agent.load_run = f"^{re.escape(folder.path.resolve().name)}$"
-        agent.load_checkpoint = r"^model_\d+\.pt$"
     return TrainConfig(env=_env_cfg(task, gains, settings, recipe), agent=agent)
-
-
-def _train_process(config: TrainConfig, log_dir: Path) -> None:
-    """Do what one process does: all of a session, with what the libraries print in a file."""
-    rank = int(os.environ.get("RANK", "0"))
-    log_file = log_dir / ("train.log" if rank == 0 else f"train.{rank}.log")
-    device = "cpu"
-    if os.environ["CUDA_VISIBLE_DEVICES"]:
-        device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
-        torch.cuda.set_device(device)
-    with (
-        log_file.open("a", encoding="utf-8", buffering=1) as file,
-        contextlib.redirect_stdout(file),
-    ):
-        devices.compile_kernels(device)
-        # mjlab looks up the class of the runner by the name of the task, and nothing else.
-        run_train(JUMP_TASK, config, log_dir)

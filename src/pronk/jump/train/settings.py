@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import tyro
 
 from pronk.errors import PronkError
+from pronk.jump.train.hosts import parse_hosts
 from pronk.jump.train.phases import TASKS
 
 WEAKEST_DRIVE = 0.3
@@ -23,10 +24,22 @@ class DeviceSettings:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU if there is one; the CPU is for tests."""
     gpu_ids: str | None = None
-    """GPUs of this host, as in 0,1, or all; 0."""
+    """GPUs of this host, or of each of --hosts, as in 0,1, or all; 0."""
+    hosts: str | None = None
+    """Machines to train on together, over SSH, as in node1,node2; this one alone. The first has
+    process 0, which writes the run. All share --out."""
     compile: bool = False
     """Compile rewards, networks and losses with torch.compile, which changes how they round;
     compiling takes time at first."""
+
+    def __post_init__(self) -> None:
+        """Refuse names that are no hosts."""
+        _ = self.host_names
+
+    @property
+    def host_names(self) -> tuple[str, ...]:
+        """The names in `hosts`; empty if it was left out."""
+        return () if self.hosts is None else parse_hosts(self.hosts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +98,7 @@ class TrainSettings:
     init_checkpoint: Path | None = None
     """jump: folder of a walking run, or one of its checkpoints."""
     envs: int | None = None
-    """Robots on each device; 4096."""
+    """Robots of each process, which has one GPU; 4096."""
     seed: int | None = None
     """Seed of all draws; 1. Process r of several draws from seed + r."""
     phase: tuple[str, ...] = ()

@@ -7,6 +7,7 @@ writes the policy, `walk.onnx` and `policy.onnx`, and a checkpoint named after t
 from __future__ import annotations
 
 import math
+import os
 import signal
 import statistics
 import sys
@@ -115,6 +116,25 @@ class PronkRunner(MjlabOnPolicyRunner):
         self._shown_at = -math.inf
         self._wrote_progress_at = -math.inf
         self._jumping = False
+
+    def _configure_multi_gpu(self) -> None:
+        """Make the process group, of GPUs as rsl_rl does; it has none of CPUs."""
+        world_size = int(os.environ.get("WORLD_SIZE", "1"))
+        if self.device != "cpu" or world_size == 1:
+            super()._configure_multi_gpu()
+            return
+        self.gpu_world_size = world_size
+        self.is_distributed = True
+        self.gpu_local_rank = int(os.environ["LOCAL_RANK"])
+        self.gpu_global_rank = int(os.environ["RANK"])
+        self.cfg["multi_gpu"] = {
+            "global_rank": self.gpu_global_rank,
+            "local_rank": self.gpu_local_rank,
+            "world_size": world_size,
+        }
+        torch.distributed.init_process_group(
+            backend="gloo", rank=self.gpu_global_rank, world_size=world_size
+        )
 
     @property
     def iteration(self) -> int:
@@ -388,6 +408,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             "speed_ranges": float(motion_command(env).ranges.grown),
             "phases": self.phases,
             "seconds": self._seconds,
+            "processes": self.gpu_world_size,
             "stopped": self.stop_reason,
         }
         checkpoint.write_checkpoint(Path(path), state)

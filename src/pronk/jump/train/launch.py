@@ -1,0 +1,190 @@
+"""The processes of one training: this one, or one for each GPU of each host, by torchrunx.
+
+torchrunx starts an agent on each host, which starts the processes; on other hosts over SSH. Process
+r of all draws from seed + r. The processes average gradients, and process 0 alone, on the first
+host, writes the run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import torch
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.scripts import train as mjlab_train
+from mjlab.utils.os import dump_yaml
+from mjlab.utils.torch import configure_torch_backends
+from mjlab.utils.wandb import add_wandb_tags
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.jump.train import devices
+from pronk.jump.train.hosts import COPIED_VARIABLES
+from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.rl import checkpoint
+from pronk.jump.train.rl.runner import PronkRunner
+
+LOCAL_HOST = "localhost"
+"""Name of this machine for torchrunx, which needs no SSH for it."""
+LOG_FOLDER = "torchrunx"
+"""Folder in that of the run, with what each agent and process prints."""
+AGENT_S = 180
+"""Longest silence of an agent until its host counts as lost [s]."""
+STOP_S = 60.0
+"""Longest wait for the checkpoint of a training that is interrupted [s]; the agents kill processes
+that have not ended 30 s after they were told to."""
+
+
+def launch(
+    config: mjlab_train.TrainConfig, log_dir: Path, hosts: Sequence[str], processes: int
+) -> None:
+    """Train by several processes, until the last phase is over or training is stopped.
+
+    `CUDA_VISIBLE_DEVICES` of this process holds for all of them, as do the other
+    `COPIED_VARIABLES`.
+
+    Args:
+        config: mjlab's configuration of the training.
+        log_dir: Folder of the run, which all hosts share.
+        hosts: Names of the hosts; process 0 is on the first.
+        processes: Number of processes on each host.
+
+    Raises:
+        PronkError: Learning has diverged, or a process was lost.
+    """
+    import torchrunx
+    from torchrunx.utils.errors import AgentFailedError, WorkerFailedError
+
+    first_checkpoint = checkpoint.latest_checkpoint(log_dir)
+    launcher = torchrunx.Launcher(
+        hostnames=list(hosts),
+        workers_per_host=processes,
+        backend=None,  # the runner makes the process group itself
+        agent_timeout=AGENT_S,
+        copy_env_vars=COPIED_VARIABLES,
+    ).set_logging_handlers(partial(_log_handlers, tuple(hosts), processes, log_dir))
+    try:
+        with _terminated_as_interrupted():
+            launcher.run(train_process, config, log_dir)
+    except KeyboardInterrupt:
+        _wait_for_checkpoint(log_dir, first_checkpoint)
+        raise
+    except (AgentFailedError, WorkerFailedError, torch.distributed.DistError) as error:
+        reason = str(error) or type(error).__name__
+        raise PronkError(
+            f"the training on {', '.join(hosts)} lost a process ({reason}); "
+            f"{log_dir / LOG_FOLDER} has what each printed. --resume goes on from the last "
+            "checkpoint."
+        ) from error
+
+
+def train_process(config: mjlab_train.TrainConfig, log_dir: Path) -> None:
+    """Do what one process does: all of a session, with what the libraries print in a file.
+
+    It is mjlab's `run_train` for tasks of this package, which on a CPU knows one process only.
+
+    Args:
+        config: mjlab's configuration of the training.
+        log_dir: Folder of the run.
+    """
+    rank = int(os.environ.get("RANK", "0"))
+    log_file = log_dir / ("train.log" if rank == 0 else f"train.{rank}.log")
+    device = "cpu"
+    if os.environ["CUDA_VISIBLE_DEVICES"]:
+        local_rank = os.environ.get("LOCAL_RANK", "0")
+        device = f"cuda:{local_rank}"
+        torch.cuda.set_device(device)
+        # The device that MuJoCo renders on.
+        os.environ["MUJOCO_EGL_DEVICE_ID"] = local_rank
+    config.agent.seed += rank
+    config.env.seed = config.agent.seed
+    with (
+        log_file.open("a", encoding="utf-8", buffering=1) as file,
+        contextlib.redirect_stdout(file),
+        _closed_process_group(),
+    ):
+        devices.compile_kernels(device)
+        configure_torch_backends()
+        env = RslRlVecEnvWrapper(
+            ManagerBasedRlEnv(cfg=config.env, device=device), clip_actions=config.agent.clip_actions
+        )
+        agent_values = asdict(config.agent)
+        if rank == 0:
+            # The runner changes what it is given.
+            dump_yaml(log_dir / "params" / "env.yaml", asdict(config.env))
+            dump_yaml(log_dir / "params" / "agent.yaml", agent_values)
+        runner = PronkRunner(env, agent_values, str(log_dir), device)
+        add_wandb_tags(config.agent.wandb_tags)
+        runner.add_git_repo_to_log(mjlab_train.__file__)
+        if config.agent.resume:
+            runner.load(str(RunFolder(log_dir).checkpoint()))
+        runner.learn(config.agent.max_iterations, init_at_random_ep_len=True)
+        env.close()
+
+
+def _log_handlers(hosts: tuple[str, ...], processes: int, log_dir: Path) -> list[logging.Handler]:
+    """Return where what is printed goes: all of it to files, that of process 0 here as well."""
+    from torchrunx.utils.log_handling import RedirectHandler, file_handlers, get_handler_filter
+
+    handlers = file_handlers(
+        list(hosts), [processes] * len(hosts), log_dir / LOG_FOLDER, logging.INFO
+    )
+    progress = RedirectHandler()
+    progress.addFilter(get_handler_filter(hosts[0], 0))
+    return [progress, *handlers]
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt in the block, so that torchrunx ends its agents."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _wait_for_checkpoint(log_dir: Path, first: Path | None) -> None:
+    """Wait until processes that were told to stop have written their checkpoint.
+
+    Args:
+        log_dir: Folder of the run.
+        first: The last checkpoint before this session.
+    """
+    end = time.monotonic() + STOP_S
+    seen = first
+    while time.monotonic() < end:
+        path = checkpoint.latest_checkpoint(log_dir)
+        if path is not None and path != seen:
+            seen = path
+            with contextlib.suppress(ArtefactError):
+                if checkpoint.read_checkpoint(path)["infos"].get("stopped"):
+                    return
+        time.sleep(0.2)
+
+
+@contextlib.contextmanager
+def _closed_process_group() -> Iterator[None]:
+    """Leave the process group of a CPU after the block.
+
+    If one process fails, the others then notice at once that it is gone, where they would wait half
+    an hour for it.
+    """
+    try:
+        yield
+    finally:
+        distributed = torch.distributed
+        if distributed.is_initialized() and distributed.get_backend() == "gloo":
+            distributed.destroy_process_group()
