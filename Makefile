@@ -6,21 +6,30 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # As tests/conftest.py groups and orders them.
 DEAL := --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-slow docs lint clean
+.PHONY: demo test test-slow check docs lint ci clean
 
 demo: $(VENV)/.core
 	$(BIN)/pronk demo --out out/demo
 
-test: $(VENV)/.dev
+test: check
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live and not slow" --durations=30
+
+check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live and not slow" --durations=30
 
 # Trainings, whole trials and processes in real time.
 test-slow: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "slow and not live" --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) tests/live --durations=10
+
+# All of the above and the site. Two processes share all tests that are not live, so that neither
+# waits for the other in between.
+ci: $(VENV)/.dev $(VENV)/.docs
+	$(MAKE) -j 2 check docs
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) tests/live --durations=10
 
 # The documentation site, in build/docs.

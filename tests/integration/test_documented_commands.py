@@ -194,6 +194,9 @@ def bounded(words: Sequence[str], folder: Path) -> list[str]:
         bounded_words.append("--overwrite")
     elif name == "match" and "paper" in words:
         bounded_words.append("--no-zero-armature")
+        knee = folder / words[2] / "FR_knee.mcap"
+        if knee.exists():
+            bounded_words[2] = str(knee.relative_to(folder))
     elif name == "demo" and "--quick" not in words:
         bounded_words.append("--quick")
     return bounded_words
