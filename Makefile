@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# Of 25,000 installed modules those alone are compiled that are imported, once for all processes.
+unexport PYTHONDONTWRITEBYTECODE
+export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
 # As tests/conftest.py groups and orders them.
 DEAL := --dist loadgroup --no-loadscope-reorder
 
@@ -50,12 +53,12 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 
 # Everything the tests need. PyTorch by itself first, so that its pinned build is taken.
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install torch==2.13.0
-	$(PIP) install -c constraints.txt -e .[train,bench,hardware,video,play,engines,cluster,dev]
+	$(PIP) install --no-compile torch==2.13.0
+	$(PIP) install --no-compile -c constraints.txt -e .[train,bench,hardware,video,play,engines,cluster,dev]
 	touch $@ $(VENV)/.core
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install -c constraints.txt -e .[docs]
+	$(PIP) install --no-compile -c constraints.txt -e .[docs]
 	touch $@
 
 clean:

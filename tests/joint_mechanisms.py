@@ -228,6 +228,9 @@ def simulate_mechanisms(mechanisms: list[Mechanism], command: Array) -> Array:
     reading = np.empty_like(command)
     shaped = bool(np.isfinite(speed_limit).any() or np.isfinite(rate_limit).any())
     has_compliance = bool(compliant.any())
+    has_cogging = bool(cogging.any())
+    has_load_friction = bool(load.any())
+    has_stribeck = bool(stribeck.any())
     for step, sent in enumerate(late):
         measured = np.where(reads_link, end, motor) if has_compliance else motor
         reading[step] = measured
@@ -256,9 +259,15 @@ def simulate_mechanisms(mechanisms: list[Mechanism], command: Array) -> Array:
             stiffness * error + integral * summed + forward * target_speed - damping * slow_speed
         )
         torque = torque + torque_share * (np.clip(asked, -limit, limit) - torque)
-        applied = torque + cogging * np.sin(40.0 * motor)
-        friction = coulomb + load * np.abs(pull * np.sin(motor)) + load * 0.3 * np.abs(torque)
-        friction = friction + stribeck * np.exp(-((speed / (0.1 * amplitude * natural)) ** 2))
+        applied = torque
+        if has_cogging:
+            applied = torque + cogging * np.sin(40.0 * motor)
+        friction = coulomb
+        if has_load_friction:
+            weight = np.abs(pull * np.sin(motor))
+            friction = coulomb + load * weight + load * 0.3 * np.abs(torque)
+        if has_stribeck:
+            friction = friction + stribeck * np.exp(-((speed / (0.1 * amplitude * natural)) ** 2))
         if has_compliance:
             twist = spring * (motor - end) + 0.02 * damping * (speed - end_speed)
             end_speed = end_speed + STEP_S * (twist - pull * np.sin(end)) / link

@@ -651,10 +651,10 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
             torque += cosine * np.cos(q) + sine * np.sin(q)
             if law.soft_friction:
                 stop = _IMPEDANCE * (torque + _FRICTION_RATE * inertia * v)
-                v = v + gain * (torque - np.clip(stop, -friction, friction))
+                v = v + gain * (torque - np.minimum(np.maximum(stop, -friction), friction))
             else:
                 v = v + gain * torque
-                v = v - np.clip(v, -friction_speed, friction_speed)
+                v = v - np.minimum(np.maximum(v, -friction_speed), friction_speed)
             q = q + h * v
     return positions.transpose(1, 0, 2)
 
