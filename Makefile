@@ -6,8 +6,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Of 25,000 installed modules those alone are compiled that are imported, once for all processes.
 unexport PYTHONDONTWRITEBYTECODE
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
-# As tests/conftest.py groups and orders them.
-DEAL := --dist loadgroup --no-loadscope-reorder
+# A module in one process, in the order of tests/conftest.py.
+DEAL := --dist loadscope --no-loadscope-reorder
 
 .PHONY: demo test test-slow check docs lint ci clean
 
