@@ -17,6 +17,7 @@ from pronk.jump.train.mdp.commands import NAME as COMMAND
 from pronk.jump.train.phases import PHASES, TASKS, changed_phases
 from pronk.jump.train.recipe import SCHEMA, apply_recipe, load_recipe, load_recipes
 from pronk.jump.train.settings import DrawSettings, TrainSettings
+from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import ROBOT, config
 
@@ -184,24 +185,42 @@ def test_a_recipe_is_part_of_a_run(tmp_path: Path) -> None:
     assert TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored).recipe == ()
 
 
+def task_with(robot_name: str, layers: list[Path]) -> Any:
+    """Return the configuration of a robot's task, changed by a recipe."""
+    robot_task = load_task(robot_name)
+    gains = training_gains("naive", robot_task.robot)
+    cfg = robot_task.env_cfg(
+        robot_task.robot, gains, iterations=dict.fromkeys(PHASES, 10), num_envs=8
+    )
+    if layers:
+        apply_recipe(cfg, load_recipes(layers))
+    return cfg
+
+
+def settings_of(cfg: Any) -> str:
+    """Return all that a recipe may change of a task."""
+    phases = PHASES
+    if "changes" in cfg.curriculum["phases"].params:
+        phases = phases_of(cfg)
+    return repr((list(cfg.rewards), cfg.commands, cfg.actions, phases))
+
+
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_the_shipped_recipes_apply(path: Path) -> None:
-    """Each changes something, layers over forward.yaml, and says in its comments what for."""
+    """Each changes the task of a robot, over forward.yaml, and says in its comments what for."""
     base = path.with_name("forward.yaml")
-    layers = [base] if path == base else [base, path]
-    cfg = config(8, training_gains("naive", ROBOT))
-    before = repr((list(cfg.rewards), cfg.commands, cfg.actions, PHASES))
-    if path != base:
-        below = config(8, training_gains("naive", ROBOT))
-        apply_recipe(below, load_recipe(base))
-        before = repr((list(below.rewards), below.commands, below.actions, phases_of(below)))
-    apply_recipe(cfg, load_recipes(layers))
-    assert repr((list(cfg.rewards), cfg.commands, cfg.actions, phases_of(cfg))) != before
+    below = [] if path == base else [base]
+    changed_robots = []
+    for robot_name in ("mini_cheetah", "go2"):
+        cfg = task_with(robot_name, [*below, path])
+        if settings_of(cfg) != settings_of(task_with(robot_name, below)):
+            changed_robots.append(robot_name)
+        for phase in phases_of(cfg).values():
+            weights = {name: (term.weight,) for name, term in cfg.rewards.items()}
+            weights |= {name: span for name, span in phase.weights.items() if name in weights}
+            assert sum(1 for span in weights.values() if any(span)) <= 20
+    assert changed_robots
     assert path.read_text().startswith("# ")
-    for phase in phases_of(cfg).values():
-        weights = {name: (term.weight,) for name, term in cfg.rewards.items()}
-        weights |= {name: span for name, span in phase.weights.items() if name in weights}
-        assert sum(1 for span in weights.values() if any(span)) <= 20
 
 
 def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
