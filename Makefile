@@ -26,14 +26,15 @@ check: $(VENV)/.dev
 # Trainings, whole trials and processes in real time.
 test-slow: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "slow and not live" --durations=10
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) tests/live --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
-# All of the above and the site. Two processes share all tests that are not live, so that neither
+# All of the above and the site. Live tests run one after another: two at once missed states. Two
+# processes share all tests that are not live, so that neither
 # waits for the other in between.
 ci: $(VENV)/.dev $(VENV)/.docs
 	$(MAKE) -j 2 check docs
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) tests/live --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
 # The documentation site, in build/docs.
 docs: $(VENV)/.docs
