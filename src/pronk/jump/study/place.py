@@ -165,7 +165,7 @@ def planned_gpus(place: StudyPlace, device: Literal["auto", "cpu", "cuda"]) -> P
     Raises:
         PronkError: GPUs that are no numbers.
     """
-    from pronk.jump.train.devices import visible_gpus
+    from pronk.jump.train.devices import parse_gpu_ids, visible_gpus
 
     count = None
     if device == "cpu":
@@ -174,14 +174,8 @@ def planned_gpus(place: StudyPlace, device: Literal["auto", "cpu", "cuda"]) -> P
         words = "--device cpu"
     elif place.cluster is not None:
         words = "those of the cluster are not counted before; plan with --gpus 0,1,2,3 for four"
-    elif place.gpus is not None and place.gpus != "all":
-        numbers = [word.strip() for word in place.gpus.split(",")]
-        are_numbers = all(number.isdigit() for number in numbers)
-        if not are_numbers or len(set(numbers)) != len(numbers):
-            raise PronkError(
-                f"--gpus {place.gpus!r}: expected different numbers, as in 0,1, or all."
-            )
-        count = len(numbers)
+    elif place.gpus is not None and place.gpus.strip() != "all":
+        count = len(parse_gpu_ids(place.gpus, "--gpus"))
         words = f"--gpus {place.gpus}"
     elif find_spec("torch") is not None and visible_gpus():
         count = len(visible_gpus())

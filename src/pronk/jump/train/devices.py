@@ -39,6 +39,26 @@ def require_extra() -> None:
         )
 
 
+def parse_gpu_ids(gpu_ids: str, option: str) -> tuple[str, ...]:
+    """Read which GPUs an option names; returns their numbers, or `all` alone.
+
+    Args:
+        gpu_ids: Numbers with commas between them, or `all`.
+        option: The option, for the message.
+
+    Raises:
+        PronkError: It is neither, or a number is given twice.
+    """
+    words = tuple(word.strip() for word in gpu_ids.split(","))
+    if words == ("all",):
+        return words
+    are_numbers = all(word.isdigit() for word in words)
+    are_different = len(set(words)) == len(words)
+    if not (are_numbers and are_different):
+        raise PronkError(f"{option} {gpu_ids!r}: expected different numbers, as in 0,1, or all.")
+    return words
+
+
 def find_devices(
     requested: str = "auto", gpu_ids: str | None = None, option: str = "--gpu-ids"
 ) -> tuple[str, ...]:
@@ -55,16 +75,9 @@ def find_devices(
     Raises:
         PronkError: There is no such GPU.
     """
-    words = []
+    words: tuple[str, ...] = ()
     if gpu_ids is not None:
-        words = [word.strip() for word in gpu_ids.split(",")]
-    if words != ["all"]:
-        are_numbers = all(word.isdigit() for word in words)
-        are_different = len(set(words)) == len(words)
-        if not (are_numbers and are_different):
-            raise PronkError(
-                f"{option} {gpu_ids!r}: expected different numbers, as in 0,1, or all."
-            )
+        words = parse_gpu_ids(gpu_ids, option)
     if requested == "cpu":
         if words:
             raise PronkError(f"{option} {gpu_ids} goes with a GPU; leave it or --device cpu out.")
@@ -78,7 +91,7 @@ def find_devices(
                 "driver, or --device cpu for a test."
             )
         return ()
-    if words == ["all"]:
+    if words == ("all",):
         return gpus
     if not words:
         return (gpus[0],)
