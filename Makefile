@@ -8,8 +8,9 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
 # A module in one process, in the order of tests/conftest.py.
 DEAL := --dist loadscope --no-loadscope-reorder
+WHEN_IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 
-.PHONY: demo test test-slow check docs lint ci clean
+.PHONY: demo test test-slow check docs lint ci ci-live ci-others clean
 
 demo: $(VENV)/.core
 	$(BIN)/pronk demo --out out/demo
@@ -28,13 +29,17 @@ test-slow: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "slow and not live" --durations=10
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
-# All of the above and the site. Live tests run one after another: two at once missed states. Two
-# processes share all tests that are not live, so that neither
-# waits for the other in between.
+# All of the above and the site. Live tests run one after another, since two at once missed states.
+# All others run beside them, but only while a core is idle: SCHED_IDLE, in the same session, for
+# which anything else that wants to run takes the core at once.
 ci: $(VENV)/.dev $(VENV)/.docs
-	$(MAKE) -j 2 check docs
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
+	$(MAKE) -j 3 --output-sync=target ci-live ci-others
+
+ci-live: check docs
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
+
+ci-others: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(WHEN_IDLE) $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
 
 # The documentation site, in build/docs.
 docs: $(VENV)/.docs

@@ -104,10 +104,12 @@ def known_log(
     )
 
 
-def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
-    """Match a log the way `pronk match --method paper` does."""
+def fit_pronk(
+    log: JointLog, *, robot: RobotSpec, threads: int = 2, grid_points: int = 50
+) -> Estimate:
+    """Match a log the way `pronk match --method paper` does, whose grid has 50 points an axis."""
     before = time.perf_counter()
-    settings = MatchSettings(zero_armature=False, threads=threads)
+    settings = MatchSettings(zero_armature=False, threads=threads, grid_points=grid_points)
     result = match([log], robot, method="paper", settings=settings)
     gains = result.gains.joints[JOINT]
     return Estimate(

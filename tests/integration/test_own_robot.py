@@ -66,7 +66,9 @@ def test_sweep_match_predict_export(model: str, joint: str, tmp_path: Path) -> N
     accepted("robot", "check", robot)
     accepted("sweep", robot, "--out", logs, *sweep)
     # The virtual knee sticks at this amplitude, which a magnitude alone cannot tell from its gains.
-    method = ("time",) if model == "cheetah" else ("paper", "--no-zero-armature")
+    # A magnitude alone cannot tell from its gains that the knee sticks at this amplitude, and takes
+    # half a minute for the arm.
+    method = ("paper", "--no-zero-armature") if model == "pendulum" else ("time",)
     accepted("match", logs, "--robot", robot, "--out", gains, "--method", *method)
     accepted("predict", logs, "--robot", robot, "--gains", gains)
     accepted("export", gains, "--robot", robot, "--to", "mjcf", "--out", matched)

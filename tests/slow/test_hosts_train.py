@@ -18,6 +18,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from mjlab.scripts.train import TrainConfig
 
+from command_line import FinishedCommand, invoke
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.launch import LOCAL_HOST, launch
 from pronk.jump.train.phases import TASKS
@@ -88,14 +89,22 @@ def ssh_home(tmp_path: Path) -> Iterator[Path]:
         server.wait()
 
 
-def started(*arguments: str | Path, home: Path | None = None) -> subprocess.Popen[str]:
-    """Start `pronk train` of a small walking policy."""
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-    if home is not None:
-        environment["HOME"] = str(home)
+@pytest.fixture(autouse=True)
+def one_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train on the CPU, each process on one core."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+def trained(*arguments: str | Path) -> FinishedCommand:
+    """Run `pronk train` of a small walking policy in this process, and what it starts."""
+    return invoke([*WORDS, *arguments])
+
+
+def started(*arguments: str | Path) -> subprocess.Popen[str]:
+    """Start `pronk train` of a small walking policy in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-c", CODE, *WORDS, *[str(argument) for argument in arguments]],
-        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -117,9 +126,9 @@ def test_two_hosts_over_ssh_train_as_two_processes_of_one_host(
 ) -> None:
     hosts = ("--hosts", ",".join(HOSTS))
     folder = RunFolder(tmp_path / "ssh")
-    process = started(*NEW, *hosts, "--minutes", "0.0001", "--out", folder.path, home=ssh_home)
-    output, _ = process.communicate()
-    assert process.returncode == 0, output
+    monkeypatch.setenv("HOME", str(ssh_home))
+    first = trained(*NEW, *hosts, "--minutes", "0.0001", "--out", folder.path)
+    assert first.exit_code == 0, first.output
     assert (ssh_home / "sshd.log").read_text().count("Accepted publickey") >= 4
     assert not list(tmp_path.glob(".pronk-hosts-*"))
     record = folder.read()
@@ -128,7 +137,7 @@ def test_two_hosts_over_ssh_train_as_two_processes_of_one_host(
     assert [host["name"] for host in session["hosts"]] == list(HOSTS)
     assert len(list(folder.path.glob("events.out.*"))) == 1
     assert (folder.path / "train.1.log").is_file()
-    resume = next(line for line in output.splitlines() if "--resume" in line)
+    resume = next(line for line in first.stdout.splitlines() if "--resume" in line)
     assert ",".join(HOSTS) in resume
 
     # The same by one agent on this host, as --gpu-ids 0,1 does.
@@ -146,8 +155,6 @@ def test_two_hosts_over_ssh_train_as_two_processes_of_one_host(
     agent.stop_at = 1.0
     single_host = tmp_path / "single"
     single_host.mkdir()
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     launch(TrainConfig(env=env, agent=agent), single_host, (LOCAL_HOST,), 2)
     expected = weights(single_host / "model_0.pt")
     actual = weights(folder.path / "model_0.pt")
@@ -156,13 +163,11 @@ def test_two_hosts_over_ssh_train_as_two_processes_of_one_host(
         assert torch.equal(tensor, actual[name]), name
 
     # One process has half as many robots.
-    process = started("--resume", "--out", folder.path)
-    output, _ = process.communicate()
-    assert process.returncode == 2
-    assert "2 processes" in output
-    process = started("--resume", *hosts, "--out", folder.path, home=ssh_home)
-    output, _ = process.communicate()
-    assert process.returncode == 0, output
+    refused = trained("--resume", "--out", folder.path)
+    assert refused.exit_code == 2
+    assert "2 processes" in refused.output
+    resumed = trained("--resume", *hosts, "--out", folder.path)
+    assert resumed.exit_code == 0, resumed.output
     record = folder.read()
     assert record["finished"]
     assert record["phases"]["walk"]["env_steps"] == ITERATIONS * 24 * 8 * 2
@@ -185,15 +190,16 @@ def test_a_terminated_training_on_hosts_leaves_a_checkpoint(tmp_path: Path) -> N
     assert checkpoint.read_checkpoint(folder.checkpoint())["infos"]["processes"] == 2
 
 
-def test_a_host_without_an_ssh_server_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+def test_a_host_without_an_ssh_server_is_refused_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     home = tmp_path / "home"
     home.mkdir()
     write_ssh_config(home, free_port())
-    out = tmp_path / "run"
-    process = started(*NEW, "--hosts", f"localhost,{HOSTS[0]}", "--out", out, home=home)
-    output, _ = process.communicate()
-    assert process.returncode == 2
+    monkeypatch.setenv("HOME", str(home))
+    refused = trained(*NEW, "--hosts", f"localhost,{HOSTS[0]}", "--out", tmp_path / "run")
+    assert refused.exit_code == 2
     for word in (HOSTS[0], "SSH", "~/.ssh/config"):
-        assert word in output
-    assert "Traceback" not in output
+        assert word in refused.output
+    assert "Traceback" not in refused.output
     assert [path.name for path in tmp_path.iterdir()] == ["home"]

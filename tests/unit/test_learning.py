@@ -395,7 +395,9 @@ def test_processes_stay_together(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    torch.multiprocessing.spawn(one_of_two, (port, str(tmp_path)), nprocs=2)
+    # Forked, they need not import PyTorch and mjlab again.
+    arguments = (port, str(tmp_path))
+    torch.multiprocessing.start_processes(one_of_two, arguments, nprocs=2, start_method="fork")
     first = torch.load(tmp_path / "0.pt", weights_only=True)
     second = torch.load(tmp_path / "1.pt", weights_only=True)
     assert not same(first["data"], second["data"])

@@ -240,7 +240,7 @@ def answer(question: HostQuestion) -> HostFacts:
 
 def own_facts(robot: str) -> HostFacts:
     """Return what this machine computes with, without its devices."""
-    from pronk.jump.train.rl.export import package_versions
+    from pronk.jump.train.versions import package_versions
     from pronk.robots import load_robot
 
     model_text = load_robot(robot).build_spec().to_xml()

@@ -28,6 +28,7 @@ from mjlab.utils.wandb import add_wandb_tags
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train import devices
+from pronk.jump.train.host_process import train_packed
 from pronk.jump.train.hosts import COPIED_VARIABLES
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
@@ -61,6 +62,7 @@ def launch(
     Raises:
         PronkError: Learning has diverged, or a process was lost.
     """
+    import cloudpickle
     import torchrunx
     from torchrunx.utils.errors import AgentFailedError, WorkerFailedError
 
@@ -74,7 +76,7 @@ def launch(
     ).set_logging_handlers(partial(_log_handlers, tuple(hosts), processes, log_dir))
     try:
         with _terminated_as_interrupted():
-            launcher.run(train_process, config, log_dir)
+            launcher.run(train_packed, cloudpickle.dumps((config, log_dir)))
     except KeyboardInterrupt:
         _wait_for_checkpoint(log_dir, first_checkpoint)
         raise

@@ -25,7 +25,7 @@ from typing import Any
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.export import package_versions
+from pronk.jump.train.versions import package_versions
 
 SCHEMA = "pronk/run/2"
 

@@ -9,10 +9,8 @@ All float32. The normalization is part of the graph: the input is as measured.
 from __future__ import annotations
 
 import copy
-import platform
 import warnings
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from torch import Tensor, nn
 from pronk.files import written_whole
 from pronk.jump.train.mdp import actions, commands
 from pronk.jump.train.rl.networks import EstimatorActor
+from pronk.jump.train.versions import package_versions
 from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.observation import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
@@ -33,21 +32,6 @@ from pronk.version import VERSION
 OPSET = 18
 TOLERANCE = 1e-5
 """Largest difference between ONNX Runtime and PyTorch that `verify` should give."""
-
-
-def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that a run is computed with."""
-    return {
-        "python": platform.python_version(),
-        "pronk": VERSION,
-        "mjlab": metadata.version("mjlab"),
-        "mujoco": metadata.version("mujoco"),
-        "mujoco_warp": metadata.version("mujoco_warp"),
-        "warp": metadata.version("warp-lang"),
-        "torch": metadata.version("torch"),
-        "rsl_rl": metadata.version("rsl-rl-lib"),
-        "numpy": metadata.version("numpy"),
-    }
 
 
 def contract_for(

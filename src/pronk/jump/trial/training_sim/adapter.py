@@ -32,12 +32,12 @@ from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
-from pronk.jump.train.rl.export import package_versions
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
+from pronk.jump.train.versions import package_versions
 from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, Act, Estimate, StepListener, evaluate_policy
 from pronk.policy.contract import check
