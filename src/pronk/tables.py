@@ -99,6 +99,20 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else NOT_MEASURED
 
 
+def counted(count: float, noun: str, plural: str = "") -> str:
+    """Return a number with its noun, in the singular for 1 alone, as in "1 robot" and "2 robots".
+
+    Args:
+        count: The number.
+        noun: The noun in the singular.
+        plural: Its plural; with an s at the end if left out.
+    """
+    if count == 1:
+        return f"1 {noun}"
+    text = f"{count:,}" if isinstance(count, int) else f"{count:g}"
+    return f"{text} {plural or noun + 's'}"
+
+
 def percent(share: float) -> str:
     """Format a share between 0 and 1 in percent."""
     return number(100.0 * share, 1)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
+import platform
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -382,12 +384,107 @@ def test_another_plan_has_cells_of_its_own(
     assert other.cells[0].key != results.cell("strong", "nominal").key
 
 
-def test_a_damaged_cell_is_named(policies: list[Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", ["", "{", '{"schema": "pronk/condition-cell/1"}', "half"])
+def test_a_damaged_cell_is_named_and_run_again(
+    policies: list[Path], tmp_path: Path, content: str
+) -> None:
     first = run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path))
     path = tmp_path / CELLS / f"{first.cells[0].key}.json"
-    path.write_text(path.read_text()[:100])
-    with pytest.raises(ArtefactError, match=path.name):
+    content_before = path.read_bytes()
+    path.write_bytes(
+        content_before[: len(content_before) // 2] if content == "half" else content.encode()
+    )
+    again = run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path))
+    (name,) = again.damaged
+    assert again.subjects[0].name in name
+    assert CONDITIONS[0].name in name
+    assert again.kept == 0
+    assert path.read_bytes() == content_before
+    assert repr(again.cells) == repr(first.cells)
+
+
+@pytest.mark.parametrize("part", ["robots", "table", "summary", "nothing", "a hidden file"])
+def test_a_part_of_a_run_is_completed(policies: list[Path], tmp_path: Path, part: str) -> None:
+    """As in a copy without its cells; an empty folder is not copied by every program."""
+    out = tmp_path / "out"
+    first = run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(out))
+    shutil.rmtree(out / CELLS)
+    names = {"robots": "robots", "table": "conditions.csv", "summary": "conditions.json"}
+    for path in list(out.iterdir()):
+        if path.name != names.get(part):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if part == "a hidden file":
+        (out / ".conditions.json.part").touch()
+    again = run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(out))
+    assert again.kept == 0
+    assert repr(again.cells) == repr(first.cells)
+
+
+def test_robots_of_a_user_are_no_part_of_a_run(policies: list[Path], tmp_path: Path) -> None:
+    robots = tmp_path / "robots"
+    robots.mkdir()
+    (robots / "nominal.yaml").write_text("# Measured by hand.\n")
+    with pytest.raises(PronkError, match="not empty"):
         run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path))
+    assert (robots / "nominal.yaml").read_text() == "# Measured by hand.\n"
+
+
+@pytest.mark.parametrize("state", ["finished", "interrupted", "of an earlier pronk"])
+def test_cells_of_another_machine_are_kept(
+    policies: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    """Its Python and NumPy are newer, its folders have other names; pronk and MuJoCo are alike."""
+    there = tmp_path / "there"
+    with monkeypatch.context() as other_machine:
+        other_machine.setattr(platform, "python_version", lambda: "3.99.1")
+        other_machine.setattr(np, "__version__", "9.9.9")
+        first = run_conditions(policies, CONDITIONS[:2], PLAN, setup(there))
+    here = tmp_path / "here"
+    shutil.copytree(there, here)
+    if state == "interrupted":
+        for name in ("conditions.json", "conditions.csv"):
+            (here / name).unlink()
+    if state == "of an earlier pronk":
+        for path in (here / CELLS).iterdir():
+            body = json.loads(path.read_text())
+            del body["versions"]
+            path.write_text(json.dumps(body))
+    moved = []
+    for path in policies:
+        copy = tmp_path / "moved" / path.name
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copyfile(path, copy)
+        moved.append(copy)
+    cells = {path.name: path.stat().st_mtime_ns for path in (here / CELLS).iterdir()}
+    again = run_conditions(moved, CONDITIONS, PLAN, setup(here))
+    # The third condition changes nothing of the first, so that its cells are there as well.
+    assert again.kept == len(again.cells) == 6
+    for path in (here / CELLS).iterdir():
+        assert path.stat().st_mtime_ns == cells.pop(path.name)
+    assert not cells
+    for cell in first.cells:
+        assert repr(again.cell(cell.policy, cell.condition)) == repr(cell)
+    (versions,) = again.kept_versions
+    assert versions["python"] == "3.99.1"
+    assert again.versions["python"] == platform.python_version()
+    assert again.unused_versions == ()
+
+
+def test_cells_of_another_mujoco_do_not_count_and_are_not_lost(
+    policies: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as other_machine:
+        other_machine.setattr(mujoco, "__version__", "2.0.0")
+        run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path))
+    (stored,) = (tmp_path / CELLS).iterdir()
+    content = stored.read_bytes()
+    again = run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path))
+    assert again.kept == 0
+    (versions,) = again.unused_versions
+    assert versions["mujoco"] == "2.0.0"
+    assert stored.read_bytes() == content
+    # With nothing to compute there is nothing to say.
+    assert run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path)).unused_versions == ()
 
 
 def test_a_folder_of_something_else_is_refused(policies: list[Path], tmp_path: Path) -> None:

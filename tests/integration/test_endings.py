@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import resource
@@ -142,3 +143,25 @@ def test_a_pipe_is_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word
     suffix = "csv" if words.split()[0] in ("response", "match") else "yaml"
     refused(*words.format(pipe=f"pipe.{suffix}").split())
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_killed_process_of_a_trial_is_no_defect(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    policy = Path(__file__).parents[2] / "policies" / "matched" / "policy.onnx"
+    words = [*COMMAND, "trial", policy, "--commands=1,0", "--jumps", "500", "--no-video"]
+    words += ["--processes", "2", "--out", tmp_path / "out"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    worker = ""
+    while not worker and process.poll() is None:
+        for number in children.read_text().split():
+            with contextlib.suppress(OSError):
+                if b"spawn_main" in Path(f"/proc/{number}/cmdline").read_bytes():
+                    worker = number
+    os.kill(int(worker), signal.SIGKILL)
+    _, stderr = process.communicate()
+    assert process.returncode == ExitStatus.REFUSED
+    (sentence,) = sentences(stderr)
+    assert "SIGKILL" in sentence
+    assert "--processes" in sentence
+    assert not (tmp_path / "out" / "summary.json").exists()

@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip("onnxruntime")
 from command_line import accepted, invoke, refused
+from hopper import write_hopper
 from pronk.cli.main import parsed_command
 from pronk.identify.match.gains import load_gains
 from pronk.jump.study.config import RandomizationConfig
@@ -147,6 +150,105 @@ def test_a_policy_that_fails_is_named_and_the_rest_is_there(study: Path, tmp_pat
 
 
 # --- Several trainings ---------------------------------------------------------------------------
+
+# --- A folder that is there in part -------------------------------------------------------------
+
+DAMAGES = {
+    "whole": [],
+    "no folder of cells": ["cells"],
+    "empty folder of cells": ["cells/*.json"],
+    "robots alone": ["cells", "conditions.*"],
+    "no table": ["conditions.csv"],
+    "no summary": ["conditions.json"],
+    "nothing": ["*"],
+}
+"""What a copy of a trial's folder lacks, by the name of the robot that is tried there."""
+CUT = "a cell that is cut"
+"""Robot whose file of jumps ends half way."""
+WITHOUT_JUMPS = {"no folder of cells", "empty folder of cells", "robots alone", CUT}
+
+
+@pytest.fixture(scope="module")
+def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a study of one policy that hops, on a robot for each damage of its copies."""
+    folder = tmp_path_factory.mktemp("whole")
+    path = write_study(
+        folder / "study.yaml",
+        arms={"hopper": {"policies": [str(write_hopper(folder / "policy.onnx"))]}},
+        robots={name: {} for name in (*DAMAGES, CUT)},
+        outcomes=["landed", "height"],
+        trial={"commands": ["0,0"], "jumps": 1},
+    )
+    accepted("study", path, "--out", folder / "out")
+    return folder
+
+
+def trial_of(out: Path, robot: str) -> Path:
+    """Return the folder of a robot's trial."""
+    return out / "trials" / "hopper" / "seed-1" / robot.replace(" ", "_")
+
+
+@pytest.mark.slow
+def test_a_copy_that_lacks_files_is_completed_and_says_which_trials(
+    whole_study: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(whole_study / "out", out)
+    for robot, patterns in DAMAGES.items():
+        for pattern in patterns:
+            for path in list(trial_of(out, robot).glob(pattern)):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    (cut,) = (trial_of(out, CUT) / "cells").glob("*.json")
+    cut.write_bytes(cut.read_bytes()[:200])
+    stamps = {}
+    for robot in ("whole", "no table", "no summary"):
+        (path,) = (trial_of(out, robot) / "cells").glob("*.json")
+        stamps[path] = path.stat().st_mtime_ns
+
+    figures = tmp_path / "figures.json"
+    printed = accepted("study", whole_study / "study.yaml", "--out", out, "--json", figures)
+    body = json.loads(figures.read_text())
+    run_again = {name.partition(" on ")[2] for name in body["run_again"]}
+    completed = {name.partition(" on ")[2] for name in body["completed"]}
+    assert run_again == WITHOUT_JUMPS
+    assert completed == {"no table", "no summary"}
+    for name in (*body["run_again"], *body["completed"]):
+        assert name in " ".join(printed.split())
+    assert body["missing"] == []
+    for path, stamp in stamps.items():
+        assert path.stat().st_mtime_ns == stamp
+    assert cell_files(out) == cell_files(whole_study / "out")
+    for name in ("study.csv", "runs.csv"):
+        assert (out / name).read_bytes() == (whole_study / "out" / name).read_bytes()
+    # Nothing is left to do, and nothing to say.
+    again = accepted("study", whole_study / "study.yaml", "--out", out)
+    assert f"{len(DAMAGES) + 1} of {len(DAMAGES) + 1} tasks were done before" in again
+    assert "run again" not in again
+
+
+@pytest.mark.slow
+def test_a_copy_without_the_state_keeps_the_jumps_that_it_has(
+    whole_study: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(whole_study / "out", out)
+    (out / "state.json").unlink()
+    shutil.rmtree(trial_of(out, "robots alone") / "cells")
+    stamps = {}
+    for path in (trial_of(out, "whole") / "cells").iterdir():
+        stamps[path] = path.stat().st_mtime_ns
+    study = yaml.safe_load((whole_study / "study.yaml").read_text())
+    study["robots"] = {"whole": {}, "robots alone": {}}
+    fewer = whole_study / "fewer.yaml"
+    fewer.write_text(yaml.safe_dump(study))
+    figures = tmp_path / "figures.json"
+    accepted("study", fewer, "--out", out, "--json", figures)
+    body = json.loads(figures.read_text())
+    assert [name.partition(" on ")[2] for name in body["run_again"]] == ["robots alone"]
+    assert [name.partition(" on ")[2] for name in body["completed"]] == ["whole"]
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    assert cell_files(out) == cell_files(whole_study / "out")
+
 
 NAIVE = ("--gains", "naive")
 

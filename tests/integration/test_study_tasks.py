@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from pronk.cli.study import failure_status
 from pronk.errors import PronkError
+from pronk.exit_status import ExitStatus
 from pronk.jump.study.local import LocalExecutor
 from pronk.jump.study.schedule import StudyProgress, TaskEnd, run_tasks
 from pronk.jump.study.tasks import StudyState, StudyTask, copied_input, study_folder
@@ -139,13 +143,54 @@ def test_an_interrupted_study_leaves_no_process_behind(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_tasks([task], executor, root, report=interrupt)
     assert executor.poll() == []
+    assert task_processes() == []
+    assert StudyState(root).records["endless"].status == "started"
+
+
+def task_processes() -> list[int]:
+    """Return the processes of tasks that this one has started."""
+    numbers = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             words = (folder / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        assert str(os.getpid()).encode() not in words[2:5], words
-    assert StudyState(root).records["endless"].status == "started"
+        if str(os.getpid()).encode() in words[2:5]:
+            numbers.append(int(folder.name))
+    return numbers
+
+
+@pytest.mark.parametrize(("kind", "way_out"), [("training", "--jobs"), ("trial", "cores")])
+def test_a_task_that_is_killed_from_outside_says_so(
+    tmp_path: Path, kind: str, way_out: str
+) -> None:
+    root = study_root(tmp_path)
+    command = ("simulate", "--link", "lcm", "--robot", "mini_cheetah")
+    task = export_task("endless", kind=kind, command=command)
+
+    def kill(progress: StudyProgress) -> None:
+        for number in task_processes():
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+
+    status = dict(run_tasks([task], LocalExecutor(root), root, report=kill))["endless"]
+    assert (status.state, status.attempts) == ("failed", 2)
+    assert "SIGKILL" in status.reason
+    assert "memory" in status.reason
+    assert way_out in status.reason
+    assert failure_status({"endless": status}) == ExitStatus.REFUSED
+
+
+def test_a_policy_of_which_nothing_is_known_is_not_replaced(tmp_path: Path) -> None:
+    """As in a copy of a study that has the policies, but neither its state nor their provenance."""
+    root = study_root(tmp_path)
+    task = export_task("run", kind="training", resume_marker="work/run/provenance.json")
+    policy = root / task.outputs[0]
+    policy.parent.mkdir(parents=True)
+    policy.write_text("trained for hours")
+    with pytest.raises(PronkError, match="how it was trained"):
+        finished([task], LocalExecutor(root), root)
+    assert policy.read_text() == "trained for hours"
 
 
 def test_trainings_of_other_settings_are_not_mixed(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from pronk.jump.study.study_results import (
     outcome_tables,
     save_study,
 )
-from pronk.report.study_figures import arm_looks, draw_robots, draw_tolerance
+from pronk.report.study_figures import SEED_MARKER, arm_looks, draw_robots, draw_tolerance
 from pronk.report.study_page import study_part, write_study_page
 from pronk.report.style import render
 
@@ -110,7 +111,8 @@ def test_robots_show_means_seeds_and_intervals(results: StudyResults) -> None:
     ((matched_x, matched_y),) = marks(landed, looks["matched"]["marker"])
     assert (nominal_y, weak_y, matched_y) == pytest.approx((50.0, 50.0, 60.0))
     assert nominal_x < 0.0 < matched_x < 0.5 < weak_x < 1.0
-    assert sorted(y for _, y in marks(landed, ".")) == pytest.approx([40, 40, 50, 60, 60, 70])
+    seeds = marks(landed, SEED_MARKER)
+    assert sorted(y for _, y in seeds) == pytest.approx([40, 40, 50, 60, 60, 70])
     intervals = []
     for collection in landed.collections:
         for segment in collection.get_segments():  # type: ignore[attr-defined]
@@ -119,6 +121,47 @@ def test_robots_show_means_seeds_and_intervals(results: StudyResults) -> None:
     assert np.allclose(sorted(intervals), [(35.0, 55.0), (45.0, 65.0)])
     assert max(y for _, y in marks(height, looks["matched"]["marker"])) == pytest.approx(0.8)
     assert [label.get_text() for label in height.get_xticklabels()] == ["shipped", "weak"]
+
+
+@pytest.mark.parametrize("arm_count", [1, 2, 8, 16])
+def test_seeds_stand_beside_the_mark_of_their_arm_and_no_two_at_one_place(
+    results: StudyResults, arm_count: int
+) -> None:
+    """Also seeds of one value, and seeds on the line of the interval."""
+    arms = tuple(f"arm {number}" for number in range(arm_count))
+    cells = []
+    for arm in arms:
+        for robot in ("shipped", "weak"):
+            cells.append(
+                OutcomeCell(
+                    arm=arm,
+                    robot=robot,
+                    outcome="landed",
+                    value=0.8,
+                    low=0.6,
+                    high=1.0,
+                    by_seed={"1": 0.8, "2": 0.8, "3": 0.8, "4": None},
+                    jumps=10,
+                )
+            )
+    study = replace(results, arms=arms, cells=tuple(cells), outcomes=("landed",))
+    (axes,) = draw_robots(study, study.outcomes).axes
+    lines = []
+    for collection in axes.collections:
+        for segment in collection.get_segments():  # type: ignore[attr-defined]
+            lines.append(segment[0, 0])
+    seeds = [x for x, _ in marks(axes, SEED_MARKER)]
+    assert len(lines) == 2 * arm_count
+    assert len(seeds) == 3 * len(lines)
+    # In the order of their places each mark is followed by its own seeds.
+    owners = ["line" for _ in lines] + ["seed" for _ in seeds]
+    in_order = sorted(zip(lines + seeds, owners, strict=True))
+    assert [owner for _, owner in in_order] == ["line", "seed", "seed", "seed"] * len(lines)
+    places = [place for place, _ in in_order]
+    assert min(np.diff(places)) > 0.002
+    for line in axes.lines:
+        if line.get_marker() == SEED_MARKER:
+            assert line.get_alpha() in (None, 1.0)
 
 
 def test_a_share_has_no_axis_far_beyond_its_bounds(results: StudyResults) -> None:
@@ -183,6 +226,31 @@ def test_the_page_has_both_figures(results: StudyResults, tmp_path: Path) -> Non
     assert part.content["robots"]
     assert part.content["tolerance"]
     assert write_study_page(tmp_path).read_text().count("data:image/svg+xml") == 2
+
+
+def test_a_page_of_one_of_everything_has_no_plural_of_it(
+    results: StudyResults, tmp_path: Path
+) -> None:
+    """One arm, policy, robot, comparison, command, jump, seed; one trial that is missing."""
+    cell = known_cell("nominal", "shipped", "landed", by_seed={"1": 0.5}, jumps=1)
+    lone = replace(
+        results,
+        arms=("nominal",),
+        robots=("shipped",),
+        outcomes=("landed",),
+        cells=(cell,),
+        jumps=1,
+        missing=("nominal, seed 2, on shipped",),
+    )
+    save_study(tmp_path / "study.json", lone)
+    text = re.sub("<[^>]*>", " ", write_study_page(tmp_path).read_text().partition("<body")[2])
+    summary = study_part(tmp_path / "study.json").summary
+    for noun in ("arm", "policy", "robot", "comparison"):
+        assert f"1 {noun}" in summary
+    plurals = "arms|policies|robots|comparisons|trials|commands|jumps|seeds|outcomes"
+    assert re.findall(rf"(?<![\d.,])1 (?:{plurals})\b", f"{text} {summary}") == []
+    save_study(tmp_path / "study.json", results)
+    assert "2 arms" in study_part(tmp_path / "study.json").summary
 
 
 def test_primary_comparisons_come_first(results: StudyResults) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from pronk.tables import Cell, Column, Table
+from pronk.tables import Cell, Column, Table, counted
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,16 @@ def test_a_row_has_one_cell_for_each_column() -> None:
 def test_the_heading_names_the_unit() -> None:
     assert Column(heading="stiffness", unit="N m/rad").title == "stiffness [N m/rad]"
     assert Column(heading="jumps").title == "jumps"
+
+
+@pytest.mark.parametrize("count", [1, 1.0])
+def test_one_alone_has_the_singular(count: float) -> None:
+    assert counted(count, "policy", "policies") == "1 policy"
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 robots"), (2, "2 robots"), (1.5, "1.5 robots"), (4096, "4,096 robots")],
+)
+def test_every_other_number_has_the_plural(count: float, text: str) -> None:
+    assert counted(count, "robot") == text

@@ -87,7 +87,8 @@ def demo(
         jumps = 1
         tried = tried[:1]
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
-    with console.progress() as report, pool(1) as process:
+    names = ("the jumps and their films",)
+    with console.progress() as report, pool(1, names=names) as process:
         jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed, quick)
         chirp_s = QUICK_CHIRP_S if quick else Chirp.length_s
         result, replays = sweep_and_match(robot, joints, out, repeats, seed, report, chirp_s)

@@ -15,6 +15,7 @@ from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.jump.study.place import StudyPlace
+from pronk.tables import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,6 +61,8 @@ def study(
     from pronk.jump.study.place import choose_place, planned_gpus
     from pronk.jump.study.study import (
         collect_results,
+        completed_trials,
+        incomplete_trials,
         plan_figures,
         plan_study,
         selected_arms,
@@ -104,15 +107,25 @@ def study(
     is_trained = selection.trainings > 0
     chosen = choose_place(place, "cpu" if not is_trained and device == "auto" else device)
     console.say(
-        f"{config.title}: {selection.trainings} trainings, {selection.trials} trials of "
-        f"{selection.jumps} jumps in all, on {chosen.words}; folder {out}"
+        f"{config.title}: {counted(selection.trainings, 'training')}, "
+        f"{counted(selection.trials, 'trial')} of {counted(selection.jumps, 'jump')} in all, on "
+        f"{chosen.words}; folder {out}"
     )
     with study_folder(out):
         tasks = study_tasks(study_plan, out, chosen.training)
+        incomplete = incomplete_trials(tasks, out)
         tasks = tasks_of(selection, tasks, out)
         statuses = run_shown(tasks, chosen, out)
+        completed = completed_trials(incomplete, tasks, out, statuses)
         results = collect_results(study_plan, out, statuses)
         page = write_study_page(out)
+    if completed.run_again:
+        console.say(
+            "run again, since their folders were there without their jumps: "
+            f"{'; '.join(completed.run_again)}"
+        )
+    if completed.kept:
+        console.say(f"completed from the jumps that their folders had: {'; '.join(completed.kept)}")
     result_tables = study_tables(results)
     for table in result_tables:
         console.show(table)
@@ -123,6 +136,8 @@ def study(
             "cells": results.cells,
             "comparisons": results.comparisons,
             "missing": results.missing,
+            "run_again": completed.run_again,
+            "completed": completed.kept,
             "page": page,
         },
         wrote=[out / STUDY_TABLE, out / STUDY_FILE, out / RUNS_FILE, page],
@@ -328,8 +343,8 @@ def _time_notes(plan: StudyPlan, estimate: TrainingTime | None) -> list[str]:
         )
     if plan.config.training.envs != MEASURED_ENVS:
         notes.append(
-            f"{plan.config.training.envs:,} robots in a training were not measured: the time is "
-            f"between that of as many iterations and that of as many environment steps of "
+            f"{counted(plan.config.training.envs, 'robot')} in a training: not measured; the time "
+            f"is between that of as many iterations and that of as many environment steps of "
             f"{MEASURED_ENVS:,} robots."
         )
     for arm in plan.arms:
@@ -383,7 +398,8 @@ def run_shown(
         if status.state in ("failed", "skipped"):
             console.warn(f"{status.name}: {status.state}: {status.reason}")
     if kept:
-        console.say(f"{kept} of {len(statuses)} tasks were done before")
+        was = "was" if kept == 1 else "were"
+        console.say(f"{kept} of {counted(len(statuses), 'task')} {was} done before")
     return statuses
 
 

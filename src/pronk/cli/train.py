@@ -15,7 +15,7 @@ from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.jump.study.place import StudyPlace
 from pronk.jump.train.settings import TrainSettings
-from pronk.tables import Column, Table
+from pronk.tables import Column, Table, counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +105,10 @@ def _train_many(
         check_arm(arm)
     place = choose_place(many.place, settings.devices.device)
     root = settings.out
+    seed_word = "seed" if len(seeds) == 1 else "seeds"
     console.say(
-        f"{len(arms) * len(seeds)} trainings: {', '.join(arm.name for arm in arms)}, seeds "
-        f"{', '.join(map(str, seeds))}, on {place.words}; folder {root}"
+        f"{counted(len(arms) * len(seeds), 'training')}: {', '.join(arm.name for arm in arms)}, "
+        f"{seed_word} {', '.join(map(str, seeds))}, on {place.words}; folder {root}"
     )
     with study_folder(root):
         tasks = training_tasks(arms, seeds, root, place.training)

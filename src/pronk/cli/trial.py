@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.tables import counted
 
 if TYPE_CHECKING:
     from pronk.jump.trial.trial import TrialPlan, TrialSetup
@@ -156,8 +157,9 @@ def _trial_of_jumps(
             console.show(table, wide=output.wide)
     timing = results.timing
     console.say(
-        f"{len(results.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
-        f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
+        f"{counted(len(results.rows), 'jump')}, {timing['simulated_s']:.0f} s of the virtual robot "
+        f"in {timing['seconds']:.0f} s on "
+        f"{counted(round(timing['processes']), 'process', 'processes')}; "
         f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
     )
     films: tuple[Path, ...] = ()
@@ -225,7 +227,14 @@ def _trial_of_conditions(
 ) -> console.Outcome:
     """Jump with every policy under every condition; print the table and draw the figure."""
     from pronk.jump.trial import tables
-    from pronk.jump.trial.condition_trial import ROBOTS, SUMMARY, TABLE, run_conditions
+    from pronk.jump.trial.condition_trial import (
+        DECIDING_VERSIONS,
+        FIGURE,
+        ROBOTS,
+        SUMMARY,
+        TABLE,
+        run_conditions,
+    )
     from pronk.jump.trial.conditions import load_conditions
     from pronk.report import style
     from pronk.report.trial_figures import draw_conditions
@@ -240,12 +249,26 @@ def _trial_of_conditions(
             overwrite=output.overwrite,
             progress=report.bar("jumping"),
         )
-    figure = style.save_figure(draw_conditions(results), output.out / "conditions.svg")
+    figure = style.save_figure(draw_conditions(results), output.out / FIGURE)
     table = tables.condition_table(results)
     console.show(table, wide=output.wide)
+    for versions in results.kept_versions:
+        console.warn(
+            f"some cells were computed before with {_other_versions(versions, results.versions)}. "
+            f"They are kept, since {' and '.join(DECIDING_VERSIONS)} have the same versions; "
+            "--overwrite computes them anew."
+        )
+    for versions in results.unused_versions:
+        console.warn(
+            f"cells of {_other_versions(versions, results.versions)} are in {output.out}; they do "
+            "not count, since another version may simulate other jumps."
+        )
+    if results.damaged:
+        console.warn(f"the files of {', '.join(results.damaged)} could not be read; computed anew.")
+    was = "was" if results.kept == 1 else "were"
     console.say(
-        f"{len(results.cells)} cells of policy and condition in {results.seconds:.0f} s, "
-        f"{results.kept} of which were there already"
+        f"{counted(len(results.cells), 'cell')} of policy and condition in "
+        f"{results.seconds:.0f} s, {results.kept} of which {was} there already"
     )
     return console.Outcome(
         figures={
@@ -257,3 +280,12 @@ def _trial_of_conditions(
         wrote=[output.out / TABLE, output.out / SUMMARY, output.out / ROBOTS, figure],
         following=[f"open {figure} in a browser"],
     )
+
+
+def _other_versions(versions: Mapping[str, str], here: Mapping[str, str]) -> str:
+    """Return the versions that differ from those of this machine, with both."""
+    parts = []
+    for name, version in versions.items():
+        if here.get(name) != version:
+            parts.append(f"{name} {version} (here {here.get(name, 'none')})")
+    return ", ".join(parts)

@@ -21,7 +21,7 @@ from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import joint_words, picture
 from pronk.robots import load_robot
 from pronk.robots.robot import Joint
-from pronk.tables import Cell, Column, Table
+from pronk.tables import Cell, Column, Table, counted
 
 _GAINS_SCHEMA = "schema: pronk/gains/"
 """Text near the beginning of every gains file."""
@@ -48,7 +48,7 @@ def match_part(path: Path) -> Part:
     if compared or not any(joint.gains.torque for joint in result.joints.values()):
         summary = _headline(result, matched)
     else:
-        summary = f"Drives of {len(result.joints)} joints fitted by torque."
+        summary = f"{counted(len(result.joints), 'drive')} fitted by torque."
     return Part(
         kind="match",
         title=f"Match of {result.robot}",
@@ -63,10 +63,9 @@ def match_part(path: Path) -> Part:
 def _headline(result: MatchResult, matched: int) -> str:
     """Return the outcome of a match in words: joints, largest error, flags."""
     count = len(result.joints)
-    plural = "" if count == 1 else "s"
-    phrases = [f"{count} joint{plural} matched"]
+    phrases = [f"{counted(count, 'joint')} matched"]
     if matched < count:
-        phrases = [f"{matched} of {count} joint{plural} matched"]
+        phrases = [f"{matched} of {counted(count, 'joint')} matched"]
     if result.worst_joint:
         error_db = result.joints[result.worst_joint].gains.quality.error_db
         phrases.append(f"largest error {error_db:.2f} dB ({joint_words(result.worst_joint)})")
@@ -74,7 +73,7 @@ def _headline(result: MatchResult, matched: int) -> str:
     if flagged == 0:
         phrases.append("no flags")
     else:
-        phrases.append(f"{flagged} joint{'' if flagged == 1 else 's'} flagged")
+        phrases.append(f"{counted(flagged, 'joint')} flagged")
     return f"{'; '.join(phrases)}."
 
 

@@ -14,6 +14,7 @@ import msgspec
 from markupsafe import Markup
 
 from pronk.report.charts import chart_library
+from pronk.tables import counted
 from pronk.version import VERSION
 
 
@@ -90,6 +91,7 @@ def page(title: str, parts: Sequence[Part]) -> str:
     )
     environment.filters["signs"] = _signs
     environment.filters["words"] = _words
+    environment.filters["counted"] = counted
     environment.filters["align"] = _alignment
     environment.filters["as_json"] = _as_json
     rendered = []

@@ -29,6 +29,14 @@ _LOOKS: tuple[Look, ...] = (
 """Colours of Okabe and Ito, and two more that stay apart from them, each with a marker."""
 _DASHES: tuple[object, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)))
 """Lines of the first eight arms, of the next eight, and of the eight after them."""
+_MAX_DISTANCE = 0.12
+"""Largest distance of two arms of which places of seeds are a share; robots are 1 apart [1]."""
+SEED_MARKER = "$\\circ$"
+"""Marker of a single seed."""
+_SEEDS_FROM = 0.3
+"""Place of an arm's first seed, right of its mark, as a share of the distance of two arms [1]."""
+_SEEDS_TO = 0.7
+"""Place of its last seed [1]."""
 LEGEND_COLUMNS = 4
 """Columns of the legend: names of arms are long."""
 
@@ -57,7 +65,8 @@ def has_series(results: StudyResults) -> bool:
 def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
     """Draw outcomes of every arm on every robot that is not in a series, a row an outcome.
 
-    Marks are means over seeds with 95 % intervals, dots the means of single seeds.
+    Marks are means over seeds with 95 % intervals. The circles right of a mark are the means of its
+    single seeds, in their order: on the line of the interval they could not be told from it.
 
     Args:
         results: The study.
@@ -70,10 +79,13 @@ def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
     height = row_height * len(outcomes) + 0.7 + 0.2 * _legend_rows(results)
     with drawing(len(outcomes), height=height, sharex=True) as (figure, grid):
         shifts = offsets(len(look_by_arm), ROOM)
+        distance = min(ROOM / len(look_by_arm), _MAX_DISTANCE)
         for axes, outcome in zip(grid[:, 0], outcomes, strict=True):
             for shift, (arm, look) in zip(shifts, look_by_arm.items(), strict=True):
                 for place, robot in enumerate(robots):
-                    _draw_mark(axes, results.cell(arm, robot, outcome), place + shift, look)
+                    cell = results.cell(arm, robot, outcome)
+                    _draw_mark(axes, cell, place + shift, look)
+                    _draw_seeds(axes, cell, place + shift, distance, look)
             _dress(axes, outcome)
             axes.grid(visible=False, axis="x")
             for boundary in range(1, len(robots)):
@@ -89,18 +101,8 @@ def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
 
 
 def _draw_mark(axes: Axes, cell: OutcomeCell, place: float, look: Look) -> None:
-    """Draw the mean of a cell, its interval and its seeds."""
+    """Draw the mean of a cell and its interval."""
     scale = OUTCOMES[cell.outcome].scale
-    seeds = [scale * value for value in cell.by_seed.values() if value is not None]
-    axes.plot(
-        np.full(len(seeds), place),
-        seeds,
-        ".",
-        color=look["color"],
-        alpha=0.45,
-        markersize=4.0,
-        zorder=2,
-    )
     if np.isfinite(cell.low):
         axes.vlines(place, scale * cell.low, scale * cell.high, color=look["color"], linewidth=1.3)
     if np.isfinite(cell.value):
@@ -113,6 +115,33 @@ def _draw_mark(axes: Axes, cell: OutcomeCell, place: float, look: Look) -> None:
             markersize=look["markersize"],
             zorder=3,
         )
+
+
+def _draw_seeds(axes: Axes, cell: OutcomeCell, place: float, distance: float, look: Look) -> None:
+    """Draw the means of the seeds of a cell beside its mark.
+
+    Args:
+        axes: Where to draw.
+        cell: The cell.
+        place: Place of its mark.
+        distance: Distance of the marks of two arms.
+        look: Look of its arm.
+    """
+    scale = OUTCOMES[cell.outcome].scale
+    places = place + distance * np.linspace(_SEEDS_FROM, _SEEDS_TO, max(len(cell.by_seed), 2))
+    for seed_place, value in zip(places, cell.by_seed.values(), strict=False):
+        if value is not None:
+            axes.plot(
+                seed_place,
+                scale * value,
+                linestyle="none",
+                marker=SEED_MARKER,
+                markersize=4.0,
+                markerfacecolor="none",
+                markeredgecolor=look["color"],
+                markeredgewidth=1.1,
+                zorder=2,
+            )
 
 
 def draw_tolerance(results: StudyResults) -> MplFigure:

@@ -19,6 +19,7 @@ from pronk.jump.study.study_results import (
 from pronk.report.page import Part, page
 from pronk.report.study_figures import draw_robots, draw_tolerance, has_robots, has_series
 from pronk.report.style import picture
+from pronk.tables import counted
 
 PAGE = "report.html"
 
@@ -47,9 +48,13 @@ def study_part(path: Path) -> Part:
         cells = [cell for cell in results.cells if cell.arm == arm]
         policies += max((len(cell.by_seed) for cell in cells), default=0)
     summary = (
-        f"{results.title}: {len(results.arms)} arms, {policies} policies, {len(results.robots)} "
-        f"robots; {decided} of {len(results.comparisons)} comparisons with a clear difference."
+        f"{results.title}: {counted(len(results.arms), 'arm')}, "
+        f"{counted(policies, 'policy', 'policies')}, {counted(len(results.robots), 'robot')}"
     )
+    if results.comparisons:
+        comparisons = counted(len(results.comparisons), "comparison")
+        summary += f"; {decided} of {comparisons} with a clear difference"
+    summary += "."
     tables = outcome_tables(results)
     seed_tables = [seed_table(results, outcome) for outcome in results.outcomes]
     content = {

@@ -29,7 +29,7 @@ from pronk.report.page import Part, page
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture
 from pronk.report.trial_figures import FEWEST_JUMPS, JumpPanel, Values, draw_jumps, draw_traces
-from pronk.tables import Cell, Column, Table
+from pronk.tables import Cell, Column, Table, counted
 
 BEFORE_S = 0.5
 """Time before the jump input that the height traces show [s]."""
@@ -223,7 +223,8 @@ def trial_part(path: Path) -> Part:
         "setup": setup_table(trial.subjects),
         **_trace_content(trial, folder),
     }
-    summary = f"{policy}, {place}: {passed} of {len(checks)} acceptance criteria passed."
+    criteria = counted(len(checks), "acceptance criterion", "acceptance criteria")
+    summary = f"{policy}, {place}: {passed} of {criteria} passed."
     if not checks:
         summary = f"{policy}, {place}; {trial.robot} has no acceptance criteria."
     return Part(

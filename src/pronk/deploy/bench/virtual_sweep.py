@@ -73,7 +73,9 @@ def sweep_virtual(
                 _LimbSweep(task=task, sim_params=sim_params, limb=limb, seed=1000 * seed + index)
             )
     log_by_stem = {}
-    for logs in in_processes(_sweep_limb, sweeps, processes=processes, progress=progress):
+    names = [f"the sweep of {sweep.limb or robot.name}" for sweep in sweeps]
+    done = in_processes(_sweep_limb, sweeps, processes=processes, names=names, progress=progress)
+    for logs in done:
         for log in logs:
             log_by_stem[log.stem] = log
     ordered = []

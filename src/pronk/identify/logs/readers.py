@@ -281,7 +281,7 @@ def read_logs(
     if len(files) < _WORTH_PROCESSES:
         processes = 1
     read: Callable[[Path], JointLog] = partial(read_log, robot=robot, options=options)
-    return in_processes(read, files, processes=processes)
+    return in_processes(read, files, processes=processes, names=list(map(str, files)))
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:

@@ -17,6 +17,7 @@ from pronk.jump.study.packing import GpuRates, free_memory_mib, packing_text
 from pronk.jump.study.schedule import TaskEnd, end_of_log
 from pronk.jump.study.tasks import StudyTask, program, program_environment
 from pronk.jump.train.training_progress import PROGRESS_FILE, read_progress
+from pronk.processes import exit_words
 
 CHECKPOINT_S = 120.0
 """Longest time that a training has to write its checkpoint when it is asked to end [s]."""
@@ -208,14 +209,14 @@ class LocalExecutor:
             if status == 0:
                 ends.append(TaskEnd(name=process.task.name, ended="well"))
                 continue
-            how = f"signal {-status}" if status < 0 else f"exit status {status}"
+            how = exit_words(status, _way_out(process))
             log_end = end_of_log(self.root, process.task)
             if "out of memory" in log_end.lower() and process.gpu:
                 beside = max(len(gpu.trainings) for gpu in self._gpus)
                 if self.rates.limit is None or self.rates.limit > beside:
                     self.rates.limit = max(beside, 1)
                     self.rates.reason = f"with {beside + 1} the memory of a GPU was used up"
-            reason = f"{how}: {log_end}"
+            reason = f"the process {how}: {log_end}"
             ends.append(TaskEnd(name=process.task.name, ended="failed", reason=reason))
         return ends
 
@@ -252,6 +253,15 @@ class LocalExecutor:
     def summary(self) -> str:
         """Return one sentence on how many trainings ran side by side; empty without a GPU."""
         return packing_text(self.rates)
+
+
+def _way_out(process: _Process) -> str:
+    """Return what can be done if a process was killed for want of memory."""
+    if process.gpu:
+        return "give fewer --per-gpu"
+    if process.task.kind == "training":
+        return "give fewer --jobs"
+    return "run it on fewer cores, as in `taskset --cpu-list 0-3 pronk study ...`"
 
 
 def _progress_time(folder: Path) -> float:

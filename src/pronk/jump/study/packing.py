@@ -82,6 +82,8 @@ def packing_text(rates: GpuRates) -> str:
     text = (
         f"{count} side by side on a GPU: {total / count:,.0f} steps/s each, {total:,.0f} together"
     )
+    if count == 1:
+        text = f"1 training at a time on a GPU: {total:,.0f} steps/s"
     alone = rates.totals.get(1)
     if alone is not None and count > 1:
         text += f", against {alone:,.0f} alone"

@@ -13,6 +13,7 @@ from pronk.errors import PronkError
 from pronk.jump.study.local import local_executor
 from pronk.jump.study.schedule import Executor
 from pronk.jump.study.trainings import TrainingPlace
+from pronk.tables import counted
 
 CLUSTER_PER_GPU = 4
 """Trainings of 4,096 robots on one GPU of a cluster, where nothing is measured first: on an H200
@@ -91,9 +92,9 @@ class ChosenPlace:
         if self.cluster is not None:
             return f"the Ray cluster {self.cluster}"
         if self.gpus:
-            gpus = "1 GPU" if len(self.gpus) == 1 else f"{len(self.gpus)} GPUs"
-            return f"{gpus} and {self.cores:g} cores"
-        return f"{self.cores:g} cores, {self.cores / self.training.cores:.0f} trainings at once"
+            return f"{counted(len(self.gpus), 'GPU')} and {counted(self.cores, 'core')}"
+        trainings = counted(round(self.cores / self.training.cores), "training")
+        return f"{counted(self.cores, 'core')}, {trainings} at once"
 
 
 def choose_place(place: StudyPlace, device: Literal["auto", "cpu", "cuda"]) -> ChosenPlace:

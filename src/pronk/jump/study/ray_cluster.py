@@ -32,6 +32,8 @@ from pronk.jump.study.tasks import (
     program_environment,
     store_file,
 )
+from pronk.processes import exit_words
+from pronk.tables import counted
 from pronk.version import VERSION
 
 CHECKPOINTS = "model_*.pt"
@@ -204,7 +206,8 @@ def run_remote_task(
         send(everything=True)
         if process.returncode == 0:
             return {"ended": "well", "reason": ""}
-        reason = f"exit status {process.returncode} on {socket.gethostname()}"
+        how = exit_words(process.returncode, "give fewer --per-gpu or nodes with more of it")
+        reason = f"the process on {socket.gethostname()} {how}"
         return {"ended": "failed", "reason": f"{reason}: {last_lines(log_file)}"}
 
 
@@ -405,8 +408,9 @@ def ray_executor(
     try:
         resources = ray.cluster_resources()
         say(
-            f"Ray cluster: {len(ray.nodes())} nodes, {resources.get('CPU', 0.0):g} cores, "
-            f"{resources.get('GPU', 0.0):g} GPUs"
+            f"Ray cluster: {counted(len(ray.nodes()), 'node')}, "
+            f"{counted(resources.get('CPU', 0.0), 'core')}, "
+            f"{counted(resources.get('GPU', 0.0), 'GPU')}"
         )
         head = {"node:__internal_head__": 0.001}
         mailbox = ray.remote(HomeMailbox).options(num_cpus=0, resources=head).remote()

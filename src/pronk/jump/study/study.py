@@ -47,6 +47,9 @@ from pronk.jump.study.study_results import (
     StudyResults,
     save_study,
 )
+from pronk.jump.study.study_results import (
+    WRITER as STUDY_WRITER,
+)
 from pronk.jump.study.tasks import (
     INPUTS,
     StudyState,
@@ -363,6 +366,78 @@ def tasks_of(selection: StudyPlan, tasks: Sequence[StudyTask], root: Path) -> li
     return kept
 
 
+def incomplete_trials(tasks: Sequence[StudyTask], root: Path) -> list[str]:
+    """Return the names of trials whose folders are there in part, and have them run again.
+
+    Such are trials that were interrupted, and those of a copy of the folder that lacks files. What
+    their folders have is kept: a trial whose jumps are there runs none of them again.
+
+    Args:
+        tasks: Tasks of the whole study.
+        root: Its folder.
+    """
+    state = StudyState(root)
+    names = []
+    for task in tasks:
+        if task.kind != "trial":
+            continue
+        if state.is_done(task):
+            try:
+                read_trial(root / task.folder)
+            except ArtefactError:
+                state.forget(task.name)
+                names.append(task.name)
+            continue
+        folder = root / task.folder
+        if not folder.is_dir() or not any(folder.iterdir()):
+            continue
+        record = state.records.get(task.name)
+        if not all((root / path).is_file() for path in task.inputs):
+            continue
+        # With another hash it is a trial of another policy or plan.
+        if record is None or record.key == task.key(root):
+            names.append(task.name)
+    return names
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletedTrials:
+    """Trials that were there in part before, and are whole now."""
+
+    run_again: tuple[str, ...] = ()
+    """Their jumps were missing or damaged."""
+    kept: tuple[str, ...] = ()
+    """Their jumps were there, and other files were missing."""
+
+
+def completed_trials(
+    names: Sequence[str],
+    tasks: Sequence[StudyTask],
+    root: Path,
+    statuses: Mapping[str, TaskStatus],
+) -> CompletedTrials:
+    """Return which of the trials that were there in part were run again.
+
+    Args:
+        names: What `incomplete_trials` returned before they were run.
+        tasks: The tasks that were run.
+        root: Folder of the study.
+        statuses: How they ended, by name.
+    """
+    run_again = []
+    kept = []
+    for task in tasks:
+        if task.name not in names or statuses[task.name].state != "done":
+            continue
+        path = root / task.folder / SUMMARY
+        with load_json(path, CONDITION_TRIAL_SCHEMA, STUDY_WRITER) as body:
+            if body["kept"]:
+                kept.append(task.name)
+            else:
+                run_again.append(task.name)
+    return CompletedTrials(run_again=tuple(run_again), kept=tuple(kept))
+
+
 def trial_name(arm: str, seed: int, robot: str) -> str:
     """Return the name of a trial's task."""
     return f"{arm}, seed {seed}, on {robot}"
@@ -546,7 +621,7 @@ def _read_jumps(
 
 def read_trial(folder: Path) -> list[TrialRun]:
     """Return the jumps of the trial in a folder of a study."""
-    with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, "pronk study STUDY.yaml") as body:
+    with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, STUDY_WRITER) as body:
         (cell,) = body["cells"]
         key = cell["key"]
     return load_cell(folder / CELLS / f"{key}.json", key)

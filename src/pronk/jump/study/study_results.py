@@ -19,7 +19,7 @@ import msgspec
 from pronk.files import write_text
 from pronk.jump.study.outcomes import OUTCOMES
 from pronk.jump.trial.results import load_json, save_json
-from pronk.tables import Cell, Column, Table, number
+from pronk.tables import Cell, Column, Table, counted, number
 
 STUDY_FILE = "study.json"
 STUDY_TABLE = "study.csv"
@@ -248,7 +248,7 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
                 row.append("-")
                 continue
             text = estimate_text(cell.value, cell.low, cell.high, outcome, signed=False)
-            row.append(f"{text}, {_seeds_text(cell.seeds)}")
+            row.append(f"{text}, {counted(cell.seeds, 'seed')}")
             if cell.seeds == 1:
                 single_seed.append(f"{arm} on {robot}")
         rows.append(tuple(row))
@@ -262,10 +262,6 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
         notes=tuple(notes),
         is_detail=in_series,
     )
-
-
-def _seeds_text(count: int) -> str:
-    return f"{count} seed" if count == 1 else f"{count} seeds"
 
 
 def comparison_table(results: StudyResults) -> Table:

@@ -160,8 +160,16 @@ class StudyState:
     def set(self, name: str, record: TaskRecord) -> None:
         """Remember the record of a task."""
         self.records[name] = record
+        self._write()
+
+    def _write(self) -> None:
         body = {"schema": STATE_SCHEMA, "tasks": msgspec.to_builtins(self.records)}
         write_text(self.path, json.dumps(body, indent=2) + "\n")
+
+    def forget(self, name: str) -> None:
+        """Forget the record of a task, which then is run again."""
+        del self.records[name]
+        self._write()
 
     def is_done(self, task: StudyTask) -> bool:
         """Return whether a task was done with these inputs, and its outputs are unchanged."""
@@ -179,13 +187,26 @@ class StudyState:
     def check_settings(self, tasks: Sequence[StudyTask]) -> None:
         """Refuse trainings that were begun in this folder with other settings or gains.
 
+        A policy of which nothing says how it was trained is no start of a training, and is not
+        replaced by one either.
+
         Raises:
-            PronkError: There is such a training; nothing was changed.
+            PronkError: There is such a training or policy; nothing was changed.
         """
         changed = []
         for task in tasks:
             record = self.records.get(task.name)
-            if task.kind != "training" or record is None:
+            if task.kind != "training":
+                continue
+            if record is None:
+                has_marker = (self.root / task.resume_marker).is_file()
+                for path in task.outputs:
+                    if not has_marker and (self.root / path).is_file():
+                        raise PronkError(
+                            f"--out {self.root}: {path} is there, but neither {STATE_FILE} nor "
+                            f"{task.resume_marker} says how it was trained; copy these files as "
+                            "well, or move it away to train anew."
+                        )
                 continue
             if (self.root / task.resume_marker).is_file() and record.key != task.key(self.root):
                 changed.append(task.name)

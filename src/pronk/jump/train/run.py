@@ -32,6 +32,7 @@ from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.tasks import Task, load_task
 from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives
 from pronk.robots.robot import RobotSpec
+from pronk.tables import counted
 
 
 def run_training(
@@ -120,7 +121,8 @@ def _check_processes(folder: RunFolder, settings: TrainSettings, processes: int)
     processes_before = infos.get("processes", processes)
     if processes != processes_before:
         raise PronkError(
-            f"--resume: the run in {folder.path} has {processes_before} processes of "
+            f"--resume: the run in {folder.path} has "
+            f"{counted(processes_before, 'process', 'processes')} of "
             f"{settings.envs} robots each, and this would be {processes}; give --gpu-ids and "
             "--hosts as before, or a new --out."
         )
@@ -258,6 +260,7 @@ def _summary(
     for name, iterations in settings.iterations.items():
         if iterations > 0:
             phases.append(f"{name} {iterations}")
+    unit = "iteration" if sum(settings.iterations.values()) == 1 else "iterations"
     gains = record["gains"]
     gains_text = f"{gains['name']} gains"
     if gains["file"]:
@@ -282,7 +285,7 @@ def _summary(
     elif len(gpus) > 1:
         device_text = f"each of {len(gpus)} GPUs"
     return (
-        f"training {settings.task} of {settings.robot}: {', '.join(phases)} iterations, "
+        f"training {settings.task} of {settings.robot}: {', '.join(phases)} {unit}, "
         f"{settings.envs} robots on {device_text}, {gains_text}{recipe_words}, seed "
         f"{settings.seed}; run folder {settings.out}"
     )

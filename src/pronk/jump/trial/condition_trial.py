@@ -6,9 +6,10 @@
 Every policy does every jump of the plan under every condition, with the same starts, noise and
 times throughout. The jumps of one policy under one condition are a cell. A finished cell is a file
 of its own, named by the hash of all that it depends on, so that a run that was interrupted, or that
-has more policies or conditions than the one before, does only what is new:
+has more policies or conditions than the one before, does only what is new. This holds on another
+machine too: cells that were computed there are kept if pronk and MuJoCo had the same versions:
 
-    cells/HASH.json                 the jumps of one cell
+    cells/HASH.json                 the jumps of one cell, and the versions it was computed with
     robots/CONDITION.yaml           its parameters, for `--sim-params` of other commands
     conditions.csv, .json           one row a cell
 """
@@ -18,9 +19,10 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +56,7 @@ from pronk.jump.trial.trial import (
 from pronk.jump.virtual.sim_params import SCHEMA as SIM_PARAMS_SCHEMA
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.names import file_name
-from pronk.processes import results_in_order
+from pronk.processes import FEWER_PROCESSES, results_in_order
 
 SCHEMA = "pronk/condition-trial/1"
 CELL_SCHEMA = "pronk/condition-cell/1"
@@ -62,7 +64,14 @@ SUMMARY = "conditions.json"
 TABLE = "conditions.csv"
 CELLS = "cells"
 ROBOTS = "robots"
+FIGURE = "conditions.svg"
 WRITER = "pronk trial POLICY --conditions FILE"
+DECIDING_VERSIONS = ("pronk", "mujoco")
+"""Software whose version decides the jumps: what is simulated, and by which physics. Of the others,
+Python 3.11 and 3.12, NumPy 2.4 and 2.5, SciPy 1.17 and 1.18, ONNX Runtime 1.30 and 1.31 gave the
+same jumps to the last digit; docs/try.md."""
+_ROBOT_COMMENT = "Condition "
+"""Beginning of the comment of the files in `robots`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +123,12 @@ class ConditionResults:
     """Wall time of this run, without cells that were there already [s]."""
     kept: int = 0
     """Number of cells that were there already."""
+    kept_versions: tuple[Mapping[str, str], ...] = ()
+    """Versions of other software with which some of those were computed."""
+    unused_versions: tuple[Mapping[str, str], ...] = ()
+    """Versions of the cells in the folder that are of another pronk or MuJoCo, and do not count."""
+    damaged: tuple[str, ...] = ()
+    """Policies and conditions whose files could not be read, so that they were run again."""
 
     @property
     def policy_names(self) -> list[str]:
@@ -136,6 +151,20 @@ class _PlannedCell:
     condition: Condition
     sim_params: SimParams
     key: str
+
+
+@dataclass(kw_only=True)
+class _KeptCells:
+    """The cells of a plan that the folder has already."""
+
+    keys: dict[str, str] = field(default_factory=dict)
+    """Name of each cell's file by the key that it would have here."""
+    versions: list[Mapping[str, str]] = field(default_factory=list)
+    """Versions of other software with which some of them were computed."""
+    unused_versions: list[Mapping[str, str]] = field(default_factory=list)
+    """Versions of cells in the folder that are of another pronk or MuJoCo."""
+    damaged: list[str] = field(default_factory=list)
+    """Policies and conditions whose files cannot be read."""
 
 
 def run_conditions(
@@ -169,18 +198,21 @@ def run_conditions(
         params = changed_params(condition, setup.sim_params, setup.robot)
         stem = file_name(condition.name).replace(" ", "_")
         path = setup.out / ROBOTS / f"{stem}.yaml"
-        save_sim_params(path, params, comment=f"Condition {condition.name!r} of `{WRITER}`.")
+        comment = f"{_ROBOT_COMMENT}{condition.name!r} of `{WRITER}`."
+        save_sim_params(path, params, comment=comment)
 
+    kept = _kept_cells(cells, plan, setup)
     missing: dict[str, _PlannedCell] = {}
     for cell in cells:
-        if not _cell_path(setup.out, cell.key).exists():
+        if cell.key not in kept.keys:
             missing.setdefault(cell.key, cell)
     _run_cells(list(missing.values()), plan, setup, progress)
 
     summed_cells = []
     for cell in cells:
-        rows = load_cell(_cell_path(setup.out, cell.key), cell.key)
-        summed_cells.append(_sum_up(cell, rows))
+        key = kept.keys.get(cell.key, cell.key)
+        rows = load_cell(_cell_path(setup.out, key), key)
+        summed_cells.append(_sum_up(replace(cell, key=key), rows))
     results = ConditionResults(
         robot=setup.robot.name,
         subjects=subjects,
@@ -193,6 +225,9 @@ def run_conditions(
         versions=software_versions(),
         seconds=time.perf_counter() - begun,
         kept=len(cells) - len(missing),
+        kept_versions=tuple(kept.versions),
+        unused_versions=tuple(kept.unused_versions) if missing else (),
+        damaged=tuple(kept.damaged),
     )
     save_conditions(setup.out, results)
     return results
@@ -206,6 +241,7 @@ def _plan_cells(
 ) -> list[_PlannedCell]:
     """Return every cell, by condition and policy; refuse robots that cannot exist."""
     cells = []
+    versions = software_versions()
     for condition in conditions:
         params = changed_params(condition, setup.sim_params, setup.robot)
         changed_setup = replace(setup, sim_params=params)
@@ -220,23 +256,60 @@ def _plan_cells(
                     subject=subject,
                     condition=condition,
                     sim_params=params,
-                    key=cell_key(subject, params, plan, setup),
+                    key=cell_key(subject, params, plan, setup, versions),
                 )
             )
     return cells
 
 
+def _kept_cells(cells: Sequence[_PlannedCell], plan: TrialPlan, setup: TrialSetup) -> _KeptCells:
+    """Find the cells that were computed before, here or where other software has other versions."""
+    kept = _KeptCells()
+    versions = software_versions()
+    usable_versions = [versions]
+    for other in _stored_versions(setup.out):
+        if any(other.get(name) != versions[name] for name in DECIDING_VERSIONS):
+            kept.unused_versions.append(other)
+        elif other != versions:
+            usable_versions.append(other)
+    for cell in cells:
+        if cell.key in kept.keys:
+            continue
+        is_damaged = False
+        for other in usable_versions:
+            key = cell_key(cell.subject, cell.sim_params, plan, setup, other)
+            path = _cell_path(setup.out, key)
+            if not path.exists():
+                continue
+            try:
+                load_cell(path, key)
+            except ArtefactError:
+                is_damaged = True
+                continue
+            kept.keys[cell.key] = key
+            if other != versions and other not in kept.versions:
+                kept.versions.append(other)
+            break
+        if is_damaged and cell.key not in kept.keys:
+            kept.damaged.append(f"{cell.subject.name} under {cell.condition.name}")
+    return kept
+
+
 def cell_key(
-    subject: TriedPolicy, sim_params: SimParams, plan: TrialPlan, setup: TrialSetup
+    subject: TriedPolicy,
+    sim_params: SimParams,
+    plan: TrialPlan,
+    setup: TrialSetup,
+    versions: Mapping[str, str],
 ) -> str:
-    """Return the hash of all that the jumps of a cell depend on, 16 hex digits."""
+    """Return the hash of what the jumps of a cell depend on, and of versions, 16 hex digits."""
     settings = {
         "schema": CELL_SCHEMA,
         "policy": subject.sha256,
         "robot": setup.robot.name,
         "sim_params": sim_params,
         "plan": plan,
-        "versions": software_versions(),
+        "versions": versions,
     }
     return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()[:16]
 
@@ -249,18 +322,29 @@ def _run_cells(
 ) -> None:
     """Run all jumps of some cells, and save each cell as soon as its last jump is done."""
     jobs: list[TrialJob] = []
+    names: list[str] = []
     last_jobs: dict[int, _PlannedCell] = {}
     for cell in cells:
-        jobs += plan_jobs([cell.subject], plan, replace(setup, sim_params=cell.sim_params))
+        cell_jobs = plan_jobs([cell.subject], plan, replace(setup, sim_params=cell.sim_params))
+        for job in cell_jobs:
+            names.append(f"{job.name} under {cell.condition.name}")
+        jobs += cell_jobs
         last_jobs[len(jobs) - 1] = cell
     rows: list[TrialRun] = []
-    results = results_in_order(run_condition_job, jobs, processes=setup.processes)
+    versions = software_versions()
+    results = results_in_order(
+        run_condition_job,
+        jobs,
+        processes=setup.processes,
+        names=names,
+        way_out=FEWER_PROCESSES,
+    )
     for index, row in enumerate(results):
         rows.append(row)
         if index in last_jobs:
             cell = last_jobs[index]
             path = _cell_path(setup.out, cell.key)
-            save_json(path, CELL_SCHEMA, {"key": cell.key, "rows": rows})
+            save_json(path, CELL_SCHEMA, {"key": cell.key, "rows": rows, "versions": versions})
             rows = []
         if progress is not None:
             progress((index + 1) / len(jobs))
@@ -319,13 +403,14 @@ def prepare_conditions(out: Path, *, overwrite: bool = False) -> None:
     """Make the folder of the results before anything is computed.
 
     Args:
-        out: A folder that is new, empty, or has cells of a run before.
-        overwrite: Delete those cells.
+        out: A folder that is new, empty, or has something of a run before, which may be a part of
+            it: a copy without its cells, or a run that was ended before its first cell.
+        overwrite: Delete the cells.
     """
     if out.exists() and not out.is_dir():
         raise PronkError(f"--out {out}: a file; expected the name of a folder.")
     try:
-        if out.is_dir() and any(out.iterdir()) and not (out / CELLS).is_dir():
+        if out.is_dir() and not (out / CELLS).is_dir() and not _is_part_of_run(out):
             raise PronkError(
                 f"--out {out}: not empty, and not the folder of a run with --conditions, which "
                 "would go on; give another folder."
@@ -338,6 +423,35 @@ def prepare_conditions(out: Path, *, overwrite: bool = False) -> None:
         raise PronkError(
             f"--out {out}: cannot be written to ({error.strerror}); give another folder."
         ) from None
+
+
+def _is_part_of_run(out: Path) -> bool:
+    """Return whether a folder without cells holds nothing but what a run writes beside them."""
+    for path in out.iterdir():
+        # Names of files that are being written begin with a dot.
+        if path.name not in (SUMMARY, TABLE, FIGURE, ROBOTS) and not path.name.startswith("."):
+            return False
+    for path in (out / ROBOTS).glob("*"):
+        if path.name.startswith("."):
+            continue
+        if not path.is_file() or not path.read_bytes().startswith(f"# {_ROBOT_COMMENT}".encode()):
+            return False
+    return True
+
+
+def _stored_versions(out: Path) -> list[dict[str, str]]:
+    """Return the versions of software that the cells of a folder were computed with."""
+    stored: list[dict[str, str]] = []
+    for path in (*sorted((out / CELLS).glob("*.json")), out / SUMMARY):
+        try:
+            body = json.loads(path.read_text(encoding="utf-8"))
+            versions = msgspec.convert(body["versions"], dict[str, str])
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            # Damaged or missing; cells of an earlier pronk have their versions in the summary.
+            continue
+        if versions not in stored:
+            stored.append(versions)
+    return stored
 
 
 def _cell_path(out: Path, key: str) -> Path:

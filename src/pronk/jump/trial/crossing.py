@@ -68,7 +68,7 @@ from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.ground import Box, Ground, Start
 from pronk.policy.rollout import ticks
 from pronk.policy.script import STILL, Commanded, Script, Velocity
-from pronk.processes import in_processes
+from pronk.processes import FEWER_PROCESSES, in_processes
 
 Shape = Literal["flat", "gap", "up", "down"]
 
@@ -569,7 +569,14 @@ def add_crossings(
         def report(share: float) -> None:
             progress((done + share) / (done + share + ROUNDS_LEFT))
 
-        return in_processes(run_attempt, attempts, processes=setup.processes, progress=report)
+        return in_processes(
+            run_attempt,
+            attempts,
+            processes=setup.processes,
+            names=[f"{attempt.name}, {attempt.obstacle.shape}" for attempt in attempts],
+            way_out=FEWER_PROCESSES,
+            progress=report,
+        )
 
     rows = climb_ladders(subjects, plan, setup, run=run)
     progress(1.0)

@@ -18,7 +18,7 @@ from pronk.jump.trial.protocol import (
 )
 from pronk.jump.trial.results import FEWEST, RunCell, ScatterRatio, Spread, TrialResults
 from pronk.jump.trial.walk import SETTLE_S, WALK_FIGURES
-from pronk.tables import NOT_MEASURED, Cell, Column, Table, number
+from pronk.tables import NOT_MEASURED, Cell, Column, Table, counted, number
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
@@ -442,8 +442,8 @@ def crossing_table(crossings: TrialResults) -> Table:
     settings = crossings.settings
     is_paper_robot = crossings.robot == PAPER_ROBOT
     note = (
-        f"crossed: in {settings['enough']} or more of {settings['runs']} runs, as were all smaller "
-        "ones. ever crossed: in any run."
+        f"crossed: in {settings['enough']} or more of {counted(settings['runs'], 'run')}, as were "
+        "all smaller ones. ever crossed: in any run."
     )
     if is_paper_robot:
         note += " The paper's gaps were judged from video of jumps over flat floor."
@@ -514,8 +514,8 @@ def condition_table(results: ConditionResults) -> Table:
         ),
         rows=tuple(rows),
         notes=(
-            f"Commands: {', '.join(results.commands)}; {results.jumps} jumps with each, seed "
-            f"{results.seed}. Mean +- standard deviation over all jumps.",
+            f"Commands: {', '.join(results.commands)}; {counted(results.jumps, 'jump')} with each, "
+            f"seed {results.seed}. Mean +- standard deviation over all jumps.",
             "velocity error: difference of mean and commanded velocity along the command before "
             "the jump input.",
         ),

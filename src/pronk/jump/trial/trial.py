@@ -49,7 +49,7 @@ from pronk.policy.contract import check
 from pronk.policy.rollout import check_standing, ticks
 from pronk.policy.runtime import Policy, load_policy
 from pronk.policy.script import STILL, Script
-from pronk.processes import in_processes
+from pronk.processes import FEWER_PROCESSES, in_processes
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
@@ -161,6 +161,11 @@ class TrialJob:
     setup: TrialSetup
     start: Start
     run_kind: RunKind
+
+    @property
+    def name(self) -> str:
+        """Policy, command and number of the run from 1, in a few words."""
+        return f"{self.subject.name}, {self.row.case}, run {self.row.number + 1}"
 
     def build(self, share: float = 1.0) -> VirtualRobot:
         """Build the virtual robot, not connected, at a share of the joint offsets."""
@@ -332,7 +337,14 @@ def run_trial(
     if run_kind is JUMPS:
         prepare_folder(setup.out, overwrite=overwrite)
     begun = time.perf_counter()
-    timed_runs = in_processes(_run_timed, jobs, processes=setup.processes, progress=progress)
+    timed_runs = in_processes(
+        _run_timed,
+        jobs,
+        processes=setup.processes,
+        names=[job.name for job in jobs],
+        way_out=FEWER_PROCESSES,
+        progress=progress,
+    )
     seconds = time.perf_counter() - begun
     rows = tuple(run.row for run in timed_runs)
     simulated_s = sum(row.script.seconds for row in rows)
