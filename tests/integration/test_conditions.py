@@ -434,18 +434,18 @@ def test_cells_of_another_machine_are_kept(
     policies: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
 ) -> None:
     """Its Python and NumPy are newer, its folders have other names; pronk and MuJoCo are alike."""
-    there = tmp_path / "there"
+    far_folder = tmp_path / "far"
     with monkeypatch.context() as other_machine:
         other_machine.setattr(platform, "python_version", lambda: "3.99.1")
         other_machine.setattr(np, "__version__", "9.9.9")
-        first = run_conditions(policies, CONDITIONS[:2], PLAN, setup(there))
-    here = tmp_path / "here"
-    shutil.copytree(there, here)
+        first = run_conditions(policies, CONDITIONS[:2], PLAN, setup(far_folder))
+    near_folder = tmp_path / "near"
+    shutil.copytree(far_folder, near_folder)
     if state == "interrupted":
         for name in ("conditions.json", "conditions.csv"):
-            (here / name).unlink()
+            (near_folder / name).unlink()
     if state == "of an earlier pronk":
-        for path in (here / CELLS).iterdir():
+        for path in (near_folder / CELLS).iterdir():
             body = json.loads(path.read_text())
             del body["versions"]
             path.write_text(json.dumps(body))
@@ -455,11 +455,11 @@ def test_cells_of_another_machine_are_kept(
         copy.parent.mkdir(exist_ok=True)
         shutil.copyfile(path, copy)
         moved.append(copy)
-    cells = {path.name: path.stat().st_mtime_ns for path in (here / CELLS).iterdir()}
-    again = run_conditions(moved, CONDITIONS, PLAN, setup(here))
+    cells = {path.name: path.stat().st_mtime_ns for path in (near_folder / CELLS).iterdir()}
+    again = run_conditions(moved, CONDITIONS, PLAN, setup(near_folder))
     # The third condition changes nothing of the first, so that its cells are there as well.
     assert again.kept == len(again.cells) == 6
-    for path in (here / CELLS).iterdir():
+    for path in (near_folder / CELLS).iterdir():
         assert path.stat().st_mtime_ns == cells.pop(path.name)
     assert not cells
     for cell in first.cells:

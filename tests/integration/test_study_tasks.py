@@ -160,13 +160,13 @@ def task_processes() -> list[int]:
     return numbers
 
 
-@pytest.mark.parametrize(("kind", "way_out"), [("training", "--jobs"), ("trial", "cores")])
+@pytest.mark.parametrize(("task_kind", "way_out"), [("training", "--jobs"), ("trial", "cores")])
 def test_a_task_that_is_killed_from_outside_says_so(
-    tmp_path: Path, kind: str, way_out: str
+    tmp_path: Path, task_kind: str, way_out: str
 ) -> None:
     root = study_root(tmp_path)
     command = ("simulate", "--link", "lcm", "--robot", "mini_cheetah")
-    task = export_task("endless", kind=kind, command=command)
+    task = export_task("endless", kind=task_kind, command=command)
 
     def kill(progress: StudyProgress) -> None:
         for number in task_processes():
