@@ -8,6 +8,7 @@ host, writes the run.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
@@ -74,12 +75,12 @@ def launch(
         agent_timeout=AGENT_S,
         copy_env_vars=COPIED_VARIABLES,
     ).set_logging_handlers(partial(_log_handlers, tuple(hosts), processes, log_dir))
+    is_interrupted = False
     try:
         with _terminated_as_interrupted():
             launcher.run(train_packed, cloudpickle.dumps((config, log_dir)))
     except KeyboardInterrupt:
-        _wait_for_checkpoint(log_dir, first_checkpoint)
-        raise
+        is_interrupted = True
     except (AgentFailedError, WorkerFailedError, torch.distributed.DistError) as error:
         reason = str(error) or type(error).__name__
         raise PronkError(
@@ -87,6 +88,12 @@ def launch(
             f"{log_dir / LOG_FOLDER} has what each printed. --resume goes on from the last "
             "checkpoint."
         ) from error
+    if is_interrupted:
+        # The agents wait for this process, deaf to the signal that torchrunx has sent them, as long
+        # as its connections are open; the frames of the interrupt held them.
+        gc.collect()
+        _wait_for_checkpoint(log_dir, first_checkpoint)
+        raise KeyboardInterrupt
 
 
 def train_process(config: mjlab_train.TrainConfig, log_dir: Path) -> None:
