@@ -218,7 +218,7 @@ def test_missing_captures_are_counted(tmp_path: Path) -> None:
     (tmp_path / trial.rows[1].capture).unlink()
     text = report(tmp_path).text
     assert "2 of 3 jumps, those with a capture" in text
-    assert "1 captures are missing" in text
+    assert "1 capture is missing" in text
 
 
 @pytest.mark.parametrize(
