@@ -452,21 +452,26 @@ def humanoid(folder: Path, *, whole: bool) -> RobotSpec:
     return load_robot(path)
 
 
-@pytest.mark.parametrize("whole", [True, False])
+@pytest.fixture(scope="module")
+def humanoids(tmp_path_factory: pytest.TempPathFactory) -> list[RobotSpec]:
+    folder = tmp_path_factory.mktemp("g1")
+    return [humanoid(folder, whole=True), humanoid(folder, whole=False)]
+
+
 @pytest.mark.parametrize("joint", G1_MOTORS)
 def test_motors_of_a_g1_have_the_numbers_of_unitree(
-    tmp_path: Path, joint: str, whole: bool
+    tmp_path: Path, joint: str, humanoids: list[RobotSpec]
 ) -> None:
-    number = G1_MOTORS[joint]
-    build = unitree("unitree_hg", motors=29, moving=number)
+    build = unitree("unitree_hg", motors=29, moving=G1_MOTORS[joint])
     path = write_bag(tmp_path / "bag", build, definitions=DEFINITIONS)
-    log = read(path, humanoid(tmp_path, whole=whole))
-    assert log.excited_joints == (joint,)
-    np.testing.assert_allclose(log.command[:, log.column(joint)], CHIRP, atol=1e-7)
-    for other, motor in G1_MOTORS.items():
-        if other != joint:
-            resting = log.position[:, log.column(other)]
-            np.testing.assert_allclose(resting, 0.1 + 0.01 * motor, atol=1e-7)
+    for robot in humanoids:
+        log = read(path, robot)
+        assert log.excited_joints == (joint,)
+        np.testing.assert_allclose(log.command[:, log.column(joint)], CHIRP, atol=1e-7)
+        for other, motor in G1_MOTORS.items():
+            if other != joint:
+                resting = log.position[:, log.column(other)]
+                np.testing.assert_allclose(resting, 0.1 + 0.01 * motor, atol=1e-7)
 
 
 def test_linkages_of_a_g1_are_not_taken_for_its_joints(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def swept_and_recorded(
 ) -> tuple[JointLog, JointLog, dict[str, Any]]:
     """Sweep a joint while another process records; return both logs and the recorder's figures."""
     robot = load_robot(robot_name)
-    chirp = Chirp(length_s=8.0, start_hz=0.3, stop_hz=8.0)
+    chirp = Chirp(length_s=5.0, start_hz=0.3, stop_hz=8.0)
     plan = make_plan(robot, [joint], chirp, amplitudes=(0.2,), repeats=2, settle_s=1.0)
     recording = out / "recording.mcap"
     figures = out / "record.json"
