@@ -14,8 +14,11 @@ from pronk.cli.study import failure_status
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.jump.study.local import LocalExecutor
+from pronk.jump.study.place import ChosenPlace
 from pronk.jump.study.schedule import StudyProgress, TaskEnd, run_tasks
+from pronk.jump.study.study import on_cores
 from pronk.jump.study.tasks import StudyState, StudyTask, copied_input, study_folder
+from pronk.jump.study.trainings import TrainingPlace
 from study_cases import GAINS, Watched, export_task, finished, study_root
 
 
@@ -120,6 +123,25 @@ def test_no_more_tasks_run_at_once_than_there_are_cores(tmp_path: Path) -> None:
         assert watched.last is not None
         assert watched.last.count("done") == 3
         assert watched.last.seconds_left == 0.0
+
+
+def test_trials_share_the_cores_of_a_host_that_has_more_of_them() -> None:
+    many = ChosenPlace(training=TrainingPlace(device="cuda"), gpus=("0",), cores=64.0)
+    assert many.trial_processes(16) == 4
+    assert many.trial_processes(40) == 1
+    assert many.trial_processes(100) == 1
+    cluster = ChosenPlace(training=TrainingPlace(device="cuda"), cluster="ray://head:10001")
+    assert cluster.trial_processes(2) == 1
+
+
+def test_the_result_of_a_trial_does_not_depend_on_its_processes(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    trial = export_task("one")
+    shared = on_cores(trial, 4)
+    assert shared.key(root) == trial.key(root)
+    assert shared.cores == 4.0
+    assert shared.threads == 1
+    assert export_task("training", cores=4.0).threads == 4
 
 
 def test_a_command_that_ends_without_its_output_has_failed(tmp_path: Path) -> None:

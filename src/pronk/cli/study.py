@@ -112,7 +112,8 @@ def study(
         f"{chosen.words}; folder {out}"
     )
     with study_folder(out):
-        tasks = study_tasks(study_plan, out, chosen.training)
+        processes = chosen.trial_processes(selection.trials)
+        tasks = study_tasks(study_plan, out, chosen.training, trial_processes=processes)
         incomplete = incomplete_trials(tasks, out)
         tasks = tasks_of(selection, tasks, out)
         statuses = run_shown(tasks, chosen, out)

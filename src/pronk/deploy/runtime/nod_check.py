@@ -14,6 +14,8 @@ ones, while the hips sway. Two things are compared.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pronk.arrays import Array
@@ -33,11 +35,10 @@ and lags: the least of starts of the Mini Cheetah without a fault is 0.35."""
 _LEAST_TURN = 0.01
 """Root of the mean square of the turn by the legs from which the inertial unit is judged, in the
 less turned direction [rad]."""
-_LARGEST_DEVIATION = 0.9
-"""Largest deviation of the turns by the inertial unit from those by the legs, as the norm of
-`A - 1` with A the matrix from one to the other: a unit turned by an angle a about the vertical
-has 2 sin(a / 2), which is 1.41 at 90 degrees and 0.9 at 53; a mirrored sign has 2. The largest of
-14 starts of the Mini Cheetah without a fault is 0.53."""
+_LARGEST_ANGLE = math.radians(53.0)
+"""Largest angle about the vertical between the turns by the inertial unit and those by the legs
+[rad]; a unit that is mounted a quarter turn off has 90 degrees. How large the turns are does not
+count: legs that give way and an attitude that wanders change that by more than half."""
 _LEAST_SHARE = 0.4
 """Largest turn by the inertial unit, as a share of that by the legs, of a robot whose feet hang in
 the air: such a robot is not judged."""
@@ -145,14 +146,18 @@ class NodCheck:
         matrix = np.linalg.lstsq(by_legs, by_unit, rcond=None)[0].T
         if np.linalg.norm(matrix, 2) < _LEAST_SHARE:
             return ""
-        deviation = float(np.linalg.norm(matrix - np.eye(2), 2))
-        if deviation > _LARGEST_DEVIATION:
-            turned = np.degrees(np.arctan2(matrix[1, 0] - matrix[0, 1], np.trace(matrix)))
-            mirrored = np.linalg.det(matrix) < 0.0
-            would = "a sign of it is mirrored" if mirrored else f"turned by {turned:.0f} degrees"
+        if np.linalg.det(matrix) < 0.0:
             return (
-                f"the inertial unit deviates by {deviation:.2f} from the turn of the trunk by the "
-                f"legs, as if {would}, or not all feet stand on the ground"
+                "the inertial unit does not turn as the trunk does by the legs: a sign of it seems to "
+                "be mirrored, or not all feet stand on the ground"
+            )
+        # Of all rotations that of the polar decomposition is nearest to the matrix.
+        angle = math.atan2(matrix[1, 0] - matrix[0, 1], np.trace(matrix))
+        if abs(angle) > _LARGEST_ANGLE:
+            return (
+                f"the inertial unit seems to be mounted {math.degrees(angle):.0f} degrees off about the "
+                "vertical, by the turns of the trunk that the legs tell, or not all feet stand on the "
+                "ground"
             )
         return ""
 

@@ -159,7 +159,7 @@ class LocalExecutor:
 
     def _start(self, task: StudyTask, gpu: _Gpu | None) -> None:
         """Start the process of a task."""
-        environment = program_environment(task.cores)
+        environment = program_environment(task.threads)
         environment.update(self._variables)
         # Numbers of GPUs are those of nvidia-smi.
         environment["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"

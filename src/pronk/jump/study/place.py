@@ -86,6 +86,15 @@ class ChosenPlace:
     per_gpu: int | None = None
     cluster: str | None = None
 
+    def trial_processes(self, trials: int) -> int:
+        """Return how many jumps of each trial may run at once, so that all cores have work.
+
+        The cores of a cluster's nodes are not known before, so a trial has one there.
+        """
+        if self.cluster is not None or trials == 0:
+            return 1
+        return max(1, int(self.cores / trials))
+
     @property
     def words(self) -> str:
         """What it is, in a few words."""

@@ -186,7 +186,7 @@ def run_remote_task(
             process = subprocess.Popen(
                 program(remote.words),
                 cwd=root,
-                env=program_environment(task.cores),
+                env=program_environment(task.threads),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -276,13 +276,16 @@ def _check_policies(paths: Sequence[Path]) -> None:
 # ---- tasks ----
 
 
-def study_tasks(plan: StudyPlan, root: Path, place: TrainingPlace) -> list[StudyTask]:
+def study_tasks(
+    plan: StudyPlan, root: Path, place: TrainingPlace, *, trial_processes: int = 1
+) -> list[StudyTask]:
     """Return the trainings and behind them the trials, and write their inputs.
 
     Args:
         plan: The study.
         root: Its folder.
         place: The devices of trainings.
+        trial_processes: Jumps of one trial at once, each on a core.
     """
     trained = []
     for arm in plan.arms:
@@ -312,7 +315,8 @@ def study_tasks(plan: StudyPlan, root: Path, place: TrainingPlace) -> list[Study
                 for robot in robots:
                     if arm.name in robot.arms:
                         inputs = (policy, params_by_robot[robot.name], nominal)
-                        tasks.append(_trial_task(plan, arm, seed, robot, inputs, needs))
+                        task = _trial_task(plan, arm, seed, robot, inputs, needs)
+                        tasks.append(on_cores(task, trial_processes))
     return tasks
 
 
@@ -461,7 +465,7 @@ def _trial_task(
     policy, params, nominal = inputs
     folder = trial_folder(arm, seed, robot)
     words = ["trial", policy, "--sim-params", params, "--conditions", nominal]
-    words += ["--jumps", str(robot.jumps), "--seed", str(trial.seed), "--processes", "1"]
+    words += ["--jumps", str(robot.jumps), "--seed", str(trial.seed)]
     for command in trial.commands:
         words.append(f"--commands={command}")
     if plan.robot.source != plan.robot.name:
@@ -478,6 +482,12 @@ def _trial_task(
         outputs=(f"{folder}/{SUMMARY}", f"{folder}/{TABLE}"),
         needs=needs,
     )
+
+
+def on_cores(trial: StudyTask, processes: int) -> StudyTask:
+    """Return a trial whose jumps run on so many cores, one process on each."""
+    command = (*trial.command, "--processes", str(processes))
+    return replace(trial, command=command, cores=float(processes), processes=processes)
 
 
 def _params_input(root: Path, robot: StudiedRobot) -> str:

@@ -64,6 +64,13 @@ class StudyTask:
     """True if the task needs a share of a GPU."""
     cores: float = 1.0
     """Number of cores that the task needs."""
+    processes: int = 1
+    """Number of processes of the command, which share these cores."""
+
+    @property
+    def threads(self) -> int:
+        """Threads that the libraries of each process get."""
+        return max(1, int(self.cores / self.processes))
 
     def log(self) -> str:
         """Return the file of what the command prints."""
@@ -91,11 +98,11 @@ def program(words: Sequence[str]) -> list[str]:
     return [sys.executable, "-m", "pronk.jump.study.task_process", str(os.getpid()), *words]
 
 
-def program_environment(cores: float) -> dict[str, str]:
+def program_environment(threads: int) -> dict[str, str]:
     """Return the environment of a task's process.
 
     Args:
-        cores: Number of cores that the task has; libraries get as many threads.
+        threads: Number of threads that its libraries get.
     """
     environment = dict(os.environ)
     # The process runs in another folder, where relative entries would mean something else.
@@ -104,9 +111,8 @@ def program_environment(cores: float) -> dict[str, str]:
         if entry:
             paths.append(str(Path(entry).resolve()))
     environment["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
-    threads = str(max(1, int(cores)))
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        environment[name] = threads
+        environment[name] = str(threads)
     return environment
 
 
