@@ -48,7 +48,7 @@ from pronk.policy.runtime import load_policy
 from pronk.policy.script import STILL, Velocity
 from pronk.robots import load_robot
 from pronk.robots.machine import State
-from pronk.tables import Cell, Column, Table
+from pronk.tables import Cell, Column, Table, counted
 
 SERVO_HZ = 500
 STEP_TICKS = 10
@@ -569,7 +569,7 @@ def table_of_flights(flights: list[Row], sets: int) -> Table:
     title = (
         f"{sum(row['seconds'] for row in flights) / 3600.0:.2f} h, {len(flights)} flights of "
         f"{sets} parameter sets, {sum(row['jumps'] for row in flights)} jumps: "
-        f"{sum(bool(row['alarm']) for row in flights)} false alarms"
+        f"{counted(sum(bool(row['alarm']) for row in flights), 'false alarm')}"
     )
     end_counts = ", ".join(f"{name} {number}" for name, number in ends.items())
     return Table(
