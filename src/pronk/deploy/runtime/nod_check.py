@@ -37,9 +37,9 @@ _LEAST_TURN = 0.01
 less turned direction [rad]."""
 _LARGEST_ANGLE = math.radians(53.0)
 """Largest angle about the vertical between the turns by the inertial unit and those by the legs
-[rad]; a unit that is mounted a quarter turn off has 90 degrees. The largest of 57 starts of the Mini
-Cheetah without a fault is 11 degrees. How large the turns are does not count: legs that give way and
-an attitude that wanders change that by more than half (docs/evidence/faults.md)."""
+[rad]; a unit that is mounted a quarter turn off has 90 degrees. The largest of 57 starts of the
+Mini Cheetah without a fault is 11 degrees. How large the turns are does not count: legs that give
+way and an attitude that wanders change that by more than half (docs/evidence/faults.md)."""
 _LEAST_SHARE = 0.4
 """Largest turn by the inertial unit, as a share of that by the legs, of a robot whose feet hang in
 the air: such a robot is not judged."""
@@ -149,16 +149,16 @@ class NodCheck:
             return ""
         if np.linalg.det(matrix) < 0.0:
             return (
-                "the inertial unit does not turn as the trunk does by the legs: a sign of it seems to "
-                "be mirrored, or not all feet stand on the ground"
+                "the inertial unit does not turn as the trunk does by the legs: a sign of it seems "
+                "to be mirrored, or not all feet stand on the ground"
             )
         # Of all rotations that of the polar decomposition is nearest to the matrix.
         angle = math.atan2(matrix[1, 0] - matrix[0, 1], np.trace(matrix))
         if abs(angle) > _LARGEST_ANGLE:
             return (
-                f"the inertial unit seems to be mounted {math.degrees(angle):.0f} degrees off about the "
-                "vertical, by the turns of the trunk that the legs tell, or not all feet stand on the "
-                "ground"
+                f"the inertial unit seems to be mounted {math.degrees(angle):.0f} degrees off "
+                "about the vertical, by the turns of the trunk that the legs tell, or not all feet "
+                "stand on the ground"
             )
         return ""
 
