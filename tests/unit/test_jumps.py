@@ -26,6 +26,7 @@ from pronk.jump.trial.jumps import (
 from pronk.jump.virtual.capture import Capture
 from pronk.policy.script import Script
 from pronk.robots import load_robot
+from pronk.robots.legged import legged
 from seen_jump import SCRIPT, STANDING, G, changed, motion, seen_jump
 
 ROBOT = load_robot("mini_cheetah")
@@ -334,6 +335,18 @@ def test_a_knee_on_the_ground_is_no_success(time: float, touches: bool) -> None:
     assert figures.non_foot_contact is touches
     assert figures.success is not touches
     assert figures.upright
+
+
+@pytest.mark.parametrize(("time", "counts"), [(ON - 0.1, False), (ON + 0.01, True)])
+def test_how_far_a_foot_is_pressed_in_is_a_share_of_its_radius(time: float, counts: bool) -> None:
+    radius = legged(ROBOT.source).foot_radius
+    capture = seen_jump()
+    pressed = capture.foot_position.copy()
+    pressed[between(time, time + 0.02), 2, 2] = -0.5 * radius
+    figures = measured(replace(capture, foot_position=pressed))
+    before = measured(capture).foot_press
+    assert before < 1.0
+    assert figures.foot_press == pytest.approx(1.5 if counts else before)
 
 
 def test_rates_are_those_of_the_acceleration() -> None:

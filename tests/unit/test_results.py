@@ -116,6 +116,27 @@ def test_a_cell_by_hand() -> None:
     assert cell.joints["peak_torque"]["FR_knee"].maximum == pytest.approx(2 * 0.48)
 
 
+@pytest.mark.parametrize(
+    ("touched", "fell", "foot_press", "is_noted"),
+    [
+        (True, False, 1.4, True),
+        (True, False, 0.6, False),
+        (False, False, 1.4, False),
+        (True, True, 1.4, False),
+    ],
+)
+def test_touches_while_feet_are_pressed_in_beyond_their_centre_are_noted(
+    touched: bool, fell: bool, foot_press: float, is_noted: bool
+) -> None:
+    results = trial({"matched": (0.4,)}, (PAPER_COMMANDS[0],))
+    changes = {"non_foot_contact": touched, "fell": fell, "foot_press": foot_press}
+    figures = replace(jump(0.4), **changes)
+    rows = (row("matched", PAPER_COMMANDS[0], 0, figures),)
+    notes = " ".join(tables.landings(replace(results, rows=rows)).notes)
+    assert ("ground.stiffness" in notes) is is_noted
+    assert ("1.4" in notes) is is_noted
+
+
 def test_the_ratio_is_that_of_the_mean_scatter() -> None:
     ratios = {}
     for ratio in trial().ratios:

@@ -378,6 +378,7 @@ class JumpFigures:
     height: float = figure("m", "max z - min z over c .. e")
     flights: float = figure("1", "flight phases that lift off from c to c + 1.5 s")
     high_flights: float = figure("1", "those of them that are 60 ms or longer and high")
+    foot_press: float = figure("1", "max over feet of (r - f_i,z) / r, from c to 2 s after d")
     flight: FlightFigures = field(default_factory=FlightFigures, metadata={"part": FlightFigures})
     approach: ApproachFigures = field(
         default_factory=ApproachFigures, metadata={"part": ApproachFigures}
@@ -454,6 +455,7 @@ def measure_jump(
         upright = settled < count and bool(
             cosine_of_tilt(capture.orientation[settled]) >= rules.upright_cosine
         )
+    lowest_foot = float(capture.foot_position[on : settled + 1, :, 2].min())
     return JumpFigures(
         standing=True,
         found=main is not None,
@@ -463,6 +465,7 @@ def measure_jump(
         height=float(np.ptp(capture.position[on : end + 1, 2])),
         flights=float(len(phases.commanded)),
         high_flights=float(len(phases.high)),
+        foot_press=(body.foot_radius - lowest_foot) / body.foot_radius,
         flight=flight,
         approach=_measure_approach(capture, script, run, on, mass=body.total_mass),
         loads=_measure_loads(capture, robot, on, end),

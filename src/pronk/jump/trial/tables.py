@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pronk.jump.trial.condition_trial import ConditionResults
 from pronk.jump.trial.criteria import CRITERIA_JUMPS, GOALS, Check, trial_checks, walk_checks
 from pronk.jump.trial.crossing import Climb, climbs
-from pronk.jump.trial.jumps import FIGURES, SYMBOLS, Figure
+from pronk.jump.trial.jumps import FIGURES, SYMBOLS, Figure, JumpFigures
 from pronk.jump.trial.protocol import (
     PAPER_GAPS,
     PAPER_RATIOS,
@@ -166,9 +166,18 @@ def landings(trial: TrialResults) -> Table:
                 cell.succeeded,
                 f"{100.0 * cell.success:.0f} ({interval_text(cell.success_ci95)})",
                 cell.fell,
+                cell.non_foot_contact,
                 spread_text(cell.figures["high_flights"], 2),
             )
         )
+    notes = [
+        "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
+        "commanded. fell: at any time of the run. touched: something but a foot touched the "
+        "ground, from the command to 2 s after touchdown."
+    ]
+    soft_note = _soft_ground_note(trial)
+    if soft_note:
+        notes.append(soft_note)
     return Table(
         title="Landings",
         columns=(
@@ -179,13 +188,34 @@ def landings(trial: TrialResults) -> Table:
             Column(heading="landed"),
             Column(heading="success [%]"),
             Column(heading="fell"),
+            Column(heading="touched"),
             Column(heading="high flights", is_detail=True),
         ),
         rows=tuple(rows),
-        notes=(
-            "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
-            "commanded. fell: at any time of the run.",
-        ),
+        notes=tuple(notes),
+    )
+
+
+def _soft_ground_note(trial: TrialResults) -> str:
+    """Return what to think of touches while a foot is pressed in beyond its centre; "" without."""
+    touched = 0
+    pressed = 0
+    largest = 0.0
+    for run in trial.rows:
+        figures: JumpFigures = run.figures
+        if not figures.non_foot_contact or figures.fell:
+            continue
+        touched += 1
+        if figures.foot_press > 1.0:
+            pressed += 1
+            largest = max(largest, figures.foot_press)
+    if pressed == 0:
+        return ""
+    return (
+        f"In {pressed} of the {counted(touched, 'jump')} without a fall in which something but a "
+        "foot touched the ground, a foot was pressed in beyond its centre, by up to "
+        f"{largest:.1f} times its radius, where the lower end of a shank comes to the floor. On "
+        "harder ground (ground.stiffness of the virtual robot's parameters) it may not touch."
     )
 
 
