@@ -16,6 +16,7 @@ from pronk.jump.virtual.plant import Plant
 from pronk.jump.virtual.robot import VirtualRobot, hold_of
 from pronk.jump.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params
 from pronk.robots import load_robot
+from pronk.robots.legged import legged
 from sized_joint import SIZES, sized_robot
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
@@ -105,10 +106,20 @@ def test_the_virtual_go2_has_hidden_parameters_of_its_own() -> None:
         assert hidden.rotor_inertia != joint.drive.rotor_inertia, joint.name
         assert hidden.coulomb != joint.drive.frictionloss, joint.name
     # A command and its state pass the network and the robot's computer at 500 Hz.
-    assert params.machine.command_delay_s + params.machine.measurement_delay_s > 0.004
+    assert params.machine.command_delay_s + params.machine.measurement_delay_s >= 0.002
     # Another model that has this name is no Go2.
     arm = replace(load_robot("so101"), name="go2")
     assert set(load_sim_params(None, arm).joints) == set(arm.joint_names)
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_a_foot_that_carries_twice_the_weight_is_not_pressed_in_beyond_its_centre(
+    name: str,
+) -> None:
+    robot = load_robot(name)
+    body = legged(robot.source)
+    ground = load_sim_params(None, robot).ground
+    assert ground.stiffness * body.foot_radius > 2.0 * body.total_mass * 9.81
 
 
 def test_friction_grows_with_the_load() -> None:
