@@ -75,7 +75,7 @@ def exit_words(exit_code: int, way_out: str) -> str:
 
 
 class _RecordingContext(SpawnContext):
-    """Spawns processes, and keeps them to ask how they ended."""
+    """Starts processes by spawn, and keeps them, so that their exit statuses can be read."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class _RecordingContext(SpawnContext):
     def Process(  # type: ignore[override]  # noqa: N802
         self, *, target: Callable[..., Any], args: tuple[Any, ...]
     ) -> SpawnProcess:
-        """Make a process, as a pool asks for one; the names are multiprocessing's."""
+        """Make a process, as a pool requests one; the names are multiprocessing's."""
         child = SpawnProcess(target=target, args=args)
         self.children.append(child)
         return child

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -188,22 +189,35 @@ def trial_of(out: Path, robot: str) -> Path:
     return out / "trials" / "hopper" / "seed-1" / robot.replace(" ", "_")
 
 
-@pytest.mark.slow
-def test_a_copy_that_lacks_files_is_completed_and_says_which_trials(
-    whole_study: Path, tmp_path: Path
-) -> None:
+@pytest.fixture
+def study_copy(whole_study: Path, tmp_path: Path) -> Path:
+    """A copy of the folder of a finished study, to damage."""
     out = tmp_path / "copy"
     shutil.copytree(whole_study / "out", out)
+    return out
+
+
+def written_at(paths: Iterable[Path]) -> dict[Path, int]:
+    """Return when files were last written [ns]."""
+    return {path: path.stat().st_mtime_ns for path in paths}
+
+
+@pytest.mark.slow
+def test_a_copy_that_lacks_files_is_completed_and_says_which_trials(
+    whole_study: Path, study_copy: Path, tmp_path: Path
+) -> None:
+    out = study_copy
     for robot, patterns in DAMAGES.items():
         for pattern in patterns:
             for path in list(trial_of(out, robot).glob(pattern)):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
     (cut,) = (trial_of(out, CUT) / "cells").glob("*.json")
     cut.write_bytes(cut.read_bytes()[:200])
-    stamps = {}
+    kept = []
     for robot in ("whole", "no table", "no summary"):
         (path,) = (trial_of(out, robot) / "cells").glob("*.json")
-        stamps[path] = path.stat().st_mtime_ns
+        kept.append(path)
+    stamps = written_at(kept)
 
     figures = tmp_path / "figures.json"
     printed = accepted("study", whole_study / "study.yaml", "--out", out, "--json", figures)
@@ -215,8 +229,7 @@ def test_a_copy_that_lacks_files_is_completed_and_says_which_trials(
     for name in (*body["run_again"], *body["completed"]):
         assert name in " ".join(printed.split())
     assert body["missing"] == []
-    for path, stamp in stamps.items():
-        assert path.stat().st_mtime_ns == stamp
+    assert written_at(stamps) == stamps
     assert cell_files(out) == cell_files(whole_study / "out")
     for name in ("study.csv", "runs.csv"):
         assert (out / name).read_bytes() == (whole_study / "out" / name).read_bytes()
@@ -228,15 +241,12 @@ def test_a_copy_that_lacks_files_is_completed_and_says_which_trials(
 
 @pytest.mark.slow
 def test_a_copy_without_the_state_keeps_the_jumps_that_it_has(
-    whole_study: Path, tmp_path: Path
+    whole_study: Path, study_copy: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "copy"
-    shutil.copytree(whole_study / "out", out)
+    out = study_copy
     (out / "state.json").unlink()
     shutil.rmtree(trial_of(out, "robots alone") / "cells")
-    stamps = {}
-    for path in (trial_of(out, "whole") / "cells").iterdir():
-        stamps[path] = path.stat().st_mtime_ns
+    stamps = written_at((trial_of(out, "whole") / "cells").iterdir())
     study = yaml.safe_load((whole_study / "study.yaml").read_text())
     study["robots"] = {"whole": {}, "robots alone": {}}
     fewer = whole_study / "fewer.yaml"
@@ -246,7 +256,7 @@ def test_a_copy_without_the_state_keeps_the_jumps_that_it_has(
     body = json.loads(figures.read_text())
     assert [name.partition(" on ")[2] for name in body["run_again"]] == ["robots alone"]
     assert [name.partition(" on ")[2] for name in body["completed"]] == ["whole"]
-    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    assert written_at(stamps) == stamps
     assert cell_files(out) == cell_files(whole_study / "out")
 
 

@@ -256,7 +256,7 @@ def _trial_of_conditions(
         console.warn(
             f"some cells were computed before with {_other_versions(versions, results.versions)}. "
             f"They are kept, since {' and '.join(DECIDING_VERSIONS)} have the same versions; "
-            "--overwrite computes them anew."
+            "--overwrite computes them again."
         )
     for versions in results.unused_versions:
         console.warn(
@@ -264,7 +264,9 @@ def _trial_of_conditions(
             "not count, since another version may simulate other jumps."
         )
     if results.damaged:
-        console.warn(f"the files of {', '.join(results.damaged)} could not be read; computed anew.")
+        console.warn(
+            f"the files of {', '.join(results.damaged)} could not be read; computed again."
+        )
     was = "was" if results.kept == 1 else "were"
     console.say(
         f"{counted(len(results.cells), 'cell')} of policy and condition in "

@@ -66,7 +66,7 @@ def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
     """Draw outcomes of every arm on every robot that is not in a series, a row an outcome.
 
     Marks are means over seeds with 95 % intervals. The circles right of a mark are the means of its
-    single seeds, in their order: on the line of the interval they could not be told from it.
+    single seeds, in their order; on the line of the interval they could hardly be seen.
 
     Args:
         results: The study.

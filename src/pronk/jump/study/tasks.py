@@ -211,7 +211,7 @@ class StudyState:
                         raise PronkError(
                             f"--out {self.root}: {path} is there, but neither {STATE_FILE} nor "
                             f"{task.resume_marker} says how it was trained; copy these files as "
-                            "well, or move it away to train anew."
+                            "well, or move it away to train again."
                         )
                 continue
             if (self.root / task.resume_marker).is_file() and record.key != task.key(self.root):
