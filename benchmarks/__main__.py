@@ -10,6 +10,7 @@ SUMMARIES = {
     "match": "pronk and its peers on virtual robots drawn at random.",
     "ak80": "The torque fit on real AK80-6 recordings beside published parameters.",
     "go2": "Two policies that ran on real Go2s, on several drives and on the virtual Go2.",
+    "go2-feet": "Falls of a policy that ran on real Go2s, on feet of several stiffnesses.",
     "go2-drives": "All joints of virtual Go2s, swept, matched, and judged by other recordings.",
     "known": "pronk, mujoco.sysid and CMA-ES on logs with known gains.",
     "grid": "The paper's grid beside a bare mujoco.rollout loop.",

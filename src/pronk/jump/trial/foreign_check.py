@@ -11,7 +11,9 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import ArtefactError, HardwareError
 from pronk.jump.trial.jumps import fallen_at
+from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.ground import Start
+from pronk.jump.virtual.plant import legs_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.policy.deploy_yaml import COMMAND_TERMS, DeployFile, Term
@@ -56,6 +58,8 @@ class ForeignRun:
     velocity: tuple[float, float, float]
     """Mean forward and left velocity in the heading's frame [m/s] and yaw rate [rad/s] over the
     second half of the run, or NaN where it fell before."""
+    foot_depth: float
+    """Greatest depth to which a foot was pressed into the floor [m], NaN where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,16 +136,33 @@ def run_on_virtual_robot(
     try:
         lasted_s = run_foreign(machine, policy, commanded, seconds=seconds, running=is_upright)
     except HardwareError:  # The numbers ran away.
-        return ForeignRun(fell_s=machine.now(), lasted_s=machine.now(), velocity=(math.nan,) * 3)
+        return _lost_run(machine.now())
     fell_s = None if lasted_s >= seconds - 1e-9 and is_upright() else lasted_s
-    velocity = _mean_velocity(machine, 0.5 * seconds)
-    machine.close()
-    return ForeignRun(fell_s=fell_s, lasted_s=lasted_s, velocity=velocity)
-
-
-def _mean_velocity(machine: VirtualRobot, begin_s: float) -> tuple[float, float, float]:
-    """Return the mean velocity of a trunk from a time on, in the frame of its heading."""
     capture = machine.capture()
+    machine.close()
+    return ForeignRun(
+        fell_s=fell_s,
+        lasted_s=lasted_s,
+        velocity=_mean_velocity(capture, 0.5 * seconds),
+        foot_depth=_foot_depth(capture, robot, sim_params.ground.floor),
+    )
+
+
+def _lost_run(fell_s: float) -> ForeignRun:
+    """Return a run that ended without numbers."""
+    return ForeignRun(fell_s=fell_s, lasted_s=fell_s, velocity=(math.nan,) * 3, foot_depth=math.nan)
+
+
+def _foot_depth(capture: Capture, robot: RobotSpec, floor: float) -> float:
+    """Return how deep a foot was pressed into the floor at most, 0 without contact [m]."""
+    model = robot.build_spec().compile()
+    radii = [float(model.geom(f"{leg}_foot_collision").size[0]) for leg in legs_of(robot)]
+    depth = floor + np.array(radii) - capture.foot_position[:, :, 2]
+    return float(depth.max(initial=0.0))
+
+
+def _mean_velocity(capture: Capture, begin_s: float) -> tuple[float, float, float]:
+    """Return the mean velocity of a trunk from a time on, in the frame of its heading."""
     late = capture.time > begin_s
     if not late.any():
         return math.nan, math.nan, math.nan
@@ -169,8 +190,7 @@ def try_changes(
         try:
             tried.append(TriedChange(text=change.text, run=run(change.deploy)))
         except ArtefactError:  # An action that is not finite: no remedy.
-            lost = ForeignRun(fell_s=0.0, lasted_s=0.0, velocity=(math.nan,) * 3)
-            tried.append(TriedChange(text=change.text, run=lost))
+            tried.append(TriedChange(text=change.text, run=_lost_run(0.0)))
     return tuple(tried)
 
 
