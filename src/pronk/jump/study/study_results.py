@@ -18,6 +18,7 @@ import msgspec
 
 from pronk.files import write_text
 from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.trial.condition_trial import DECIDING_VERSIONS
 from pronk.jump.trial.results import load_json, save_json
 from pronk.tables import Cell, Column, Table, counted, number
 
@@ -32,6 +33,10 @@ OTHER_ROBOT = "arms of other robots"
 """What that is compared with."""
 
 
+SEVERAL_VERSIONS = " and "
+"""What joins the versions of a software where trials have several."""
+TRIALS = "trials"
+"""Folder of the trials in that of a study."""
 NO_INTERVAL = (
     "A single seed (n = 1) has a value but no interval: how far policies of other seeds lie from "
     "it is not known."
@@ -160,6 +165,24 @@ class StudyResults:
     failed: tuple[str, ...] = ()
     """Trainings that failed, with the reasons."""
     versions: dict[str, str] = field(default_factory=dict)
+    """Versions of software that the trials were computed with, several joined by
+    `SEVERAL_VERSIONS`."""
+
+    @property
+    def mixed_versions(self) -> str:
+        """A sentence on trials of different physics in one table; empty if all are of the same."""
+        mixed = []
+        for name in DECIDING_VERSIONS:
+            version = self.versions.get(name, "")
+            if SEVERAL_VERSIONS in version:
+                mixed.append(f"{name} {version}")
+        if not mixed:
+            return ""
+        return (
+            f"The trials are not all of one version ({', '.join(mixed)}), which decides what is "
+            "simulated: a difference between arms or robots may be one between versions. Delete "
+            f"the folder {TRIALS} and run the command again; trainings are kept."
+        )
 
     def cell(self, arm: str, robot: str, outcome: str) -> OutcomeCell:
         """Return one outcome of one arm on one robot; without a value if it was not tried there."""
