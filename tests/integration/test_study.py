@@ -81,7 +81,9 @@ def test_every_policy_jumps_on_every_robot(study: Path) -> None:
     for row in rows:
         cell = results.cell(row["arm"], row["robot"], "landed")
         assert cell.value == float(row["landed"])
-        assert (cell.seeds, cell.jumps) == (1, 1)
+        assert (cell.seeds, cell.jumps, cell.jumps_with_value) == (1, 1, 1)
+        height = results.cell(row["arm"], row["robot"], "height")
+        assert height.jumps_with_value == int(row["height"] != "")
     (comparison,) = results.comparisons
     heights = {row["arm"]: row["height"] for row in rows if row["robot"] == "shipped"}
     assert comparison.value == float(heights["matched"]) - float(heights["nominal"])

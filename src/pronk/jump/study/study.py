@@ -695,11 +695,14 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
     seeds = []
     means: dict[str, float | None] = {}
     count = 0
+    with_value = 0
     for seed, runs in by_seed.items():
         strata = values_by_command(runs, outcome_name)
         seeds.append(strata)
         means[str(seed)] = seed_mean(strata)
         count += len(runs)
+        for values in strata:
+            with_value += int(np.isfinite(values).sum())
     estimate = mean_interval(seeds, is_share=OUTCOMES[outcome_name].is_share)
     return OutcomeCell(
         arm=arm,
@@ -712,6 +715,7 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
         high=estimate.high,
         by_seed=means,
         jumps=count,
+        jumps_with_value=with_value,
     )
 
 

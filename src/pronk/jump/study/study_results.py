@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ OTHER_ROBOT = "arms of other robots"
 """What that is compared with."""
 
 
+MAX_UNEVEN = 5
+"""Largest number of robots that the note on unequal shares of jumps names."""
 SEVERAL_VERSIONS = " and "
 """What joins the versions of a software where trials have several."""
 TRIALS = "trials"
@@ -64,6 +67,8 @@ class OutcomeCell:
     """Mean over the jumps of each seed."""
     jumps: int
     """Number of commanded jumps of all seeds."""
+    jumps_with_value: int | None = None
+    """Number of those that have this outcome; None in results of an earlier pronk."""
 
     @property
     def seeds(self) -> int:
@@ -276,6 +281,12 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
                 single_seed.append(f"{arm} on {robot}")
         rows.append(tuple(row))
     notes = [f"{outcome.replace('_', ' ')}: {definition.meaning}."]
+    uneven = _uneven_counts(results, outcome, shown)
+    if uneven:
+        notes.append(
+            "Where arms have a value of unequal shares of their jumps, their means may be over "
+            f"different commands. Jumps with a value: {'; '.join(uneven)}."
+        )
     if single_seed:
         notes.append(f"{NO_INTERVAL} Here: {'; '.join(single_seed)}.")
     return Table(
@@ -285,6 +296,30 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
         notes=tuple(notes),
         is_detail=in_series,
     )
+
+
+def _uneven_counts(results: StudyResults, outcome: str, robots: Collection[str]) -> list[str]:
+    """Return how many jumps have an outcome on robots where that share differs between arms.
+
+    Args:
+        results: The study.
+        outcome: Name of the outcome.
+        robots: Names of the robots that count.
+    """
+    texts = []
+    for robot in results.robots:
+        counts = []
+        shares = set()
+        for arm in results.arms:
+            cell = results.cell(arm, robot, outcome)
+            if robot in robots and cell.jumps and cell.jumps_with_value is not None:
+                shares.add(Fraction(cell.jumps_with_value, cell.jumps))
+                counts.append(f"{arm} {cell.jumps_with_value} of {cell.jumps}")
+        if len(shares) > 1:
+            texts.append(f"on {robot} {', '.join(counts)}")
+    if len(texts) > MAX_UNEVEN:
+        texts[MAX_UNEVEN:] = [f"and on {len(texts) - MAX_UNEVEN} more"]
+    return texts
 
 
 def comparison_table(results: StudyResults) -> Table:

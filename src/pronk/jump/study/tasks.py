@@ -215,7 +215,11 @@ class StudyState:
                             "well, or move it away to train again."
                         )
                 continue
-            if (self.root / task.resume_marker).is_file() and record.key != task.key(self.root):
+            # Without the marker the folder would be made anew, and a policy in it be lost.
+            is_begun = any(
+                (self.root / path).is_file() for path in (task.resume_marker, *task.outputs)
+            )
+            if is_begun and record.key != task.key(self.root):
                 changed.append(task.name)
                 has_robot_file |= str(task.settings.get("robot")).startswith(f"{INPUTS}/")
         if changed:
