@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import pronk.robots
 from command_line import accepted, refused
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError, RobotError
@@ -485,6 +486,27 @@ def test_cells_of_another_mujoco_do_not_count_and_are_not_lost(
     assert stored.read_bytes() == content
     # With nothing to compute there is nothing to say.
     assert run_conditions(policies[:1], CONDITIONS[:1], PLAN, setup(tmp_path)).unused_versions == ()
+
+
+def test_a_changed_robot_of_the_same_name_has_cells_of_its_own(
+    policies: list[Path], tmp_path: Path
+) -> None:
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    out = tmp_path / "out"
+    kept = []
+    heights = []
+    for name, mass in (("light", "6.607999999999999"), ("heavy", "7.608"), ("moved", "7.608")):
+        folder = tmp_path / name
+        shutil.copytree(shipped, folder)
+        model = folder / "mini_cheetah.xml"
+        model.write_text(model.read_text().replace("6.607999999999999", mass))
+        robot = load_robot(folder / "robot.yaml")
+        changed = replace(setup(out), robot=robot)
+        results = run_conditions(policies[:1], CONDITIONS[:1], PLAN, changed)
+        kept.append(results.kept)
+        heights.append(results.cells[0].height.mean)
+    assert kept == [0, 0, 1]
+    assert heights[0] != heights[1] == heights[2]
 
 
 def test_a_folder_of_something_else_is_refused(policies: list[Path], tmp_path: Path) -> None:

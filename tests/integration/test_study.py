@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 pytest.importorskip("onnxruntime")
+import pronk.robots
 from command_line import accepted, invoke, refused
 from hopper import write_hopper
 from pronk.cli.main import parsed_command
@@ -80,7 +81,9 @@ def test_every_policy_jumps_on_every_robot(study: Path) -> None:
     for row in rows:
         cell = results.cell(row["arm"], row["robot"], "landed")
         assert cell.value == float(row["landed"])
-        assert (cell.seeds, cell.jumps) == (1, 1)
+        assert (cell.seeds, cell.jumps, cell.jumps_with_value) == (1, 1, 1)
+        height = results.cell(row["arm"], row["robot"], "height")
+        assert height.jumps_with_value == int(row["height"] != "")
     (comparison,) = results.comparisons
     heights = {row["arm"]: row["height"] for row in rows if row["robot"] == "shipped"}
     assert comparison.value == float(heights["matched"]) - float(heights["nominal"])
@@ -166,6 +169,8 @@ DAMAGES = {
 """What a copy of a trial's folder lacks, by the name of the robot that is tried there."""
 CUT = "a cell that is cut"
 """Robot whose file of jumps ends half way."""
+HEAVY = ('mass="6.607999999999999"', 'mass="7.608"')
+"""Mass of the Mini Cheetah's trunk in its model, and that of a heavier one [kg]."""
 WITHOUT_JUMPS = {"no folder of cells", "empty folder of cells", "robots alone", CUT}
 
 
@@ -258,6 +263,57 @@ def test_a_copy_without_the_state_keeps_the_jumps_that_it_has(
     assert [name.partition(" on ")[2] for name in body["completed"]] == ["whole"]
     assert written_at(stamps) == stamps
     assert cell_files(out) == cell_files(whole_study / "out")
+
+
+@pytest.mark.slow
+def test_trials_of_several_versions_are_named(whole_study: Path, study_copy: Path) -> None:
+    """As in a study that goes on under another MuJoCo, or with a node that has another one."""
+    (path,) = (trial_of(study_copy, "whole") / "cells").glob("*.json")
+    body = json.loads(path.read_text())
+    installed = body["versions"]["mujoco"]
+    body["versions"]["mujoco"] = "2.0.0"
+    path.write_text(json.dumps(body))
+    command = invoke(["study", whole_study / "study.yaml", "--out", study_copy])
+    assert command.exit_code == 0
+    assert "2.0.0" in command.stderr
+    results = load_study_results(study_copy / "study.json")
+    for version in (installed, "2.0.0"):
+        assert version in results.versions["mujoco"]
+        assert version in results.mixed_versions
+    assert results.mixed_versions in (study_copy / "report.html").read_text()
+    assert not load_study_results(whole_study / "out" / "study.json").mixed_versions
+
+
+@pytest.mark.slow
+def test_a_robot_of_files_is_known_by_what_they_say(tmp_path: Path) -> None:
+    """Its name alone kept the jumps of the robot that it was before."""
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    printed = {}
+    heights = {}
+    for place in ("first", "moved", "heavier"):
+        home = tmp_path / place
+        shutil.copytree(shipped, home / "robot")
+        if place != "first":
+            shutil.copytree(tmp_path / "first" / "out", home / "out")
+        if place == "heavier":
+            model = home / "robot" / "mini_cheetah.xml"
+            text = model.read_text()
+            assert HEAVY[0] in text
+            model.write_text(text.replace(*HEAVY))
+        path = write_study(
+            home / "study.yaml",
+            arms={"hopper": {"policies": [str(write_hopper(home / "policy.onnx"))]}},
+            training={"robot": "robot/robot.yaml"},
+            outcomes=["height"],
+            trial={"commands": ["0,0"], "jumps": 1},
+        )
+        printed[place] = accepted("study", path, "--out", home / "out")
+        (cell,) = load_study_results(home / "out" / "study.json").cells
+        heights[place] = cell.value
+    assert "1 of 1 task was done before" in printed["moved"]
+    assert "done before" not in printed["heavier"]
+    assert heights["moved"] == heights["first"]
+    assert heights["heavier"] != heights["first"]
 
 
 NAIVE = ("--gains", "naive")

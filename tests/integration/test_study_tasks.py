@@ -226,6 +226,21 @@ def test_trainings_of_other_settings_are_not_mixed(tmp_path: Path) -> None:
         finished([other], LocalExecutor(root), root)
 
 
+def test_a_policy_of_other_settings_is_not_replaced_where_its_provenance_is_missing(
+    tmp_path: Path,
+) -> None:
+    root = study_root(tmp_path)
+    fields = {"kind": "training", "resume_marker": "work/run/provenance.json"}
+    task = export_task("run", **fields)
+    finished([task], LocalExecutor(root), root)
+    policy = root / task.outputs[0]
+    content = policy.read_bytes()
+    other = export_task("run", settings={"seed": 2}, **fields)
+    with pytest.raises(PronkError, match="other settings"):
+        finished([other], LocalExecutor(root), root)
+    assert policy.read_bytes() == content
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"schema": "x"}'])
 def test_a_damaged_state_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "state.json").write_text(content)

@@ -15,13 +15,16 @@ pytest.importorskip("mjlab")
 import pronk.robots
 from command_line import refused
 from pronk.errors import PronkError
+from pronk.jump.study.robot_inputs import robot_input
 from pronk.jump.train import devices
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
+from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl.runner import stop_signals
 from pronk.jump.train.run import run_training
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
+from pronk.robots import load_robot
 
 pytestmark = pytest.mark.train
 NAIVE = ("--gains", "naive")
@@ -173,3 +176,18 @@ def test_a_robot_with_its_own_task(tmp_path: Path) -> None:
         (tmp_path / "env_cfgs.py").write_text(text)
         with pytest.raises(PronkError, match=words):
             load_task(robot)
+
+
+def test_the_robot_of_a_run_in_a_study_is_found_from_any_folder(tmp_path: Path) -> None:
+    """The run names the copy in the folder of the study, which `evaluate` and --resume look for."""
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    shutil.copytree(shipped, tmp_path / "robot")
+    (tmp_path / "robot" / "env_cfgs.py").write_text(ENV_CFGS)
+    root = tmp_path / "study"
+    copy = robot_input(root, str(tmp_path / "robot" / "robot.yaml"), is_trained=True)
+    shutil.rmtree(tmp_path / "robot")
+    folder = RunFolder(root / "trainings" / "arm" / "seed-1")
+    task = load_task(folder.robot(copy.name))
+    assert task.robot.joints == load_robot("mini_cheetah").joints
+    assert folder.robot("go2") == "go2"
+    assert folder.robot("nowhere.yaml") == "nowhere.yaml"

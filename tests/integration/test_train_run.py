@@ -6,8 +6,10 @@ import os
 import shutil
 import signal
 import statistics
+import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -179,6 +181,28 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     assert state["iter"] == 5
     assert state["infos"]["env_state"]["common_step_counter"] == 6 * 24
     assert not load_policy(folder.path / "policy.onnx").contract.jump
+
+
+def test_a_run_that_ends_before_its_first_checkpoint_says_why(tmp_path: Path) -> None:
+    """As one whose processes are killed before they have written what stopped them."""
+    folder = RunFolder(tmp_path / "run")
+    words = ("train", "walk", "--gains", "naive", *SMALL, "--phase", "walk=6", "--out", folder.path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pronk", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    while process.poll() is None:
+        if folder.provenance.is_file() and folder.read()["sessions"]:
+            break
+        time.sleep(0.05)
+    process.terminate()
+    output, _ = process.communicate()
+    assert process.returncode == 130, output
+    assert checkpoint.latest_checkpoint(folder.path) is None
+    (session,) = folder.read()["sessions"]
+    assert session["stopped"] == "SIGTERM"
 
 
 @of_one_run

@@ -185,8 +185,8 @@ def test_a_terminated_training_on_hosts_leaves_a_checkpoint(tmp_path: Path) -> N
     output, _ = process.communicate()
     assert process.returncode == 130, output
     assert "--hosts localhost,127.0.0.1" in output
-    # On a busy machine the last iteration may take longer than its processes are waited for.
-    assert folder.read()["sessions"][0]["stopped"] in ("SIGTERM", "SIGINT", "")
+    # Also on a busy machine, where the last iteration may take longer than it is waited for.
+    assert folder.read()["sessions"][0]["stopped"] == "SIGTERM"
     assert checkpoint.read_checkpoint(folder.checkpoint())["infos"]["processes"] == 2
 
 

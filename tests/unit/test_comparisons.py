@@ -19,6 +19,7 @@ from pronk.errors import PronkError
 from pronk.jump.study.config import ComparisonConfig, load_study
 from pronk.jump.study.study import Jumps, compared_arms
 from pronk.jump.study.study_results import (
+    ComparedArms,
     StudyResults,
     comparison_table,
     load_study_results,
@@ -153,6 +154,23 @@ def test_one_arm_as_a_word_and_as_a_list_are_the_same_comparison() -> None:
     assert compared_arms(jumps, "c", listed, ["shipped"]) == first
     assert (first.arm, first.against) == ("b", "a")
     assert first.value == pytest.approx(0.58)
+
+
+@pytest.mark.parametrize("outcome", ["landed", "velocity_error"])
+@pytest.mark.parametrize("commands", [(), ("forward 2",)])
+def test_a_comparison_named_after_its_outcome_says_it_once(
+    outcome: str, commands: tuple[str, ...]
+) -> None:
+    comparison = ComparedArms(
+        name=outcome, outcome=outcome, arm="b", against="a", robots=("weak",), commands=commands
+    )
+    words = outcome.replace("_", " ")
+    sentence = comparison_sentence(comparison).replace("_", " ")
+    assert sentence.count(words) == 1
+    assert all(command in sentence for command in commands)
+    other = comparison_sentence(replace(comparison, name="a match")).replace("_", " ")
+    assert other.startswith("a match (")
+    assert words in other
 
 
 def test_tables_files_and_sentences_name_arms_and_commands(tmp_path: Path) -> None:

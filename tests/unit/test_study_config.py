@@ -122,6 +122,8 @@ def test_a_plan_counts_trainings_trials_and_jumps(tmp_path: Path) -> None:
             },
             "robots.r|torque_scale",
         ),
+        # Trials of both would be in one folder, and one be read as the other.
+        ({"robots": {"a b": {}, "a_b": {"jumps": 2}}}, "'a b'|'a_b'"),
         ({"robots": {"r": {"conditions": "nowhere"}}}, "robots.r|nowhere"),
         ({"outcomes": ["beauty"]}, "outcomes|beauty|landed"),
         ({"outcomes": []}, "outcomes is empty"),

@@ -219,6 +219,25 @@ def test_tables_separate_robots_from_series(results: StudyResults) -> None:
     assert by_robot["weak"][1] == "-"
 
 
+def test_a_table_says_where_arms_have_values_of_unequal_shares(results: StudyResults) -> None:
+    """The mean height of an arm that jumps with easy commands only is no mean over all of them."""
+
+    def notes(counts: dict[str, tuple[int, int]]) -> str:
+        cells = []
+        for cell in results.cells:
+            if cell.robot == "shipped" and cell.outcome == "height":
+                with_value, jumps = counts[cell.arm]
+                cell = replace(cell, jumps=jumps, jumps_with_value=with_value)
+            cells.append(cell)
+        table = outcome_tables(replace(results, cells=tuple(cells)))[1]
+        return " ".join(table.notes)
+
+    uneven = notes({"nominal": (3, 10), "matched": (10, 10)})
+    assert "on shipped nominal 3 of 10, matched 10 of 10" in uneven
+    # Commands without a value are those of all arms; arms may have other numbers of seeds.
+    assert "of 10" not in notes({"nominal": (8, 10), "matched": (16, 20)})
+
+
 def test_the_page_has_both_figures(results: StudyResults, tmp_path: Path) -> None:
     save_study(tmp_path / "study.json", results)
     assert load_study_results(tmp_path / "study.json").cells[0] == results.cells[0]

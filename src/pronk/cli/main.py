@@ -334,9 +334,9 @@ def _plain_characters(error: UnicodeError) -> tuple[str, int]:
     return "".join(PLAIN_CHARACTERS.get(character, "?") for character in text), error.end
 
 
-def _interrupt(_number: int, _frame: object) -> None:
-    """End as Ctrl-C does, so that temporary files are removed."""
-    raise KeyboardInterrupt
+def _interrupt(number: int, _frame: object) -> None:
+    """End as Ctrl-C does, so that temporary files are removed; the error has the signal's name."""
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def _abandon_broken_output() -> None:

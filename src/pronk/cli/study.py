@@ -127,6 +127,8 @@ def study(
         )
     if completed.kept:
         console.say(f"completed from the jumps that their folders had: {'; '.join(completed.kept)}")
+    if results.mixed_versions:
+        console.warn(results.mixed_versions)
     result_tables = study_tables(results)
     for table in result_tables:
         console.show(table)

@@ -30,10 +30,13 @@ def comparison_sentence(comparison: ComparedArms) -> str:
     text = estimate_text(
         comparison.value, comparison.low, comparison.high, comparison.outcome, signed=True
     )
+    title = f"{comparison.name} ({comparison.outcome_words})"
+    if comparison.name.replace("_", " ") == comparison.outcome.replace("_", " "):
+        # A comparison that is named after its outcome.
+        title = comparison.outcome_words
     return (
-        f"{comparison.name} ({comparison.outcome_words}): {comparison.arm} less "
-        f"{comparison.against}, on {', '.join(comparison.robots)}: {text} {definition.unit}, "
-        f"{comparison.verdict}."
+        f"{title}: {comparison.arm} less {comparison.against}, on "
+        f"{', '.join(comparison.robots)}: {text} {definition.unit}, {comparison.verdict}."
     )
 
 
@@ -72,7 +75,7 @@ def study_part(path: Path) -> Part:
         title="Study",
         virtual=results.virtual,
         summary=summary,
-        warning=bool(results.missing),
+        warning=bool(results.missing or results.mixed_versions),
         content=content,
         figures={"comparisons": results.comparisons, "missing": results.missing},
     )

@@ -34,9 +34,9 @@ SMALLEST_MASS = 1e-4
 SMALLEST_INERTIA = 1e-8
 """Moment of inertia of such a link, as of a ball of 0.1 g and 16 mm [kg m^2]."""
 SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample", "num", "dim")
+"""Attributes whose product is the number of samples of an element."""
 FOLDERS = ("meshdir", "texturedir", "assetdir")
 """Attributes that name the folder of files."""
-"""Attributes whose product is the number of samples of an element."""
 COMMENT = re.compile("<!--.*?-->", re.DOTALL)
 """A comment of XML."""
 TAG = re.compile(r"<(/?)([A-Za-z_][\w:.-]*)((?:[^<>\"']|\"[^\"]*\"|'[^']*')*?)(/?)>")

@@ -144,9 +144,9 @@ def _strip_link(link: ET.Element, path: Path, *, with_meshes: bool) -> str:
             shape = geometry[0]
         keeps = shape is not None and shape.tag in PRIMITIVES and _has_size(shape)
         if shape is not None and shape.tag == "mesh" and not has_mass:
-            mesh_path = _mesh_path(shape.get("filename", ""), path)
-            if mesh_path is not None and with_meshes:
-                shape.set("filename", str(mesh_path))
+            mesh_file = mesh_path(shape.get("filename", ""), path)
+            if mesh_file is not None and with_meshes:
+                shape.set("filename", str(mesh_file))
                 meshes += 1
                 keeps = True
             else:
@@ -188,7 +188,7 @@ def _correct_inertia(inertial: ET.Element, name: str) -> str:
     )
 
 
-def _mesh_path(filename: str, path: Path) -> Path | None:
+def mesh_path(filename: str, path: Path) -> Path | None:
     """Return where a mesh of a URDF is; None if it is not there or MuJoCo cannot read it.
 
     `package://NAME/...` is looked for in the folders above the URDF, with and without NAME.

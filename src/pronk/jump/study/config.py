@@ -278,12 +278,21 @@ class StudyConfig:
         return parse_seeds(str(seeds))
 
     def check_robots(self, arms_by_robot: Mapping[str, Sequence[str]]) -> None:
-        """Refuse comparisons on robots that the study, or one of their arms, does not have.
+        """Refuse robots with one folder, and comparisons on robots that an arm does not have.
 
         Args:
             arms_by_robot: Arms that are tried on each robot, by its name; with a robot for each
                 condition.
         """
+        robot_by_folder: dict[str, str] = {}
+        for robot in arms_by_robot:
+            other_robot = robot_by_folder.setdefault(robot.replace(" ", "_"), robot)
+            if other_robot != robot:
+                # Their trials would write to one folder, and one be read as the other.
+                raise PronkError(
+                    f"robots: {other_robot!r} and {robot!r} differ by spaces and underscores only; "
+                    "change one."
+                )
         for name, comparison in self.comparisons.items():
             place = f"comparisons.{name}"
             robots = comparison.robots

@@ -34,6 +34,10 @@ class JumpOutcome:
         return f"{self.name.replace('_', ' ')} [{self.unit}]"
 
 
+_OF_JUMPS = "; of the jumps that left the ground"
+"""Which of the commanded jumps have a figure of the flight: those that `jumped` counts."""
+
+
 def _landed(run: TrialRun) -> float:
     return float(run.figures.success)
 
@@ -70,8 +74,8 @@ OUTCOMES: Mapping[str, JumpOutcome] = {
     "landed": JumpOutcome(
         name="landed",
         unit="%",
-        meaning="upright 2 s after touchdown, and nothing but feet touched the ground; of all "
-        "commanded jumps",
+        meaning="share of all commanded jumps after which the robot stood upright 2 s after "
+        "touchdown, and nothing but feet had touched the ground",
         value=_landed,
         is_share=True,
         digits=1,
@@ -79,7 +83,9 @@ OUTCOMES: Mapping[str, JumpOutcome] = {
     "jumped": JumpOutcome(
         name="jumped",
         unit="%",
-        meaning="left the ground after the command; of all commanded jumps",
+        meaning="share of all commanded jumps in which the robot left the ground within 1.5 s "
+        "after the jump command, for 60 ms or longer, and its trunk rose more than 3 cm over its "
+        "standing height",
         value=_jumped,
         is_share=True,
         digits=1,
@@ -87,31 +93,50 @@ OUTCOMES: Mapping[str, JumpOutcome] = {
     "fell": JumpOutcome(
         name="fell",
         unit="%",
-        meaning="fell at any time of the run; of all runs",
+        meaning="share of all runs in which the robot fell, before, in or after the jump",
         value=_fell,
         is_share=True,
         digits=1,
     ),
     "height": JumpOutcome(
-        name="height", unit="m", meaning="height of the trunk's way in the jump", value=_height
+        name="height",
+        unit="m",
+        meaning="vertical travel of the trunk, from its lowest to its highest point between the "
+        f"jump command and 0.5 s after touchdown{_OF_JUMPS}",
+        value=_height,
     ),
     "distance": JumpOutcome(
-        name="distance", unit="m", meaning="way from lift-off to touchdown", value=_distance
+        name="distance",
+        unit="m",
+        meaning=f"horizontal distance of the trunk from lift-off to touchdown{_OF_JUMPS}",
+        value=_distance,
     ),
     "along": JumpOutcome(
-        name="along", unit="m", meaning="that way along the command", value=_along
+        name="along",
+        unit="m",
+        meaning="part of the horizontal distance from lift-off to touchdown in the commanded "
+        f"direction{_OF_JUMPS} with a commanded velocity",
+        value=_along,
     ),
-    "gap": JumpOutcome(name="gap", unit="m", meaning="gap that the feet cleared", value=_gap),
+    "gap": JumpOutcome(
+        name="gap",
+        unit="m",
+        meaning="length of the ground, in the direction of the flight, between the last footholds "
+        f"before lift-off and the first ones after touchdown{_OF_JUMPS}",
+        value=_gap,
+    ),
     "velocity_error": JumpOutcome(
         name="velocity_error",
         unit="m/s",
-        meaning="difference of mean and commanded velocity along the command before the jump",
+        meaning="absolute difference of mean and commanded velocity in the commanded direction, "
+        "from 1 s after the velocity command to the jump command",
         value=velocity_error,
     ),
     "energy": JumpOutcome(
         name="energy",
         unit="J",
-        meaning="energy of the drives in the jump",
+        meaning="electrical energy that the drives took from the battery between the jump command "
+        f"and 0.5 s after touchdown, less what they returned{_OF_JUMPS}",
         value=_energy,
         digits=1,
     ),

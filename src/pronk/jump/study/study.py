@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,12 +36,15 @@ from pronk.jump.study.config import (
     comparison_robots,
 )
 from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.study.robot_inputs import RobotInput, robot_input
 from pronk.jump.study.schedule import TaskStatus
 from pronk.jump.study.study_results import (
     OTHER_ROBOT,
     OWN_ROBOT,
     RUNS_FILE,
+    SEVERAL_VERSIONS,
     STUDY_FILE,
+    TRIALS,
     ComparedArms,
     OutcomeCell,
     StudyResults,
@@ -70,6 +73,7 @@ from pronk.jump.trial.condition_trial import (
     SUMMARY,
     TABLE,
     load_cell,
+    load_cell_versions,
     save_sim_params,
 )
 from pronk.jump.trial.condition_trial import SCHEMA as CONDITION_TRIAL_SCHEMA
@@ -81,7 +85,6 @@ from pronk.names import file_name
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 
-TRIALS = "trials"
 NOMINAL_CONDITION = b"schema: pronk/conditions/1\nconditions:\n- name: nominal\n"
 """File of conditions of a trial whose robot is in its `--sim-params`."""
 SECONDS_A_JUMP = 3.0
@@ -293,6 +296,7 @@ def study_tasks(
             trained.append(_with_randomization(arm, arm.training, root))
     tasks = training_tasks(trained, plan.config.seed_numbers, root, place)
     nominal = written_input(root, NOMINAL_CONDITION, "nominal", ".yaml")
+    tried = robot_input(root, plan.robot.source)
     params_by_robot = {}
     for robot in plan.robots:
         params_by_robot[robot.name] = _params_input(root, robot)
@@ -315,7 +319,7 @@ def study_tasks(
                 for robot in robots:
                     if arm.name in robot.arms:
                         inputs = (policy, params_by_robot[robot.name], nominal)
-                        task = _trial_task(plan, arm, seed, robot, inputs, needs)
+                        task = _trial_task(plan, arm, seed, robot, tried, inputs, needs)
                         tasks.append(on_cores(task, trial_processes))
     return tasks
 
@@ -458,9 +462,21 @@ def _trial_task(
     arm: StudyArm,
     seed: int,
     robot: StudiedRobot,
+    tried: RobotInput,
     inputs: tuple[str, str, str],
     needs: tuple[str, ...],
 ) -> StudyTask:
+    """Return the task of a trial.
+
+    Args:
+        plan: The study.
+        arm: Arm of the policy.
+        seed: Its seed.
+        robot: The virtual robot.
+        tried: The robot that both are of.
+        inputs: The policy, the parameters of the virtual robot, and the condition.
+        needs: Names of the tasks that have to be done before.
+    """
     trial = plan.config.trial
     policy, params, nominal = inputs
     folder = trial_folder(arm, seed, robot)
@@ -468,8 +484,8 @@ def _trial_task(
     words += ["--jumps", str(robot.jumps), "--seed", str(trial.seed)]
     for command in trial.commands:
         words.append(f"--commands={command}")
-    if plan.robot.source != plan.robot.name:
-        words += ["--robot", str(Path(plan.robot.source).resolve())]
+    if tried.files:
+        words += ["--robot", tried.name]
     words += ["--out", folder]
     settings = {"commands": list(trial.commands), "jumps": robot.jumps, "seed": trial.seed}
     return StudyTask(
@@ -478,7 +494,7 @@ def _trial_task(
         folder=folder,
         command=tuple(words),
         settings=settings,
-        inputs=inputs,
+        inputs=(*inputs, *tried.files),
         outputs=(f"{folder}/{SUMMARY}", f"{folder}/{TABLE}"),
         needs=needs,
     )
@@ -601,7 +617,7 @@ def collect_results(
         robot_jumps={robot.name: robot.jumps for robot in plan.robots},
         missing=tuple(missing),
         failed=tuple(failed),
-        versions=software_versions(),
+        versions=_versions_of_trials(plan, root, missing),
     )
     write_text(root / RUNS_FILE, runs_csv(plan, jumps))
     save_study(root / STUDY_FILE, results)
@@ -637,6 +653,35 @@ def read_trial(folder: Path) -> list[TrialRun]:
     return load_cell(folder / CELLS / f"{key}.json", key)
 
 
+def trial_versions(folder: Path) -> dict[str, str]:
+    """Return the versions of software that the trial in a folder of a study was computed with."""
+    with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, STUDY_WRITER) as body:
+        (cell,) = body["cells"]
+        versions: dict[str, str] = body["versions"]
+        key = cell["key"]
+    return load_cell_versions(folder / CELLS / f"{key}.json") or versions
+
+
+def _versions_of_trials(plan: StudyPlan, root: Path, missing: Collection[str]) -> dict[str, str]:
+    """Return the versions of software that the trials were computed with, several as one text.
+
+    Trials that are kept may be of other versions than those of this process.
+    """
+    versions: dict[str, dict[str, None]] = {}
+    for arm in plan.arms:
+        for robot in plan.robots:
+            if arm.name not in robot.arms:
+                continue
+            for seed in plan.seeds(arm):
+                if trial_name(arm.name, seed, robot.name) not in missing:
+                    stored = trial_versions(root / trial_folder(arm, seed, robot))
+                    for name, version in stored.items():
+                        versions.setdefault(name, {})[version] = None
+    if not versions:
+        return software_versions()
+    return {name: SEVERAL_VERSIONS.join(sorted(several)) for name, several in versions.items()}
+
+
 def values_by_command(runs: Sequence[TrialRun], outcome: str) -> list[Array]:
     """Return an outcome of the jumps of one seed, an array (n,) for each command."""
     values: dict[str, list[float]] = {}
@@ -650,11 +695,14 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
     seeds = []
     means: dict[str, float | None] = {}
     count = 0
+    with_value = 0
     for seed, runs in by_seed.items():
         strata = values_by_command(runs, outcome_name)
         seeds.append(strata)
         means[str(seed)] = seed_mean(strata)
         count += len(runs)
+        for values in strata:
+            with_value += int(np.isfinite(values).sum())
     estimate = mean_interval(seeds, is_share=OUTCOMES[outcome_name].is_share)
     return OutcomeCell(
         arm=arm,
@@ -667,6 +715,7 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
         high=estimate.high,
         by_seed=means,
         jumps=count,
+        jumps_with_value=with_value,
     )
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import msgspec
 
 from pronk.files import write_text
 from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.trial.condition_trial import DECIDING_VERSIONS
 from pronk.jump.trial.results import load_json, save_json
 from pronk.tables import Cell, Column, Table, counted, number
 
@@ -32,6 +34,12 @@ OTHER_ROBOT = "arms of other robots"
 """What that is compared with."""
 
 
+MAX_UNEVEN = 5
+"""Largest number of robots that the note on unequal shares of jumps names."""
+SEVERAL_VERSIONS = " and "
+"""What joins the versions of a software where trials have several."""
+TRIALS = "trials"
+"""Folder of the trials in that of a study."""
 NO_INTERVAL = (
     "A single seed (n = 1) has a value but no interval: how far policies of other seeds lie from "
     "it is not known."
@@ -59,6 +67,8 @@ class OutcomeCell:
     """Mean over the jumps of each seed."""
     jumps: int
     """Number of commanded jumps of all seeds."""
+    jumps_with_value: int | None = None
+    """Number of those that have this outcome; None in results of an earlier pronk."""
 
     @property
     def seeds(self) -> int:
@@ -160,6 +170,24 @@ class StudyResults:
     failed: tuple[str, ...] = ()
     """Trainings that failed, with the reasons."""
     versions: dict[str, str] = field(default_factory=dict)
+    """Versions of software that the trials were computed with, several joined by
+    `SEVERAL_VERSIONS`."""
+
+    @property
+    def mixed_versions(self) -> str:
+        """A sentence on trials of different physics in one table; empty if all are of the same."""
+        mixed = []
+        for name in DECIDING_VERSIONS:
+            version = self.versions.get(name, "")
+            if SEVERAL_VERSIONS in version:
+                mixed.append(f"{name} {version}")
+        if not mixed:
+            return ""
+        return (
+            f"The trials are not all of one version ({', '.join(mixed)}), which decides what is "
+            "simulated: a difference between arms or robots may be one between versions. Delete "
+            f"the folder {TRIALS} and run the command again; trainings are kept."
+        )
 
     def cell(self, arm: str, robot: str, outcome: str) -> OutcomeCell:
         """Return one outcome of one arm on one robot; without a value if it was not tried there."""
@@ -253,6 +281,12 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
                 single_seed.append(f"{arm} on {robot}")
         rows.append(tuple(row))
     notes = [f"{outcome.replace('_', ' ')}: {definition.meaning}."]
+    uneven = _uneven_counts(results, outcome, shown)
+    if uneven:
+        notes.append(
+            "Where arms have a value of unequal shares of their jumps, their means may be over "
+            f"different commands. Jumps with a value: {'; '.join(uneven)}."
+        )
     if single_seed:
         notes.append(f"{NO_INTERVAL} Here: {'; '.join(single_seed)}.")
     return Table(
@@ -262,6 +296,30 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
         notes=tuple(notes),
         is_detail=in_series,
     )
+
+
+def _uneven_counts(results: StudyResults, outcome: str, robots: Collection[str]) -> list[str]:
+    """Return how many jumps have an outcome on robots where that share differs between arms.
+
+    Args:
+        results: The study.
+        outcome: Name of the outcome.
+        robots: Names of the robots that count.
+    """
+    texts = []
+    for robot in results.robots:
+        counts = []
+        shares = set()
+        for arm in results.arms:
+            cell = results.cell(arm, robot, outcome)
+            if robot in robots and cell.jumps and cell.jumps_with_value is not None:
+                shares.add(Fraction(cell.jumps_with_value, cell.jumps))
+                counts.append(f"{arm} {cell.jumps_with_value} of {cell.jumps}")
+        if len(shares) > 1:
+            texts.append(f"on {robot} {', '.join(counts)}")
+    if len(texts) > MAX_UNEVEN:
+        texts[MAX_UNEVEN:] = [f"and on {len(texts) - MAX_UNEVEN} more"]
+    return texts
 
 
 def comparison_table(results: StudyResults) -> Table:

@@ -191,7 +191,7 @@ class StudyState:
         return hashes == record.outputs
 
     def check_settings(self, tasks: Sequence[StudyTask]) -> None:
-        """Refuse trainings that were begun in this folder with other settings or gains.
+        """Refuse trainings that were begun in this folder with other settings or inputs.
 
         A policy of which nothing says how it was trained is no start of a training, and is not
         replaced by one either.
@@ -200,6 +200,7 @@ class StudyState:
             PronkError: There is such a training or policy; nothing was changed.
         """
         changed = []
+        has_robot_file = False
         for task in tasks:
             record = self.records.get(task.name)
             if task.kind != "training":
@@ -214,14 +215,26 @@ class StudyState:
                             "well, or move it away to train again."
                         )
                 continue
-            if (self.root / task.resume_marker).is_file() and record.key != task.key(self.root):
+            # Without the marker the folder would be made anew, and a policy in it be lost.
+            is_begun = any(
+                (self.root / path).is_file() for path in (task.resume_marker, *task.outputs)
+            )
+            if is_begun and record.key != task.key(self.root):
                 changed.append(task.name)
+                has_robot_file |= str(task.settings.get("robot")).startswith(f"{INPUTS}/")
         if changed:
-            raise PronkError(
-                f"--out {self.root}: {', '.join(changed)} was begun there with other settings or "
-                "gains; give another folder, or delete "
+            text = (
+                f"--out {self.root}: {', '.join(changed)} was begun there with other settings, "
+                "gains, recipe or robot; give another folder, or delete "
                 f"{self.root / tasks[0].folder} and its like to train anew."
             )
+            if has_robot_file:
+                text += (
+                    " Trainings of a robot.yaml are known by its content. An earlier pronk knew "
+                    "them by its path, so that those that it began cannot go on here; name their "
+                    "finished policies as `policies` of an arm."
+                )
+            raise PronkError(text)
 
     def finish(self, task: StudyTask, record: TaskRecord) -> TaskRecord:
         """Remember a task whose command has ended well; it has failed if an output is missing."""

@@ -3,7 +3,7 @@
 An arm is a way to train, by its gains and options; each arm is trained from every seed. The folder
 of a study holds
 
-    inputs/                  copies of gains and recipes, named by their content
+    inputs/                  copies of gains, recipes and robots, named by their content
     trainings/ARM/seed-N/    the folder of one run, as `pronk train` writes it
     logs/, state.json        what each task printed, and which are done
     trainings.json           every training, and the spread over seeds of each arm
@@ -22,6 +22,7 @@ from typing import Any
 
 from pronk.errors import PronkError
 from pronk.files import sha256, write_text
+from pronk.jump.study.robot_inputs import robot_input
 from pronk.jump.study.schedule import TaskStatus
 from pronk.jump.study.tasks import StudyTask, copied_input, written_input
 from pronk.jump.train.phases import STEPS_PER_ITERATION
@@ -187,11 +188,11 @@ def training_tasks(
     prepared = []
     for arm in arms:
         settings = arm.settings
-        inputs = []
-        robot = Path(str(settings.robot))
-        if robot.is_file():
-            # Tasks run in the folder of the study.
-            settings = replace(settings, robot=str(robot.resolve()))
+        inputs: list[str] = []
+        if settings.robot is not None:
+            robot = robot_input(root, settings.robot, is_trained=True)
+            inputs += robot.files
+            settings = replace(settings, robot=robot.name)
         if settings.gains_file is not None:
             copy = copied_input(root, settings.gains_file, "gains")
             inputs.append(copy)

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from types import FrameType
 
 import torch
 from mjlab.envs import ManagerBasedRlEnv
@@ -62,6 +63,7 @@ def launch(
 
     Raises:
         PronkError: Learning has diverged, or a process was lost.
+        KeyboardInterrupt: A signal stopped the training, whose name it has.
     """
     import cloudpickle
     import torchrunx
@@ -76,8 +78,9 @@ def launch(
         copy_env_vars=COPIED_VARIABLES,
     ).set_logging_handlers(partial(_log_handlers, tuple(hosts), processes, log_dir))
     is_interrupted = False
+    signals: list[str] = []
     try:
-        with _terminated_as_interrupted():
+        with _terminated_as_interrupted(signals):
             launcher.run(train_packed, cloudpickle.dumps((config, log_dir)))
     except KeyboardInterrupt:
         is_interrupted = True
@@ -93,7 +96,7 @@ def launch(
         # as its connections are open; the frames of the interrupt held them.
         gc.collect()
         _wait_for_checkpoint(log_dir, first_checkpoint)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(signals[0] if signals else "SIGINT")
 
 
 def train_process(config: mjlab_train.TrainConfig, log_dir: Path) -> None:
@@ -153,12 +156,21 @@ def _log_handlers(hosts: tuple[str, ...], processes: int, log_dir: Path) -> list
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt in the block, so that torchrunx ends its agents."""
+def _terminated_as_interrupted(signals: list[str]) -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt in the block, so that torchrunx ends its agents.
+
+    Args:
+        signals: Gets the name of the signal.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        signals.append(signal.Signals(number).name)
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:

@@ -26,6 +26,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.versions import package_versions
+from pronk.robots import ROBOT_NAMES
 
 SCHEMA = "pronk/run/2"
 
@@ -50,6 +51,22 @@ class RunFolder:
     def recipe(self) -> Path:
         """The copy of the recipe, or what several were merged to."""
         return self.path / "recipe.yaml"
+
+    def robot(self, name: str) -> str:
+        """Return the name or the path of the run's robot as this process can load it.
+
+        A run that is part of a study reads a copy of a robot.yaml in the folder of the study, to
+        which the path is relative.
+
+        Args:
+            name: The robot among the settings of the run.
+        """
+        if name in ROBOT_NAMES or Path(name).exists():
+            return name
+        for parent in self.path.resolve().parents:
+            if (parent / name).is_file():
+                return str(parent / name)
+        return name
 
     def checkpoint(self) -> Path:
         """Return the last numbered checkpoint; ArtefactError if there is none."""

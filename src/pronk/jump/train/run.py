@@ -70,7 +70,7 @@ def run_training(
         report(f"asking {', '.join(settings.devices.host_names)} whether they can train together")
         hosts = check_hosts(
             settings.devices.host_names,
-            robot=str(settings.robot),
+            robot=folder.robot(str(settings.robot)),
             device=settings.devices.device,
             gpu_ids=settings.devices.gpu_ids,
             out=settings.out,
@@ -305,6 +305,7 @@ def _train_session(
         session["hosts"] = [host.record() for host in hosts]
     record["sessions"].append(session)
     folder.write(record)
+    first_checkpoint = checkpoint.latest_checkpoint(folder.path)
     log_dir = folder.path.resolve()
     try:
         if hosts:
@@ -313,6 +314,10 @@ def _train_session(
             launch(config, log_dir, (LOCAL_HOST,), processes)
         else:
             train_process(config, log_dir)
+    except KeyboardInterrupt as interrupt:
+        # It may have ended before a checkpoint could say so.
+        session["stopped"] = str(interrupt) or "SIGINT"
+        raise
     finally:
         session["seconds"] = time.monotonic() - begin
         session["device"] = _session_device(hosts, processes)
@@ -322,7 +327,8 @@ def _train_session(
             infos = state["infos"]
             record["phases"] = infos.get("phases", {})
             record["finished"] = state["iter"] + 1 >= config.agent.max_iterations
-            session["stopped"] = infos.get("stopped", "")
+            if last_checkpoint != first_checkpoint and not session["stopped"]:
+                session["stopped"] = infos.get("stopped", "")
         folder.write(record)
     return record
 
@@ -340,7 +346,7 @@ def _session_device(hosts: tuple[Host, ...], processes: int) -> dict[str, Any]:
 
 def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
     """Return mjlab's configuration of a training, which continues the last checkpoint if any."""
-    task = load_task(str(settings.robot))
+    task = load_task(folder.robot(str(settings.robot)))
     gains = run_gains(folder, task.robot)
     iterations = sum(settings.iterations.values())
     agent = task.rl_cfg(iterations=iterations, seed=settings.seed)

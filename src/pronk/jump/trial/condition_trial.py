@@ -57,6 +57,7 @@ from pronk.jump.virtual.sim_params import SCHEMA as SIM_PARAMS_SCHEMA
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.names import file_name
 from pronk.processes import FEWER_PROCESSES, results_in_order
+from pronk.robots.robot_files import robot_key
 
 SCHEMA = "pronk/condition-trial/1"
 CELL_SCHEMA = "pronk/condition-cell/1"
@@ -306,7 +307,7 @@ def cell_key(
     settings = {
         "schema": CELL_SCHEMA,
         "policy": subject.sha256,
-        "robot": setup.robot.name,
+        "robot": robot_key(setup.robot),
         "sim_params": sim_params,
         "plan": plan,
         "versions": versions,
@@ -467,6 +468,12 @@ def load_cell(path: Path, key: str) -> list[TrialRun]:
                 "command again."
             )
         return [load_run(stored, JumpFigures) for stored in body["rows"]]
+
+
+def load_cell_versions(path: Path) -> dict[str, str]:
+    """Read the versions of software that a cell was computed with; none of an earlier pronk's."""
+    with load_json(path, CELL_SCHEMA, WRITER) as body:
+        return msgspec.convert(body.get("versions", {}), dict[str, str])
 
 
 def save_conditions(folder: Path, results: ConditionResults) -> tuple[Path, Path]:

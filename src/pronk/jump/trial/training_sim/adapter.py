@@ -221,7 +221,7 @@ def load_evaluated_policy(path: Path, device: str) -> EvaluatedPolicy:
         act=actor,
         estimate=actor.estimate,
         jump=uses_jump_input(state),
-        robot=settings.get("robot", "mini_cheetah"),
+        robot=run.robot(settings.get("robot", "mini_cheetah")),
         about=about,
         draws=_draws_of(settings),
     )
