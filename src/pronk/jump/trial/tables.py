@@ -204,43 +204,31 @@ def landings(trial: TrialResults) -> Table:
 def _first_touches(trial: TrialResults, policy: str) -> str:
     """Return which parts of a robot touched the ground first, and when; "" without a touch."""
     counts: Counter[str] = Counter()
-    unknown = 0
     times = []
     for run in trial.rows:
         figures: JumpFigures = run.figures
-        if run.policy != policy or not figures.non_foot_contact:
-            continue
-        if not figures.touched_part:
-            unknown += 1
+        if run.policy != policy or not figures.touched_part:
             continue
         counts[figures.touched_part] += 1
         if math.isfinite(figures.touch):
             times.append(figures.touch)
-    phrases = []
-    for part, count in sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])):
-        phrases.append(f"{part} {count}")
-    if unknown:
-        phrases.append(f"a part that is not known {unknown}")
-    if not phrases:
+    if not counts:
         return ""
+    phrases = []
+    for part, count in counts.most_common():
+        phrases.append(f"{part} {count}")
     note = f"{policy}, touched first by: {', '.join(phrases)}"
     if times:
-        note += f"; {_span_text(min(times), max(times))} after touchdown"
+        low = f"{min(times):.2f}"
+        high = f"{max(times):.2f}"
+        span = low if low == high else f"{low} to {high}"
+        note += f"; {span} s after touchdown"
         if min(times) < 0.0:
             note += " (negative: before it)"
         without_touchdown = counts.total() - len(times)
         if without_touchdown:
             note += f", {counted(without_touchdown, 'jump')} without touchdown left out"
     return f"{note}."
-
-
-def _span_text(low: float, high: float) -> str:
-    """Return a span of times, or one time where both ends read alike."""
-    low_text = f"{low:.2f}"
-    high_text = f"{high:.2f}"
-    if low_text == high_text:
-        return f"{low_text} s"
-    return f"{low_text} to {high_text} s"
 
 
 def _soft_ground_note(trial: TrialResults) -> str:

@@ -173,15 +173,16 @@ def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Names]:
     foot_of_geom = np.full(model.ngeom, foot_count)
     foot_of_geom[plant.feet] = np.arange(foot_count)
     pairs = np.concatenate(geom_pairs)
-    touching_foot = foot_of_geom[pairs].min(axis=1)
-    sample_of_pair = np.array(samples, dtype=np.intp)
+    feet_touching = foot_of_geom[pairs].min(axis=1)
     touched = np.zeros((len(positions), foot_count + 1), dtype=bool)
-    touched[sample_of_pair, touching_foot] = True
-    # The ground belongs to the world, which is body 0.
-    is_other = touching_foot == foot_count
-    bodies = model.geom_bodyid[pairs[is_other]].max(axis=1)
-    parts = _part_names(model, len(positions), sample_of_pair[is_other], bodies)
-    return foot_position, touched[:, :foot_count], parts
+    touched[samples, feet_touching] = True
+    other_parts = np.full(len(positions), "")
+    is_other = feet_touching == foot_count
+    if is_other.any():
+        # The ground belongs to the world, which is body 0.
+        bodies = model.geom_bodyid[pairs[is_other]].max(axis=1)
+        other_parts = _part_names(model, len(positions), np.array(samples)[is_other], bodies)
+    return foot_position, touched[:, :foot_count], other_parts
 
 
 def _part_names(model: Any, count: int, samples: Indices, bodies: Indices) -> Names:
@@ -193,20 +194,15 @@ def _part_names(model: Any, count: int, samples: Indices, bodies: Indices) -> Na
         samples: Sample of each contact, (n,).
         bodies: Body of each contact, (n,).
     """
-    if not len(samples):
-        return np.full(count, "")
-    # Few combinations of bodies occur, so each is named once.
-    touching, row_of_contact = np.unique(samples, return_inverse=True)
-    is_touching = np.zeros((len(touching), model.nbody), dtype=bool)
-    is_touching[row_of_contact, bodies] = True
-    combinations, combination_of_row = np.unique(is_touching, axis=0, return_inverse=True)
-    texts = []
-    for combination in combinations:
-        names = []
-        for body in np.flatnonzero(combination):
-            names.append(model.body(body).name or f"body {body}")
-        texts.append(TOGETHER.join(names))
-    text_of_combination = np.array(texts)
-    parts = np.full(count, "", dtype=text_of_combination.dtype)
-    parts[touching] = text_of_combination[combination_of_row]
-    return parts
+    bodies_of_sample: dict[int, set[int]] = {}
+    for sample, body in zip(samples.tolist(), bodies.tolist(), strict=True):
+        bodies_of_sample.setdefault(sample, set()).add(body)
+    text_of_bodies: dict[frozenset[int], str] = {}  # Few combinations occur.
+    texts = [""] * count
+    for sample, sample_bodies in bodies_of_sample.items():
+        key = frozenset(sample_bodies)
+        if key not in text_of_bodies:
+            names = [model.body(body).name or f"body {body}" for body in sorted(key)]
+            text_of_bodies[key] = TOGETHER.join(names)
+        texts[sample] = text_of_bodies[key]
+    return np.array(texts)
