@@ -51,6 +51,7 @@ def motion(time: np.ndarray, **arrays: Any) -> Capture:
         "foot_position": np.zeros((count, 4, 3)),
         "contact": np.ones((count, 4), dtype=bool),
         "other_contact": np.zeros(count, dtype=bool),
+        "other_parts": np.full(count, ""),
         "joint_position": np.zeros((count, 12)),
         "joint_velocity": np.zeros((count, 12)),
         "torque": np.zeros((count, 12)),

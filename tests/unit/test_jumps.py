@@ -337,6 +337,81 @@ def test_a_knee_on_the_ground_is_no_success(time: float, touches: bool) -> None:
     assert figures.upright
 
 
+def touched(capture: Capture, time: float, parts: str, duration: float = 0.05) -> Capture:
+    """The same with parts on the ground from a time on for a while [s]."""
+    samples = between(time, time + duration)
+    names = capture.other_parts.astype("<U40")
+    names[samples] = parts
+    touching = changed(capture, "other_contact", samples, True)
+    return replace(touching, other_parts=names)
+
+
+def pressed(capture: Capture, time: float, foot: int, press: float) -> Capture:
+    """The same with a foot pressed in by a share of its radius from a time on for 0.1 s."""
+    height = (1.0 - press) * case.BODY.foot_radius
+    return changed(capture, "foot_position", (between(time, time + 0.1), foot, 2), height)
+
+
+@pytest.mark.parametrize("after", [-0.5, 0.09, 1.9])
+def test_the_first_touch_has_a_part_and_a_time_after_touchdown(after: float) -> None:
+    time = round(DOWN + after, 3)
+    # Before the jump input and more than 2 s after touchdown it does not count.
+    capture = touched(seen_jump(), ON - 0.2, "trunk")
+    capture = touched(capture, DOWN + 2.1, "trunk")
+    assert measured(capture).touched_part == ""
+    assert math.isnan(measured(capture).touch)
+    # Only the first counts.
+    capture = touched(capture, time + 0.06, "FL_thigh")
+    capture = touched(capture, time, "HR_thigh+HL_thigh")
+    figures = measured(capture)
+    assert figures.non_foot_contact
+    assert figures.touched_part == "HR_thigh+HL_thigh"
+    assert figures.touch == pytest.approx(after, abs=1.5 * case.DT)
+
+
+def test_a_touch_without_a_jump_has_a_part_and_no_time() -> None:
+    standing = motion(seen_jump().time)
+    figures = measured(touched(standing, ON + 0.3, "trunk"))
+    assert not figures.found
+    assert figures.touched_part == "trunk"
+    assert math.isnan(figures.touch)
+
+
+def test_a_touch_of_a_part_that_is_not_known_has_a_time() -> None:
+    figures = measured(changed(seen_jump(), "other_contact", between(DOWN + 0.2, DOWN + 0.3), True))
+    assert figures.non_foot_contact
+    assert figures.touched_part == ""
+    assert figures.touch == pytest.approx(0.2, abs=1.5 * case.DT)
+    assert math.isnan(figures.touch_press)
+
+
+@pytest.mark.parametrize(
+    ("parts", "foot", "pressed_after", "press"),
+    [
+        # Feet are FR, FL, HR, HL; the touch is from 0.1 to 0.15 s after touchdown.
+        ("HR_shank", 2, 0.1, 1.4),
+        ("HR_shank", 2, 0.5, 0.0),  # another time
+        ("HR_shank", 2, 0.12, 0.0),  # a part of the time
+        ("HR_shank", 3, 0.1, 0.0),  # another leg
+        ("HR_shank+HL_shank", 2, 0.1, 0.0),  # one of two legs
+        ("HR_thigh", 2, 0.1, math.nan),
+        ("HR_thigh+HR_shank", 2, 0.1, math.nan),
+    ],
+)
+def test_the_press_of_a_foot_counts_while_its_own_shank_touches(
+    parts: str, foot: int, pressed_after: float, press: float
+) -> None:
+    capture = pressed(seen_jump(), DOWN + pressed_after, foot, 1.4)
+    figures = measured(touched(capture, DOWN + 0.1, parts))
+    assert figures.foot_press == pytest.approx(1.4)
+    assert figures.touch_press == pytest.approx(press, abs=1e-9, nan_ok=True)
+
+
+def test_without_a_touch_there_is_no_press_of_one() -> None:
+    figures = measured(pressed(seen_jump(), DOWN + 0.1, 2, 1.4))
+    assert math.isnan(figures.touch_press)
+
+
 @pytest.mark.parametrize(("time", "counts"), [(ON - 0.1, False), (ON + 0.01, True)])
 def test_how_far_a_foot_is_pressed_in_is_a_share_of_its_radius(time: float, counts: bool) -> None:
     radius = legged(ROBOT.source).foot_radius

@@ -116,25 +116,57 @@ def test_a_cell_by_hand() -> None:
     assert cell.joints["peak_torque"]["FR_knee"].maximum == pytest.approx(2 * 0.48)
 
 
+def landing_notes(*jumps: JumpFigures) -> str:
+    """Return the notes below the landings of one policy's jumps with one command."""
+    command = PAPER_COMMANDS[0]
+    rows = []
+    for number, figures in enumerate(jumps):
+        rows.append(row("matched", command, number, figures))
+    results = trial({"matched": (0.4,)}, (command,))
+    return " ".join(tables.landings(replace(results, rows=tuple(rows))).notes)
+
+
 @pytest.mark.parametrize(
-    ("touched", "fell", "foot_press", "is_noted"),
+    ("fell", "touch_press", "is_noted"),
     [
-        (True, False, 1.4, True),
-        (True, False, 0.6, False),
-        (False, False, 1.4, False),
-        (True, True, 1.4, False),
+        (False, 1.4, True),
+        # Not beyond its centre in some sample.
+        (False, 0.6, False),
+        # Another part than the shank of a pressed foot.
+        (False, math.nan, False),
+        (True, 1.4, False),
     ],
 )
-def test_touches_while_feet_are_pressed_in_beyond_their_centre_are_noted(
-    touched: bool, fell: bool, foot_press: float, is_noted: bool
+def test_touches_of_shanks_whose_feet_are_pressed_in_beyond_their_centre_are_noted(
+    fell: bool, touch_press: float, is_noted: bool
 ) -> None:
-    results = trial({"matched": (0.4,)}, (PAPER_COMMANDS[0],))
-    changes = {"non_foot_contact": touched, "fell": fell, "foot_press": foot_press}
-    figures = replace(jump(0.4), **changes)
-    rows = (row("matched", PAPER_COMMANDS[0], 0, figures),)
-    notes = " ".join(tables.landings(replace(results, rows=rows)).notes)
+    # In each of them a foot was pressed in deeply at some time.
+    figures = replace(
+        jump(0.4), non_foot_contact=True, fell=fell, foot_press=1.7, touch_press=touch_press
+    )
+    notes = landing_notes(figures)
     assert ("ground.stiffness" in notes) is is_noted
     assert ("1.4" in notes) is is_noted
+
+
+def test_the_landings_say_what_touched_first_and_when() -> None:
+    def touching(part: str, touch: float) -> JumpFigures:
+        return replace(jump(0.4), non_foot_contact=True, touched_part=part, touch=touch)
+
+    thigh = touching("RR_thigh", 0.09)
+    trunk = touching("trunk", 0.76)
+    notes = landing_notes(jump(0.4), trunk, thigh, thigh)
+    assert "RR_thigh 2, trunk 1; 0.09 to 0.76 s after touchdown." in notes
+    assert "negative" not in notes
+    assert "trunk 1; 0.76 s after touchdown." in landing_notes(trunk)
+    early = touching("RL_thigh+RR_thigh", -0.31)
+    notes = landing_notes(early, trunk)
+    assert "RL_thigh+RR_thigh 1, trunk 1; -0.31 to 0.76 s after touchdown" in notes
+    assert "negative" in notes
+    # Without a jump there is no touchdown.
+    assert "1 jump without" in landing_notes(thigh, touching("trunk", math.nan))
+    for figures in (jump(0.4), replace(jump(0.4), non_foot_contact=True)):
+        assert "touched first" not in landing_notes(figures)
 
 
 def test_the_ratio_is_that_of_the_mean_scatter() -> None:
@@ -226,6 +258,25 @@ def test_walks_and_crossings_are_loaded_as_they_were(results: TrialResults, tmp_
     assert repr((loaded.rows, loaded.cells)) == repr((results.rows, results.cells))
 
 
+def test_a_trial_of_an_earlier_pronk_does_not_know_what_touched(tmp_path: Path) -> None:
+    rows = []
+    for run in trial().rows:
+        changes = {"non_foot_contact": True, "touched_part": "trunk", "touch": 0.2}
+        rows.append(replace(run, figures=replace(run.figures, **changes)))
+    _, summary = save_results(tmp_path, replace(trial(), rows=tuple(rows)))
+    assert load_results(tmp_path).rows[0].figures.touched_part == "trunk"
+    body = json.loads(summary.read_text())
+    for run in body["rows"]:
+        for name in ("touched_part", "touch", "touch_press"):
+            del run["figures"][name]
+    summary.write_text(json.dumps(body))
+    figures = load_results(tmp_path).rows[0].figures
+    assert figures.non_foot_contact
+    assert figures.touched_part == ""
+    assert math.isnan(figures.touch)
+    assert math.isnan(figures.touch_press)
+
+
 def test_the_summary_is_strict_json(tmp_path: Path) -> None:
     save_results(tmp_path, trial())
     text = (tmp_path / "summary.json").read_text()
@@ -239,6 +290,7 @@ def test_the_table_has_every_figure_of_every_jump(tmp_path: Path) -> None:
     save_results(tmp_path, results)
     table = list(csv.DictReader(io.StringIO((tmp_path / "trials.csv").read_text())))
     assert len(table) == len(results.rows) == 40
+    assert table[0]["touched_part"] == table[0]["touch_s"] == ""
     landed = table[0]
     assert (landed["height_m"], landed["peak_torque_FR_knee_N_m"]) == ("0.4", "0.8")
     assert landed["success"] == "1"

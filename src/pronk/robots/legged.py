@@ -19,6 +19,8 @@ class Legged:
 
     legs: tuple[str, ...]
     """Prefixes of the joints of each leg."""
+    shanks: dict[str, str]
+    """Body that carries the foot of each leg, by the prefix of the leg."""
     leg_joints: tuple[str, ...]
     """Joints of a leg from the hip down, without the prefix."""
     default_position: dict[str, float]
@@ -58,12 +60,17 @@ def legged(name: str | Path) -> Legged:
     feet = np.flatnonzero(is_sphere & (model.geom_bodyid == shank))
     if not len(feet):
         raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
+    shanks = {}
+    for name in robot.legs:
+        last_joint = [joint for joint in robot.joint_names if joint.startswith(f"{name}_")][-1]
+        shanks[name] = model.body(model.joint(last_joint).bodyid[0]).name
     base = model.body(robot.base_body)
     default_position = {}
     for joint in joints:
         default_position[joint.name.removeprefix(leg)] = joint.default_position
     return Legged(
         legs=robot.legs,
+        shanks=shanks,
         leg_joints=tuple(default_position),
         default_position=default_position,
         thigh_length=float(-model.body_pos[shank, 2]),

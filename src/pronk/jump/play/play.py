@@ -193,6 +193,7 @@ def joined(captures: Sequence[Capture]) -> Capture:
         foot_position=join("foot_position"),
         contact=join("contact"),
         other_contact=join("other_contact"),
+        other_parts=join("other_parts"),
         joint_position=join("joint_position"),
         joint_velocity=join("joint_velocity"),
         torque=join("torque"),

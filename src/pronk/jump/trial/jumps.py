@@ -22,7 +22,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from pronk.arrays import Array, Mask
-from pronk.jump.virtual.capture import Capture
+from pronk.jump.virtual.capture import TOGETHER, Capture
+from pronk.jump.virtual.plant import Indices, legs_of
 from pronk.policy.script import Script
 from pronk.robots.legged import legged
 from pronk.robots.motor import torque_limits
@@ -370,6 +371,9 @@ class JumpFigures:
     """There was a jump."""
     non_foot_contact: bool = False
     """Something but a foot touched the ground, from c to 2 s after d."""
+    touched_part: str = ""
+    """Body of the robot's model that was the first of it, or several of one sample; empty if it is
+    not known."""
     fell: bool = False
     """The robot fell, at any time of the run."""
     upright: bool = False
@@ -379,6 +383,14 @@ class JumpFigures:
     flights: float = figure("1", "flight phases that lift off from c to c + 1.5 s")
     high_flights: float = figure("1", "those of them that are 60 ms or longer and high")
     foot_press: float = figure("1", "max over feet of (r - f_i,z) / r, from c to 2 s after d")
+    touch: float = figure(
+        "s", "time from d to the first touch of something but a foot; negative before d"
+    )
+    touch_press: float = figure(
+        "1",
+        "min over the shanks that touch, from c to 2 s after d, of (r - f_i,z) / r of their own "
+        "foot at that time; none if another part touches as well",
+    )
     flight: FlightFigures = field(default_factory=FlightFigures, metadata={"part": FlightFigures})
     approach: ApproachFigures = field(
         default_factory=ApproachFigures, metadata={"part": ApproachFigures}
@@ -455,21 +467,55 @@ def measure_jump(
         upright = settled < count and bool(
             cosine_of_tilt(capture.orientation[settled]) >= rules.upright_cosine
         )
+    touches = on + np.flatnonzero(capture.other_contact[on : settled + 1])
+    touch = math.nan
+    if main is not None and len(touches):
+        touch = float(touches[0] - main.touchdown) * capture.dt
     lowest_foot = float(capture.foot_position[on : settled + 1, :, 2].min())
     return JumpFigures(
         standing=True,
         found=main is not None,
-        non_foot_contact=bool(capture.other_contact[on : settled + 1].any()),
+        non_foot_contact=len(touches) > 0,
+        touched_part=str(capture.other_parts[touches[0]]) if len(touches) else "",
         fell=fell,
         upright=upright,
         height=float(np.ptp(capture.position[on : end + 1, 2])),
         flights=float(len(phases.commanded)),
         high_flights=float(len(phases.high)),
         foot_press=(body.foot_radius - lowest_foot) / body.foot_radius,
+        touch=touch,
+        touch_press=_measure_touch_press(capture, touches, robot),
         flight=flight,
         approach=_measure_approach(capture, script, run, on, mass=body.total_mass),
         loads=_measure_loads(capture, robot, on, end),
     )
+
+
+def _measure_touch_press(capture: Capture, touches: Indices, robot: RobotSpec) -> float:
+    """Return how far a foot was pressed in at least while its shank touched the ground [1].
+
+    Args:
+        capture: The recorded motion.
+        touches: Samples in which anything but a foot touches the ground. (n,)
+        robot: The robot.
+
+    Returns:
+        The least share of the foot's radius; NaN if nothing touched, another part than a shank
+        did, or the parts are not known.
+    """
+    body = legged(robot.source)
+    foot_of_shank = {}
+    for foot, leg in enumerate(legs_of(robot)):
+        if leg in body.shanks:
+            foot_of_shank[body.shanks[leg]] = foot
+    least = math.inf
+    for sample in touches:
+        for part in str(capture.other_parts[sample]).split(TOGETHER):
+            if part not in foot_of_shank:
+                return math.nan
+            height = capture.foot_position[sample, foot_of_shank[part], 2]
+            least = min(least, float(body.foot_radius - height) / body.foot_radius)
+    return least if len(touches) else math.nan
 
 
 def _measure_flight(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from pronk.jump.trial.condition_trial import ConditionResults
@@ -175,6 +176,10 @@ def landings(trial: TrialResults) -> Table:
         "commanded. fell: at any time of the run. touched: something but a foot touched the "
         "ground, from the command to 2 s after touchdown."
     ]
+    for policy in trial.policy_names:
+        first_touches = _first_touches(trial, policy)
+        if first_touches:
+            notes.append(first_touches)
     soft_note = _soft_ground_note(trial)
     if soft_note:
         notes.append(soft_note)
@@ -196,26 +201,55 @@ def landings(trial: TrialResults) -> Table:
     )
 
 
+def _first_touches(trial: TrialResults, policy: str) -> str:
+    """Return which parts of a robot touched the ground first, and when; "" without a touch."""
+    counts: Counter[str] = Counter()
+    times = []
+    for run in trial.rows:
+        figures: JumpFigures = run.figures
+        if run.policy != policy or not figures.touched_part:
+            continue
+        counts[figures.touched_part] += 1
+        if math.isfinite(figures.touch):
+            times.append(figures.touch)
+    if not counts:
+        return ""
+    phrases = []
+    for part, count in counts.most_common():
+        phrases.append(f"{part} {count}")
+    note = f"{policy}, touched first by: {', '.join(phrases)}"
+    if times:
+        low = f"{min(times):.2f}"
+        high = f"{max(times):.2f}"
+        span = low if low == high else f"{low} to {high}"
+        note += f"; {span} s after touchdown"
+        if min(times) < 0.0:
+            note += " (negative: before it)"
+        without_touchdown = counts.total() - len(times)
+        if without_touchdown:
+            note += f", {counted(without_touchdown, 'jump')} without touchdown left out"
+    return f"{note}."
+
+
 def _soft_ground_note(trial: TrialResults) -> str:
-    """Return what to think of touches while a foot is pressed in beyond its centre; "" without."""
+    """Return what to think of touches of shanks whose feet were pressed in deeply; "" without."""
     touched = 0
-    pressed = 0
-    largest = 0.0
+    presses = []
     for run in trial.rows:
         figures: JumpFigures = run.figures
         if not figures.non_foot_contact or figures.fell:
             continue
         touched += 1
-        if figures.foot_press > 1.0:
-            pressed += 1
-            largest = max(largest, figures.foot_press)
-    if pressed == 0:
+        if figures.touch_press > 1.0:
+            presses.append(figures.touch_press)
+    if not presses:
         return ""
     return (
-        f"In {pressed} of the {counted(touched, 'jump')} without a fall in which something but a "
-        "foot touched the ground, a foot was pressed in beyond its centre, by up to "
-        f"{largest:.1f} times its radius, where the lower end of a shank comes to the floor. On "
-        "harder ground (ground.stiffness of the virtual robot's parameters) it may not touch."
+        f"In {len(presses)} of the {counted(touched, 'jump')} without a fall in which something "
+        "but a foot touched the ground, only shanks touched it, and their own feet were pressed in "
+        f"beyond their centres whenever they did, by {min(presses):.1f} times the radius or more. "
+        "It may be the lower end of the shank that came to the floor with the foot; on harder "
+        "ground (ground.stiffness of the virtual robot's parameters) it may not touch."
     )
 
 

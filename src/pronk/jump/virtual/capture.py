@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import mujoco
 import numpy as np
@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.files import save_arrays, stored_arrays
-from pronk.jump.virtual.plant import Plant
+from pronk.jump.virtual.plant import Indices, Plant
 
 Mask = NDArray[np.bool_]
+Names = NDArray[np.str_]
 
 SCHEMA = "pronk/capture/1"
+TOGETHER = "+"
+"""What stands between the names of parts that touch the ground at the same instant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,10 @@ class Capture:
     """Whether each foot is on the ground."""
     other_contact: Annotated[Mask, ()]
     """Whether anything but a foot touches the ground."""
+    other_parts: Annotated[Names, ()]
+    """Bodies of the robot's model that touch the ground with anything but a foot, in the order of
+    the model with `TOGETHER` between them; empty without such a contact or where it is not known
+    which they are."""
     joint_position: Annotated[Array, (12,)]
     """Angles of the links, in file order [rad]."""
     joint_velocity: Annotated[Array, (12,)]
@@ -77,6 +84,8 @@ _SHAPES = {
     for name, hint in get_type_hints(Capture, include_extras=True).items()
 }
 """Shape of one sample of each field."""
+_PARTS = "other_parts"
+"""The field that captures of an earlier pronk do not have."""
 
 
 def save_capture(path: Path, capture: Capture) -> None:
@@ -86,13 +95,18 @@ def save_capture(path: Path, capture: Capture) -> None:
 
 
 def load_capture(path: Path) -> Capture:
-    """Read a capture.
+    """Read a capture; in one of an earlier pronk, `other_parts` are not known.
 
     Raises:
         ArtefactError: The file is missing, damaged or of another schema.
     """
     with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, arrays):
-        return Capture(**{name: arrays[name] for name in _SHAPES})
+        fields = {name: arrays[name] for name in _SHAPES if name != _PARTS}
+        if _PARTS in arrays:
+            fields[_PARTS] = arrays[_PARTS]
+        else:
+            fields[_PARTS] = np.full(len(fields["time"]), "")
+        return Capture(**fields)
 
 
 def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
@@ -107,7 +121,7 @@ def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
     qpos = states.position
     qvel = states.velocity
     orientation = qpos[:, 3:7]
-    foot_position, foot_contact, other_contact = _contacts(plant, qpos)
+    foot_position, foot_contact, other_parts = _contacts(plant, qpos)
     current = states.torque / plant.constant
     heat = current * current * plant.resistance
     return Capture(
@@ -118,7 +132,8 @@ def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
         angular_velocity=qvel[:, 3:6].copy(),
         foot_position=foot_position,
         contact=foot_contact,
-        other_contact=other_contact,
+        other_contact=other_parts != "",
+        other_parts=other_parts,
         joint_position=qpos[:, plant.link_qpos],
         joint_velocity=qvel[:, plant.link],
         torque=states.torque,
@@ -127,7 +142,7 @@ def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
     )
 
 
-def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Mask]:
+def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Names]:
     """Find the contacts of a plant on the ground.
 
     Args:
@@ -135,8 +150,8 @@ def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Mask]:
         positions: Its qpos at T instants, (T, nq).
 
     Returns:
-        Feet in the world [m], (T, 4, 3), whether they touch the ground, (T, 4), and whether
-        anything else does, (T,).
+        Feet in the world [m], (T, 4, 3), whether they touch the ground, (T, 4), and what else
+        does, (T,), as of `Capture.other_parts`.
     """
     model = plant.model
     data = plant.scratch
@@ -157,6 +172,37 @@ def _contacts(plant: Plant, positions: Array) -> tuple[Array, Mask, Mask]:
     # The ground is one geom of a pair; the other is a foot or not, whose number is `foot_count`.
     foot_of_geom = np.full(model.ngeom, foot_count)
     foot_of_geom[plant.feet] = np.arange(foot_count)
+    pairs = np.concatenate(geom_pairs)
+    feet_touching = foot_of_geom[pairs].min(axis=1)
     touched = np.zeros((len(positions), foot_count + 1), dtype=bool)
-    touched[samples, foot_of_geom[np.concatenate(geom_pairs)].min(axis=1)] = True
-    return foot_position, touched[:, :foot_count], touched[:, foot_count]
+    touched[samples, feet_touching] = True
+    other_parts = np.full(len(positions), "")
+    is_other = feet_touching == foot_count
+    if is_other.any():
+        # The ground belongs to the world, which is body 0.
+        bodies = model.geom_bodyid[pairs[is_other]].max(axis=1)
+        other_parts = _part_names(model, len(positions), np.array(samples)[is_other], bodies)
+    return foot_position, touched[:, :foot_count], other_parts
+
+
+def _part_names(model: Any, count: int, samples: Indices, bodies: Indices) -> Names:
+    """Name the bodies that touch the ground in each of `count` samples.
+
+    Args:
+        model: The mujoco.MjModel.
+        count: Number of samples.
+        samples: Sample of each contact, (n,).
+        bodies: Body of each contact, (n,).
+    """
+    bodies_of_sample: dict[int, set[int]] = {}
+    for sample, body in zip(samples.tolist(), bodies.tolist(), strict=True):
+        bodies_of_sample.setdefault(sample, set()).add(body)
+    text_of_bodies: dict[frozenset[int], str] = {}  # Few combinations occur.
+    texts = [""] * count
+    for sample, sample_bodies in bodies_of_sample.items():
+        key = frozenset(sample_bodies)
+        if key not in text_of_bodies:
+            names = [model.body(body).name or f"body {body}" for body in sorted(key)]
+            text_of_bodies[key] = TOGETHER.join(names)
+        texts[sample] = text_of_bodies[key]
+    return np.array(texts)

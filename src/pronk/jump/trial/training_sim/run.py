@@ -199,7 +199,7 @@ class EvaluationRun:
     def captures(self, index: int) -> Iterator[Capture]:
         """Yield the motion of the robots of one command, numbered through walks and jumps.
 
-        What was not recorded, feet, joints and power, is NaN.
+        What was not recorded, feet, joints and power, is NaN; which parts touch is not known.
         """
         plan = self._plan
         robots = slice(index * plan.robots, (index + 1) * plan.robots)
@@ -220,6 +220,7 @@ class EvaluationRun:
                 foot_position=np.broadcast_to(np.nan, (count, 4, 3)),
                 contact=feet[:, i],
                 other_contact=other[:, i],
+                other_parts=np.full(count, ""),
                 joint_position=joints,
                 joint_velocity=joints,
                 torque=joints,
@@ -336,7 +337,11 @@ def _jump(capture: Capture, case: Case, plan: EvaluationPlan, *, on: float) -> d
     rules = plan.jump_rules
     script = replace(plan.script, command=case.command, run_s=on - plan.script.start)
     jump = measure_jump(capture, script, plan.robot, began=0.0, rules=rules)
-    figures: dict[str, Any] = {name: getattr(jump, name) for name in flags_of(JumpFigures)}
+    figures: dict[str, Any] = {}
+    for name in flags_of(JumpFigures):
+        flag = getattr(jump, name)
+        if isinstance(flag, bool):  # A text has no mean.
+            figures[name] = flag
     for name, figure in FIGURES.items():
         if not figure.joints:
             figures[name] = figure.value(jump)
