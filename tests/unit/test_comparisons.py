@@ -157,12 +157,18 @@ def test_one_arm_as_a_word_and_as_a_list_are_the_same_comparison() -> None:
 
 
 @pytest.mark.parametrize("outcome", ["landed", "velocity_error"])
+@pytest.mark.parametrize("beginning", ["", "a match, "])
 @pytest.mark.parametrize("commands", [(), ("forward 2",)])
 def test_a_comparison_named_after_its_outcome_says_it_once(
-    outcome: str, commands: tuple[str, ...]
+    outcome: str, beginning: str, commands: tuple[str, ...]
 ) -> None:
     comparison = ComparedArms(
-        name=outcome, outcome=outcome, arm="b", against="a", robots=("weak",), commands=commands
+        name=f"{beginning}{outcome}",
+        outcome=outcome,
+        arm="b",
+        against="a",
+        robots=("weak",),
+        commands=commands,
     )
     words = outcome.replace("_", " ")
     sentence = comparison_sentence(comparison).replace("_", " ")

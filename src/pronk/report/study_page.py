@@ -30,10 +30,13 @@ def comparison_sentence(comparison: ComparedArms) -> str:
     text = estimate_text(
         comparison.value, comparison.low, comparison.high, comparison.outcome, signed=True
     )
-    title = f"{comparison.name} ({comparison.outcome_words})"
-    if comparison.name.replace("_", " ") == comparison.outcome.replace("_", " "):
-        # A comparison that is named after its outcome.
-        title = comparison.outcome_words
+    name = comparison.name.replace("_", " ")
+    if comparison.outcome.replace("_", " ") not in name:
+        title = f"{name} ({comparison.outcome_words})"
+    elif comparison.commands:
+        title = f"{name} ({', '.join(comparison.commands)})"
+    else:
+        title = name
     return (
         f"{title}: {comparison.arm} less {comparison.against}, on "
         f"{', '.join(comparison.robots)}: {text} {definition.unit}, {comparison.verdict}."
