@@ -150,8 +150,8 @@ def test_the_estimator_learns_a_known_function() -> None:
     torch.manual_seed(0)
     mixing = torch.randn(102, 7) / math.sqrt(102) / 3.0
 
-    def observe_known_function() -> Any:
-        obs = observe()
+    def observe_known_function(rows: int = ROBOTS) -> Any:
+        obs = observe(rows)
         target = (obs["measured"][:, list(ESTIMATOR_INDICES)] - 1.0) @ mixing
         target[:, :4] = (target[:, :4] > 0.0).float()
         obs["estimator_target"] = target
