@@ -33,14 +33,14 @@ test-slow: $(VENV)/.dev
 # All else runs beside them, but only while a core is idle: SCHED_IDLE, in the same session, for
 # which anything else that wants to run takes the core at once. Types and the site are checked
 # there too, so that live tests, which take longest, begin as soon as all is installed.
-ci: $(VENV)/.dev $(VENV)/.docs
+ci: $(VENV)/.dev
 	$(MAKE) -j 4 --output-sync=target ci-live ci-idle
 
 ci-live: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
 # Its jobs are some of the four of `ci`.
-ci-idle: $(VENV)/.dev $(VENV)/.docs
+ci-idle: $(VENV)/.dev
 	$(WHEN_IDLE) $(MAKE) check docs ci-others
 
 ci-others: $(VENV)/.dev
@@ -62,12 +62,14 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --no-compile -c constraints.txt -e .[policy,video]
 	touch $@
 
-# Everything the tests need. PyTorch by itself first, so that its pinned build is taken.
+# Everything the tests and the site need, in one go, so that dependencies are resolved once. PyTorch
+# is named so that its pinned build is taken.
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install --no-compile torch==2.13.0
-	$(PIP) install --no-compile -c constraints.txt -e .[train,bench,hardware,video,play,engines,cluster,dev]
-	touch $@ $(VENV)/.core
+	$(PIP) install --no-compile -c constraints.txt torch==2.13.0 \
+		-e .[train,bench,hardware,video,play,engines,cluster,dev,docs]
+	touch $@ $(VENV)/.core $(VENV)/.docs
 
+# The site alone.
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --no-compile -c constraints.txt -e .[docs]
 	touch $@
