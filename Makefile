@@ -10,7 +10,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
 DEAL := --dist loadscope --no-loadscope-reorder
 WHEN_IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 
-.PHONY: demo test test-slow check docs lint ci ci-live ci-others clean
+.PHONY: demo test test-slow check docs lint ci ci-live ci-idle ci-others clean
 
 demo: $(VENV)/.core
 	$(BIN)/pronk demo --out out/demo
@@ -30,16 +30,21 @@ test-slow: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
 # All of the above and the site. Live tests run one after another, since two at once missed states.
-# All others run beside them, but only while a core is idle: SCHED_IDLE, in the same session, for
-# which anything else that wants to run takes the core at once.
-ci: $(VENV)/.dev $(VENV)/.docs
-	$(MAKE) -j 3 --output-sync=target ci-live ci-others
+# All else runs beside them, but only while a core is idle: SCHED_IDLE, in the same session, for
+# which anything else that wants to run takes the core at once. Types and the site are checked
+# there too, so that live tests, which take longest, begin as soon as all is installed.
+ci: $(VENV)/.dev
+	$(MAKE) -j 4 --output-sync=target ci-live ci-idle
 
-ci-live: check docs
+ci-live: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
 
+# Its jobs are some of the four of `ci`.
+ci-idle: $(VENV)/.dev
+	$(WHEN_IDLE) $(MAKE) check docs ci-others
+
 ci-others: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(WHEN_IDLE) $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 $(DEAL) -m "not live" --durations=40
 
 # The documentation site, in build/docs.
 docs: $(VENV)/.docs
@@ -57,12 +62,14 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --no-compile -c constraints.txt -e .[policy,video]
 	touch $@
 
-# Everything the tests need. PyTorch by itself first, so that its pinned build is taken.
+# Everything the tests and the site need, in one go, so that dependencies are resolved once. PyTorch
+# is named so that its pinned build is taken.
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install --no-compile torch==2.13.0
-	$(PIP) install --no-compile -c constraints.txt -e .[train,bench,hardware,video,play,engines,cluster,dev]
-	touch $@ $(VENV)/.core
+	$(PIP) install --no-compile -c constraints.txt torch==2.13.0 \
+		-e .[train,bench,hardware,video,play,engines,cluster,dev,docs]
+	touch $@ $(VENV)/.core $(VENV)/.docs
 
+# The site alone.
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --no-compile -c constraints.txt -e .[docs]
 	touch $@

@@ -40,9 +40,12 @@ def observe(rows: int = ROBOTS, *, jump: bool = True) -> TensorDict:
 
 def build(
     *,
+    robots: int = ROBOTS,
+    steps: int = STEPS,
     hidden: tuple[int, ...] = (32, 16),
     read: tuple[str, ...] = ("measured", "jump"),
     observation: TensorDict | None = None,
+    environment: Any = None,
     multi_gpu: dict[str, int] | None = None,
     estimator: dict[str, Any] | None = None,
     compile_mode: str | None = None,
@@ -63,12 +66,12 @@ def build(
         "critic": critic,
         "algorithm": ppo,
         "obs_groups": {"actor": list(read), "critic": ["critic", "critic_jump"]},
-        "num_steps_per_env": STEPS,
+        "num_steps_per_env": steps,
         "multi_gpu": multi_gpu,
         "torch_compile_mode": compile_mode,
     }
-    env: Any = SimpleNamespace(num_envs=ROBOTS, num_actions=12)
-    start = observe() if observation is None else observation
+    env: Any = SimpleNamespace(num_envs=robots, num_actions=12, unwrapped=environment)
+    start = observe(robots) if observation is None else observation
     built = EstimatorPPO.construct_algorithm(start, env, cfg, "cpu")
     built.train_mode()
     return built
@@ -76,13 +79,14 @@ def build(
 
 def roll_out(algorithm: EstimatorPPO, observe: Any = observe) -> None:
     """Fill the storage, as the runner does."""
+    robots = algorithm.storage.num_envs
     with torch.inference_mode():
-        observation = observe()
-        for _ in range(STEPS):
+        observation = observe(robots)
+        for _ in range(algorithm.storage.num_transitions_per_env):
             algorithm.act(observation)
-            observation = observe()
-            dones = torch.rand(ROBOTS) < 0.1
-            algorithm.process_env_step(observation, torch.randn(ROBOTS), dones, {})
+            observation = observe(robots)
+            dones = torch.rand(robots) < 0.1
+            algorithm.process_env_step(observation, torch.randn(robots), dones, {})
         algorithm.compute_returns(observation)
 
 
@@ -96,7 +100,7 @@ def trained(updates: int = 2, *, jump: bool = True, **cfg: Any) -> EstimatorPPO:
     """Return an algorithm after some updates on observations with or without jump input."""
     algorithm = build(**cfg)
     for _ in range(updates):
-        learn(algorithm, lambda: observe(jump=jump))
+        learn(algorithm, lambda rows: observe(rows, jump=jump))
     return algorithm
 
 

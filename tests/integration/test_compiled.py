@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.registry import load_rl_cfg
 
 import ppo_case
 import training_env
 from pronk.cli import main as cli
+from pronk.jump.train.gains import training_gains
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum
@@ -26,6 +29,8 @@ ROUNDING = 1e-5
 """Largest difference of results that should be alike but for rounding, of the order of 1."""
 STEPS = 6
 """Policy steps in each phase."""
+ROBOTS = 8
+"""Robots of all tests: what is compiled for one of them need not be compiled for the next."""
 
 
 @pytest.fixture(autouse=True)
@@ -38,8 +43,9 @@ def one_thread() -> Iterator[None]:
 
 
 def rewards_of_all_phases(*, compiles: bool) -> list[Any]:
-    """Step eight robots through all phases with jumps; returns the rewards of each step."""
-    env = ManagerBasedRlEnv(training_env.config(8, training_env.MATCHED), device="cpu")
+    """Step robots through all phases with jumps; returns the rewards of each step."""
+    gains = training_gains("naive", training_env.ROBOT)
+    env = ManagerBasedRlEnv(training_env.config(ROBOTS, gains), device="cpu")
     StackedRewardManager.install(env)
     command = motion_command(env)
     if compiles:
@@ -54,7 +60,7 @@ def rewards_of_all_phases(*, compiles: bool) -> list[Any]:
         with torch.inference_mode(), torch._dynamo.config.patch(error_on_recompile=is_strict):
             for step in range(STEPS):
                 curriculum(env).apply(env, phase, step / STEPS)
-                actions = torch.randn(8, 12, generator=generator)
+                actions = torch.randn(ROBOTS, 12, generator=generator)
                 _, reward, *_ = env.step(0.3 * actions)
                 rewards.append(reward.clone())
                 command.jump[:] = phase.jump and step > 0
@@ -73,7 +79,7 @@ def test_compiled_rewards_are_the_same_in_every_phase() -> None:
 
 def test_a_compiled_run_is_exported_and_says_so(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
-    arguments = ["walk", "--gains", "naive", "--phase", "walk=2", "--envs", "8"]
+    arguments = ["walk", "--gains", "naive", "--phase", "walk=1", "--envs", str(ROBOTS)]
     arguments += ["--device", "cpu", "--compile", "--out", str(folder.path)]
     assert cli.run(["train", *arguments]) == 0
     record = folder.read()
@@ -83,10 +89,20 @@ def test_a_compiled_run_is_exported_and_says_so(tmp_path: Path) -> None:
 
 
 def updated(compile_mode: str | None) -> tuple[Any, dict[str, float]]:
-    """Learn from one rollout of random observations, with a rate that follows the divergence."""
+    """Learn from one rollout of random observations, with a rate that follows the divergence.
+
+    Sizes and settings are those of the run above, for which all of it is compiled already.
+    """
+    environment = training_env.nominal()
     torch.manual_seed(2)
+    learning = asdict(load_rl_cfg("Pronk-Walk-MiniCheetah"))
     algorithm = ppo_case.build(
-        compile_mode=compile_mode, use_clipped_value_loss=False, desired_kl=0.01
+        compile_mode=compile_mode,
+        robots=ROBOTS,
+        steps=learning["num_steps_per_env"],
+        environment=environment,
+        hidden=learning["actor"]["hidden_dims"],
+        **learning["algorithm"],
     )
     ppo_case.roll_out(algorithm)
     return algorithm, algorithm.update()

@@ -104,7 +104,7 @@ class Workspace:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.finished: dict[tuple[Path, tuple[str, ...]], FinishedCommand] = {}
+        self.finished: dict[tuple[Path | str, ...], FinishedCommand] = {}
 
     def folder_of(self, command: DocumentedCommand) -> Path:
         """Return where a command is run."""
@@ -119,7 +119,7 @@ class Workspace:
         """Run a command and all that it names as next; fail where one does not run."""
         line = " ".join(words)
         bounded_words = bounded(words, folder)
-        key = (folder, tuple(bounded_words))
+        key = (folder, *arguments_in_order(bounded_words))
         if key in self.finished:
             return
         if any(word in line.split() or word in line for word in PARSED):
@@ -172,14 +172,31 @@ def replaced(words: Sequence[str], folder: Path) -> list[str]:
     return [placeholders.get(word, word) for word in words]
 
 
+def arguments_in_order(words: Sequence[str]) -> list[str]:
+    """Return the words of a command with its options sorted, each with what follows it."""
+    before = []
+    options: list[str] = []
+    for word in words:
+        if word.startswith("--"):
+            options.append(word)
+        elif options:
+            options[-1] = f"{options[-1]} {word}"
+        else:
+            before.append(word)
+    return before + sorted(options)
+
+
 def bounded(words: Sequence[str], folder: Path) -> list[str]:
     """Make a command short, and let it replace what it made before."""
     bounded_words = list(words)
     name = words[1]
     if name == "trial":
-        for option, value in (("--jumps", "1"), ("--commands", "1,0")):
-            if option not in words:
-                bounded_words += [option, value]
+        if "--jumps" in words:
+            bounded_words[words.index("--jumps") + 1] = "1"
+        else:
+            bounded_words += ["--jumps", "1"]
+        if not any(word.startswith("--commands") for word in words):
+            bounded_words += ["--commands", "1,0"]
         bounded_words += ["--no-video", "--overwrite"]
     elif name == "sweep":
         if "--joints" not in words:
@@ -194,9 +211,14 @@ def bounded(words: Sequence[str], folder: Path) -> list[str]:
         bounded_words.append("--overwrite")
     elif name == "match" and "paper" in words:
         bounded_words.append("--no-zero-armature")
-        knee = folder / words[2] / "FR_knee.mcap"
-        if knee.exists():
-            bounded_words[2] = str(knee.relative_to(folder))
+        if "--out" not in words:
+            bounded_words += ["--out", "out/paper/gains.yaml"]
+        # The chirps of the quick demo are half as long as the usual ones.
+        for logs in ("out/demo/logs", words[2]):
+            knee = folder / logs / "FR_knee.mcap"
+            if knee.exists():
+                bounded_words[2] = str(knee.relative_to(folder))
+                break
     elif name == "demo" and "--quick" not in words:
         bounded_words.append("--quick")
     return bounded_words

@@ -38,11 +38,11 @@ def drawn(seed: int, faults: tuple[str, ...]) -> list[Mechanism]:
 
 
 HONEST = drawn(3, ("",) * 12)
-WRONG_LIMIT = drawn(5, ("saturation, limit wrong",) * 3)
+WRONG_LIMIT = drawn(5, ("saturation, limit wrong",) * 2)
 STATED = drawn(29, ("", "", "", "saturation, limit known"))
 (AT_REST,) = drawn(31, ("",))
-BY_MOTOR = [with_fault(joint, "compliance, motor encoder", 0.6) for joint in drawn(8, ("",) * 3)]
-BY_LINK = [with_fault(joint, "compliance, link encoder", 0.6) for joint in drawn(8, ("",) * 3)]
+BY_MOTOR = [with_fault(joint, "compliance, motor encoder", 0.6) for joint in drawn(8, ("",) * 2)]
+BY_LINK = [with_fault(joint, "compliance, link encoder", 0.6) for joint in drawn(8, ("",) * 2)]
 OTHER_FAULTS = drawn(11, FAULTS[4:])
 """Neither a torque limit nor a compliance."""
 (EXPLAINED,) = drawn(17, ("",))

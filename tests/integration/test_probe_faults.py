@@ -233,8 +233,7 @@ def test_without_damping_no_law_is_claimed_that_moves_alike(law: str, robot: Rob
         "no number",
         "raises",
         "other shape",
-        # The fits take all the time that they have.
-        pytest.param("noise", marks=pytest.mark.slow),
+        # The fit takes all the time that it has.
         pytest.param("random walk", marks=pytest.mark.slow),
     ],
 )
@@ -251,14 +250,12 @@ def test_no_simulator_breaks_the_probe(defect: str, robot: RobotSpec) -> None:
                 return np.zeros(command.shape)
             if defect == "no number":
                 return np.full(command.shape, np.nan)
-            if defect == "noise":
-                return 0.05 * generator.standard_normal(command.shape)
             if defect == "random walk":
                 return 0.02 * np.cumsum(generator.standard_normal(command.shape), axis=1)
             return np.zeros(command.shape[:2])
 
     simulator = Defective(robot, Truth())
-    if defect in ("noise", "random walk"):
+    if defect == "random walk":
         try:
             probe = probe_joint(simulator, robot)
         except PronkError:

@@ -160,7 +160,6 @@ def test_a_policy_that_fails_is_named_and_the_rest_is_there(study: Path, tmp_pat
 DAMAGES = {
     "whole": [],
     "no folder of cells": ["cells"],
-    "empty folder of cells": ["cells/*.json"],
     "robots alone": ["cells", "conditions.*"],
     "no table": ["conditions.csv"],
     "no summary": ["conditions.json"],
@@ -171,7 +170,7 @@ CUT = "a cell that is cut"
 """Robot whose file of jumps ends half way."""
 HEAVY = ('mass="6.607999999999999"', 'mass="7.608"')
 """Mass of the Mini Cheetah's trunk in its model, and that of a heavier one [kg]."""
-WITHOUT_JUMPS = {"no folder of cells", "empty folder of cells", "robots alone", CUT}
+WITHOUT_JUMPS = {"no folder of cells", "robots alone", CUT}
 
 
 @pytest.fixture(scope="module")

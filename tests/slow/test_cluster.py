@@ -37,23 +37,24 @@ SETTINGS = TrainSettings(
 )
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Two nodes of one core each, the first of them the head."""
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two nodes of one core each, the first of them the head; the last test kills the other one."""
     source = str(Path(pronk.__file__).resolve().parents[1])
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "0")
-    monkeypatch.setenv("RAY_DISABLE_IMPORT_WARNING", "1")
-    nodes = Cluster(
-        initialize_head=True,
-        head_node_args={"num_cpus": 1, "include_dashboard": False},
-    )
-    nodes.second = nodes.add_node(num_cpus=1)
-    try:
-        yield nodes
-    finally:
-        ray.shutdown()
-        nodes.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
+        patch.setenv("RAY_memory_monitor_refresh_ms", "0")
+        patch.setenv("RAY_DISABLE_IMPORT_WARNING", "1")
+        nodes = Cluster(
+            initialize_head=True,
+            head_node_args={"num_cpus": 1, "include_dashboard": False},
+        )
+        nodes.second = nodes.add_node(num_cpus=1)
+        try:
+            yield nodes
+        finally:
+            ray.shutdown()
+            nodes.shutdown()
 
 
 class NodeKiller:
@@ -73,6 +74,20 @@ class NodeKiller:
             return
         self.checkpoints = sorted(folders)
         self.cluster.remove_node(self.cluster.second, allow_graceful=False)
+
+
+def test_failures_on_nodes_are_named_with_their_log(cluster: Any, tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    tasks = [export_task("bad", "inputs/bad.yaml"), export_task("good")]
+    with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
+        statuses = finished(tasks, executor, root)
+    assert {name: status.state for name, status in statuses.items()} == {
+        "bad": "failed",
+        "good": "done",
+    }
+    assert "bad.yaml" in statuses["bad"].reason
+    assert (root / tasks[0].log()).exists()
+    assert (root / tasks[1].outputs[0]).exists()
 
 
 def test_a_study_survives_the_loss_of_a_node(cluster: Any, tmp_path: Path) -> None:
@@ -108,17 +123,3 @@ def test_a_study_survives_the_loss_of_a_node(cluster: Any, tmp_path: Path) -> No
     local_tasks = study_tasks(local_plan, local_root, TrainingPlace(device="cpu"))
     finished(local_tasks, LocalExecutor(local_root, cores=2.0), local_root)
     assert cell_files(local_root) == cell_files(root)
-
-
-def test_failures_on_nodes_are_named_with_their_log(cluster: Any, tmp_path: Path) -> None:
-    root = study_root(tmp_path)
-    tasks = [export_task("bad", "inputs/bad.yaml"), export_task("good")]
-    with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
-        statuses = finished(tasks, executor, root)
-    assert {name: status.state for name, status in statuses.items()} == {
-        "bad": "failed",
-        "good": "done",
-    }
-    assert "bad.yaml" in statuses["bad"].reason
-    assert (root / tasks[0].log()).exists()
-    assert (root / tasks[1].outputs[0]).exists()

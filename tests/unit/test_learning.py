@@ -150,8 +150,8 @@ def test_the_estimator_learns_a_known_function() -> None:
     torch.manual_seed(0)
     mixing = torch.randn(102, 7) / math.sqrt(102) / 3.0
 
-    def observe_known_function() -> Any:
-        obs = observe()
+    def observe_known_function(rows: int = ROBOTS) -> Any:
+        obs = observe(rows)
         target = (obs["measured"][:, list(ESTIMATOR_INDICES)] - 1.0) @ mixing
         target[:, :4] = (target[:, :4] > 0.0).float()
         obs["estimator_target"] = target
@@ -246,7 +246,7 @@ def jump_weights(algorithm: EstimatorPPO) -> list[Any]:
 
 def test_fed_zeros_the_jump_input_stays_blank() -> None:
     """After updates on zeros its weights are zero, and the function is that without it."""
-    algorithm = trained(3, jump=False, hidden=PAPER)
+    algorithm = trained(2, jump=False, hidden=PAPER, num_learning_epochs=1)
     assert len(jump_weights(algorithm)) == 3
     for value in jump_weights(algorithm):
         assert not value.any()
