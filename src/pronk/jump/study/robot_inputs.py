@@ -15,7 +15,6 @@ from pathlib import Path
 from pronk.errors import RobotError
 from pronk.jump.study.tasks import INPUTS, store_file
 from pronk.robots import ROBOT_NAMES
-from pronk.robots.robot_files import robot_files
 
 TASK_FILES = ("env_cfgs.py", "rl_cfg.py")
 """Files beside a robot.yaml that make its training task; docs/train-your-robot.md."""
@@ -44,6 +43,9 @@ def robot_input(root: Path, robot: str, *, is_trained: bool = False) -> RobotInp
     """
     if robot in ROBOT_NAMES:
         return RobotInput(name=robot)
+    # Not at the top: it imports MuJoCo, which the help of a command does not need.
+    from pronk.robots.robot_files import robot_files
+
     files = list(robot_files(robot))
     first = files[0]
     if is_trained:
