@@ -205,6 +205,12 @@ def settings_of(cfg: Any) -> str:
     return repr((list(cfg.rewards), cfg.commands, cfg.actions, phases))
 
 
+MOST_TERMS = 20
+"""Number of reward terms that a shipped recipe may have in a phase."""
+MORE_TERMS = {"long": 21}
+"""The same of a layer for the Go2 that pays for the gap beside the distance."""
+
+
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_the_shipped_recipes_apply(path: Path) -> None:
     """Each changes the task of a robot, over forward.yaml, and says in its comments what for."""
@@ -218,7 +224,8 @@ def test_the_shipped_recipes_apply(path: Path) -> None:
         for phase in phases_of(cfg).values():
             weights = {name: (term.weight,) for name, term in cfg.rewards.items()}
             weights |= {name: span for name, span in phase.weights.items() if name in weights}
-            assert sum(1 for span in weights.values() if any(span)) <= 20
+            terms = sum(1 for span in weights.values() if any(span))
+            assert terms <= MORE_TERMS.get(path.stem, MOST_TERMS)
     assert changed_robots
     assert path.read_text().startswith("# ")
 
