@@ -13,12 +13,12 @@ from pronk.errors import ArtefactError, HardwareError
 from pronk.jump.trial.jumps import fallen_at
 from pronk.jump.virtual.capture import Capture
 from pronk.jump.virtual.ground import Start
-from pronk.jump.virtual.plant import legs_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams
 from pronk.policy.deploy_yaml import COMMAND_TERMS, DeployFile, Term
 from pronk.policy.foreign import ForeignPolicy, poses_out_of_range, run_foreign
 from pronk.policy.script import Velocity
+from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 
 STAND_S = 1.0
@@ -155,9 +155,7 @@ def _lost_run(fell_s: float) -> ForeignRun:
 
 def _foot_depth(capture: Capture, robot: RobotSpec, floor: float) -> float:
     """Return how deep a foot was pressed into the floor at most, 0 without contact [m]."""
-    model = robot.build_spec().compile()
-    radii = [float(model.geom(f"{leg}_foot_collision").size[0]) for leg in legs_of(robot)]
-    depth = floor + np.array(radii) - capture.foot_position[:, :, 2]
+    depth = floor + legged(robot.source).foot_radius - capture.foot_position[:, :, 2]
     return float(depth.max(initial=0.0))
 
 
