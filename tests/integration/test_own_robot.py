@@ -65,7 +65,6 @@ def test_sweep_match_predict_export(model: str, joint: str, tmp_path: Path) -> N
     accepted("robot", "new", model_of(model, tmp_path))
     accepted("robot", "check", robot)
     accepted("sweep", robot, "--out", logs, *sweep)
-    # The virtual knee sticks at this amplitude, which a magnitude alone cannot tell from its gains.
     # A magnitude alone cannot tell from its gains that the knee sticks at this amplitude, and takes
     # half a minute for the arm.
     method = ("paper", "--no-zero-armature") if model == "pendulum" else ("time",)
