@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -92,12 +92,7 @@ def run_case(work: tuple[FootCase, int], *, policy: Path, speed: float, seconds:
         seconds=seconds,
         seed=seed,
     )
-    return {
-        "stiffness": case.stiffness,
-        "damping": case.damping,
-        "torque_scale": case.torque_scale,
-        "command_delay_s": case.command_delay_s,
-        "measurement_delay_s": case.measurement_delay_s,
+    return asdict(case) | {
         "seed": seed,
         "fell_s": run.fell_s,
         "speed": run.velocity[0],
@@ -216,13 +211,8 @@ def falls_table(cases: Sequence[FootCase], rows: Sequence[Row], title: str) -> T
 
 def _case_of(row: Row) -> FootCase:
     """Return what was changed in a run."""
-    return FootCase(
-        stiffness=row["stiffness"],
-        damping=row["damping"],
-        torque_scale=row["torque_scale"],
-        command_delay_s=row["command_delay_s"],
-        measurement_delay_s=row["measurement_delay_s"],
-    )
+    changes = {entry.name: row[entry.name] for entry in fields(FootCase)}
+    return FootCase(**changes)
 
 
 def go2_feet(

@@ -106,7 +106,7 @@ def test_its_trials_are_those_of_a_trial_by_itself(study: Path, tmp_path: Path) 
     (path,) = (tmp_path / "cells").glob("*.json")
     stored = cell_files(study / "out")
     assert path.read_bytes() in stored.values()
-    (run,) = read_trial(study / "out" / "trials" / "matched" / "seed-1" / "shipped")
+    (run,) = read_trial(study / "out" / "trials" / "matched" / "seed-1" / "shipped").rows
     assert OUTCOMES["height"].value(run) > 0.2
 
 

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.opengl import keep_opengl_out
+from pronk.signals import interrupt
 from pronk.version import VERSION
 
 if TYPE_CHECKING:
@@ -308,7 +309,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _print_plain_characters()
     with contextlib.suppress(ValueError):  # Signals are for the main thread alone.
-        signal.signal(signal.SIGTERM, _interrupt)
+        signal.signal(signal.SIGTERM, interrupt)
     if sys.stdout is None:
         if sys.stderr is not None:
             sys.stderr.write("pronk: standard output is closed; give it a place, as in >out.txt.\n")
@@ -332,11 +333,6 @@ def _plain_characters(error: UnicodeError) -> tuple[str, int]:
         raise error
     text = error.object[error.start : error.end]
     return "".join(PLAIN_CHARACTERS.get(character, "?") for character in text), error.end
-
-
-def _interrupt(number: int, _frame: object) -> None:
-    """End as Ctrl-C does, so that temporary files are removed; the error has the signal's name."""
-    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def _abandon_broken_output() -> None:

@@ -61,9 +61,9 @@ def legged(name: str | Path) -> Legged:
     if not len(feet):
         raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
     shanks = {}
-    for name in robot.legs:
-        last_joint = [joint for joint in robot.joint_names if joint.startswith(f"{name}_")][-1]
-        shanks[name] = model.body(model.joint(last_joint).bodyid[0]).name
+    for prefix in robot.legs:
+        last_joint = [joint for joint in robot.joint_names if joint.startswith(f"{prefix}_")][-1]
+        shanks[prefix] = model.body(model.joint(last_joint).bodyid[0]).name
     base = model.body(robot.base_body)
     default_position = {}
     for joint in joints:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,8 @@ from pronk.jump.trial.condition_trial import (
     CELLS,
     SUMMARY,
     TABLE,
+    StoredCell,
     load_cell,
-    load_cell_versions,
     save_sim_params,
 )
 from pronk.jump.trial.condition_trial import SCHEMA as CONDITION_TRIAL_SCHEMA
@@ -582,7 +582,7 @@ def collect_results(
     Returns:
         The results, which are in `study.json` and `study.csv`, with every jump in `runs.csv`.
     """
-    jumps, missing = _read_jumps(plan, root, statuses)
+    jumps, versions, missing = _read_jumps(plan, root, statuses)
     cells = []
     for arm in plan.arms:
         for robot in plan.robots:
@@ -617,7 +617,7 @@ def collect_results(
         robot_jumps={robot.name: robot.jumps for robot in plan.robots},
         missing=tuple(missing),
         failed=tuple(failed),
-        versions=_versions_of_trials(plan, root, missing),
+        versions=_joined_versions(versions),
     )
     write_text(root / RUNS_FILE, runs_csv(plan, jumps))
     save_study(root / STUDY_FILE, results)
@@ -626,9 +626,10 @@ def collect_results(
 
 def _read_jumps(
     plan: StudyPlan, root: Path, statuses: Mapping[str, TaskStatus]
-) -> tuple[Jumps, list[str]]:
-    """Return the jumps of all trials that are done, and the names of the others."""
+) -> tuple[Jumps, list[dict[str, str]], list[str]]:
+    """Return the jumps of all trials that are done, their versions, and names of the others."""
     jumps: Jumps = {}
+    versions = []
     missing = []
     for arm in plan.arms:
         for robot in plan.robots:
@@ -640,43 +641,37 @@ def _read_jumps(
                 if name not in statuses or statuses[name].state not in ("done", "kept"):
                     missing.append(name)
                     continue
-                by_seed[seed] = read_trial(root / trial_folder(arm, seed, robot))
+                trial = read_trial(root / trial_folder(arm, seed, robot))
+                by_seed[seed] = trial.rows
+                versions.append(trial.versions)
             jumps[arm.name, robot.name] = by_seed
-    return jumps, missing
+    return jumps, versions, missing
 
 
-def read_trial(folder: Path) -> list[TrialRun]:
-    """Return the jumps of the trial in a folder of a study."""
-    with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, STUDY_WRITER) as body:
-        (cell,) = body["cells"]
-        key = cell["key"]
-    return load_cell(folder / CELLS / f"{key}.json", key)
-
-
-def trial_versions(folder: Path) -> dict[str, str]:
-    """Return the versions of software that the trial in a folder of a study was computed with."""
+def read_trial(folder: Path) -> StoredCell:
+    """Return the jumps of the trial in a folder of a study, and the versions of its software."""
     with load_json(folder / SUMMARY, CONDITION_TRIAL_SCHEMA, STUDY_WRITER) as body:
         (cell,) = body["cells"]
         versions: dict[str, str] = body["versions"]
         key = cell["key"]
-    return load_cell_versions(folder / CELLS / f"{key}.json") or versions
+    stored = load_cell(folder / CELLS / f"{key}.json", key)
+    # A cell of an earlier pronk has its versions in the summary.
+    return replace(stored, versions=stored.versions or versions)
 
 
-def _versions_of_trials(plan: StudyPlan, root: Path, missing: Collection[str]) -> dict[str, str]:
-    """Return the versions of software that the trials were computed with, several as one text.
+def _joined_versions(stored_versions: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """Return the versions of software of all trials, several of one as one text.
 
-    Trials that are kept may be of other versions than those of this process.
+    Trials that are kept may be of other versions than those of this process, which are returned
+    where there is no trial.
+
+    Args:
+        stored_versions: Versions of each trial.
     """
-    versions: dict[str, dict[str, None]] = {}
-    for arm in plan.arms:
-        for robot in plan.robots:
-            if arm.name not in robot.arms:
-                continue
-            for seed in plan.seeds(arm):
-                if trial_name(arm.name, seed, robot.name) not in missing:
-                    stored = trial_versions(root / trial_folder(arm, seed, robot))
-                    for name, version in stored.items():
-                        versions.setdefault(name, {})[version] = None
+    versions: dict[str, set[str]] = {}
+    for stored in stored_versions:
+        for name, version in stored.items():
+            versions.setdefault(name, set()).add(version)
     if not versions:
         return software_versions()
     return {name: SEVERAL_VERSIONS.join(sorted(several)) for name, several in versions.items()}

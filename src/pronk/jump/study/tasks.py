@@ -215,7 +215,7 @@ class StudyState:
                             "well, or move it away to train again."
                         )
                 continue
-            # Without the marker the folder would be made anew, and a policy in it be lost.
+            # Without the marker the training would begin again, and the policy there be lost.
             is_begun = any(
                 (self.root / path).is_file() for path in (task.resume_marker, *task.outputs)
             )

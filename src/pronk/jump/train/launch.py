@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 import torch
 from mjlab.envs import ManagerBasedRlEnv
@@ -35,6 +34,7 @@ from pronk.jump.train.hosts import COPIED_VARIABLES
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import PronkRunner
+from pronk.signals import interrupt
 
 LOCAL_HOST = "localhost"
 """Name of this machine for torchrunx, which needs no SSH for it."""
@@ -77,13 +77,12 @@ def launch(
         agent_timeout=AGENT_S,
         copy_env_vars=COPIED_VARIABLES,
     ).set_logging_handlers(partial(_log_handlers, tuple(hosts), processes, log_dir))
-    is_interrupted = False
-    signals: list[str] = []
+    signal_name = ""
     try:
-        with _terminated_as_interrupted(signals):
+        with _terminated_as_interrupted():
             launcher.run(train_packed, cloudpickle.dumps((config, log_dir)))
-    except KeyboardInterrupt:
-        is_interrupted = True
+    except KeyboardInterrupt as error:
+        signal_name = str(error) or signal.SIGINT.name
     except (AgentFailedError, WorkerFailedError, torch.distributed.DistError) as error:
         reason = str(error) or type(error).__name__
         raise PronkError(
@@ -91,12 +90,12 @@ def launch(
             f"{log_dir / LOG_FOLDER} has what each printed. --resume goes on from the last "
             "checkpoint."
         ) from error
-    if is_interrupted:
+    if signal_name:
         # The agents wait for this process, deaf to the signal that torchrunx has sent them, as long
         # as its connections are open; the frames of the interrupt held them.
         gc.collect()
         _wait_for_checkpoint(log_dir, first_checkpoint)
-        raise KeyboardInterrupt(signals[0] if signals else "SIGINT")
+        raise KeyboardInterrupt(signal_name)
 
 
 def train_process(config: mjlab_train.TrainConfig, log_dir: Path) -> None:
@@ -156,20 +155,11 @@ def _log_handlers(hosts: tuple[str, ...], processes: int, log_dir: Path) -> list
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted(signals: list[str]) -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt in the block, so that torchrunx ends its agents.
-
-    Args:
-        signals: Gets the name of the signal.
-    """
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt in the block, so that torchrunx ends its agents."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-
-    def interrupt(number: int, _: FrameType | None) -> None:
-        signals.append(signal.Signals(number).name)
-        raise KeyboardInterrupt
-
     handler = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield

@@ -145,6 +145,16 @@ class ConditionResults:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StoredCell:
+    """A cell as its file has it."""
+
+    rows: list[TrialRun]
+    """Its jumps."""
+    versions: dict[str, str]
+    """Versions of software that it was computed with; empty in a cell of an earlier pronk."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _PlannedCell:
     """A cell before its jumps."""
 
@@ -212,8 +222,8 @@ def run_conditions(
     summed_cells = []
     for cell in cells:
         key = kept.keys.get(cell.key, cell.key)
-        rows = load_cell(_cell_path(setup.out, key), key)
-        summed_cells.append(_sum_up(replace(cell, key=key), rows))
+        stored = load_cell(_cell_path(setup.out, key), key)
+        summed_cells.append(_sum_up(replace(cell, key=key), stored.rows))
     results = ConditionResults(
         robot=setup.robot.name,
         subjects=subjects,
@@ -459,21 +469,18 @@ def _cell_path(out: Path, key: str) -> Path:
     return out / CELLS / f"{key}.json"
 
 
-def load_cell(path: Path, key: str) -> list[TrialRun]:
-    """Read the jumps of one cell; a damaged file is an `ArtefactError` that names it."""
+def load_cell(path: Path, key: str) -> StoredCell:
+    """Read one cell; a damaged file is an `ArtefactError` that names it."""
     with load_json(path, CELL_SCHEMA, WRITER) as body:
         if body["key"] != key:
             raise ArtefactError(
                 f"{path}: has the jumps of another cell, {body['key']}; delete it, and run the "
                 "command again."
             )
-        return [load_run(stored, JumpFigures) for stored in body["rows"]]
-
-
-def load_cell_versions(path: Path) -> dict[str, str]:
-    """Read the versions of software that a cell was computed with; none of an earlier pronk's."""
-    with load_json(path, CELL_SCHEMA, WRITER) as body:
-        return msgspec.convert(body.get("versions", {}), dict[str, str])
+        return StoredCell(
+            rows=[load_run(stored, JumpFigures) for stored in body["rows"]],
+            versions=msgspec.convert(body.get("versions", {}), dict[str, str]),
+        )
 
 
 def save_conditions(folder: Path, results: ConditionResults) -> tuple[Path, Path]:
