@@ -275,6 +275,23 @@ def test_candidates_are_events_of_the_first_lift_off(
     assert earned("height_by_speed") == pytest.approx([0.3 * 0.7] * N)
 
 
+def test_the_size_of_jumps_backwards_earns_a_share(
+    env: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A share of 0.4 at 2 m/s backwards and beyond, half of the way to it at 1 m/s."""
+    velocities = torch.zeros(N, 3)
+    velocities[:4, 0] = torch.tensor([-1.0, -2.0, -3.0, 1.0])
+    command = pretend(env, {"command": velocities})
+    for gain in ("travel_gain", "flight_gain", "gap_gain"):
+        monkeypatch.setattr(command.state, gain, torch.full((N,), 0.5))
+    monkeypatch.setattr(command.cfg, "backward_share", 0.4)
+    share = torch.ones(N)
+    share[:3] = torch.tensor([0.7, 0.4, 0.4])
+    for name in ("jump_height", "flight_distance", "clearance_gap"):
+        earned = value(env, name) * env.step_dt
+        assert earned.tolist() == pytest.approx((0.5 * share).tolist()), name
+
+
 def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:
     env.sim.data.qpos[2, 2:7] = v(0.3, 0.0, 1.0, 0.0, 0.0)
     env.episode_length_buf[5] = 10**6

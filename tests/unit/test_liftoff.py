@@ -13,7 +13,7 @@ pytest.importorskip("mjlab")
 
 from torch import Tensor
 
-from pronk.jump.train.mdp.liftoff import angle_kernel, forward_share, height_share
+from pronk.jump.train.mdp.liftoff import angle_kernel, forward_share, speed_share
 
 pytestmark = pytest.mark.train
 
@@ -49,7 +49,7 @@ def test_the_kernel_is_between_0_and_1(along: float, target: float, vertical: fl
 
 def test_less_height_is_paid_the_faster_forwards() -> None:
     forward = torch.tensor([-2.0, 0.0, 1.0, 2.0, 3.0], dtype=torch.float64)
-    share = height_share(forward, full_speed=2.0, least=0.4)
+    share = speed_share(forward, full_speed=2.0, least=0.4)
     assert share.tolist() == pytest.approx([1.0, 1.0, 0.7, 0.4, 0.4])
 
 

@@ -6,7 +6,7 @@
       flight_distance: {jump_a: 28, jump_b: [28, 40]}   # in a phase; from its beginning to its end
     jump_scales:                  # factor of the weight in jump mode, likewise
       orientation: 1
-    jump:                         # fields of `JumpSettings`, `speed_added`, `guidance_sweep`
+    jump:                         # fields of `JumpSettings`, and `COMMAND_NUMBERS`
       late_s: 0.25
     task:                         # `action_scale`
       action_scale: 0.42
@@ -51,6 +51,10 @@ SPEED_ADDED = "speed_added"
 rewarded for in jump mode (`MotionCommandCfg.jump_speed_added`) [m/s]."""
 GUIDANCE_SWEEP = "guidance_sweep"
 """Another one: `MotionCommandCfg.guidance_sweep`."""
+BACKWARD_SHARE = "backward_share"
+"""Another one: `MotionCommandCfg.backward_share`."""
+COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE)
+"""All entries of `jump` that are no fields of `JumpSettings`."""
 ACTION_SCALE = "action_scale"
 """Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
 which a policy explores, is in units of it."""
@@ -94,7 +98,7 @@ class Recipe:
     jump_scales: Spans = field(default_factory=dict)
     """Factors of the weights in jump mode, likewise."""
     jump: Mapping[str, float] = field(default_factory=dict)
-    """Fields of `JumpSettings`, `SPEED_ADDED` and `GUIDANCE_SWEEP`."""
+    """Fields of `JumpSettings`, and `COMMAND_NUMBERS`."""
     task: Mapping[str, float] = field(default_factory=dict)
     """`ACTION_SCALE`."""
     source: str = ""
@@ -358,12 +362,18 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     settings: dict[str, float] = dict(recipe.jump)
     command.jump_speed_added = settings.pop(SPEED_ADDED, command.jump_speed_added)
     command.guidance_sweep = settings.pop(GUIDANCE_SWEEP, command.guidance_sweep)
+    command.backward_share = settings.pop(BACKWARD_SHARE, command.backward_share)
+    if not 0.0 <= command.backward_share <= 1.0:
+        raise ArtefactError(
+            f"{recipe.source_of('jump', BACKWARD_SHARE)}: jump: {BACKWARD_SHARE} is "
+            f"{command.backward_share:g}; expected a share from 0 to 1."
+        )
     names = [entry.name for entry in fields(command.settings)]
     for name in settings:
         if name not in names:
             raise ArtefactError(
                 f"{recipe.source_of('jump', name)}: jump has no number {name!r}; the numbers are "
-                f"{', '.join([*names, SPEED_ADDED, GUIDANCE_SWEEP])}."
+                f"{', '.join([*names, *COMMAND_NUMBERS])}."
             )
     try:
         command.settings = replace(command.settings, **settings)
@@ -399,8 +409,8 @@ def _source_of_bad_jump(recipe: Recipe, settings: JumpSettings) -> str:
     numbers: dict[str, float] = {}
     for part in recipe.parts:
         numbers.update(part.jump)
-        numbers.pop(SPEED_ADDED, None)
-        numbers.pop(GUIDANCE_SWEEP, None)
+        for name in COMMAND_NUMBERS:
+            numbers.pop(name, None)
         try:
             replace(settings, **numbers)
         except PronkError:

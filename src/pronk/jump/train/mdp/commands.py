@@ -20,6 +20,7 @@ from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import foot_sweep, guidance
 from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
+from pronk.jump.train.mdp.liftoff import speed_share
 from pronk.jump.train.mdp.motion import (
     RobotFrames,
     SimulatorState,
@@ -38,6 +39,11 @@ if TYPE_CHECKING:
 
 NAME = "motion"
 """The command term's name in every environment."""
+
+
+BACKWARD_FULL_SPEED = 2.0
+"""Commanded speed backwards from which on `MotionCommandCfg.backward_share` is left [m/s]: the
+fastest of the paper's commands."""
 
 
 @dataclass(kw_only=True)
@@ -76,6 +82,9 @@ class MotionCommandCfg(CommandTermCfg):
     guidance_sweep: float = 0.0
     """Share of the commanded forward velocity with which guided feet are swept backwards; 0 keeps
     them below the hips."""
+    backward_share: float = 1.0
+    """Share of the pay for height, distance and gap that is left for commands backwards at
+    `BACKWARD_FULL_SPEED` and faster, 0 to 1."""
     settings: JumpSettings = field(default_factory=JumpSettings)
     """Definition of a good jump."""
 
@@ -185,6 +194,13 @@ class MotionCommand(CommandTerm):
         speed = torch.linalg.vector_norm(horizontal, dim=-1)
         added = self.cfg.jump_speed_added * speed.clamp_max(1.0) + self.state.overspeed
         return horizontal * (1.0 + added * self.state.mode / speed.clamp_min(1e-6))[:, None]
+
+    def scaled_backwards(self, value: Tensor) -> Tensor:
+        """Multiply a reward for the size of a jump, (N,), by its share backwards."""
+        if self.cfg.backward_share == 1.0:
+            return value
+        share = speed_share(-self.velocity[:, 0], BACKWARD_FULL_SPEED, self.cfg.backward_share)
+        return value * share
 
     @property
     def jumper(self) -> Tensor:

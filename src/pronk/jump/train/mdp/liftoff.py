@@ -46,15 +46,16 @@ def forward_share(forward: Tensor, full_speed: float) -> Tensor:
     return (forward / full_speed).clamp(0.0, 1.0)
 
 
-def height_share(forward: Tensor, full_speed: float, least: float) -> Tensor:
-    """Compute the share of the reward for height that is left at a forward command, 1 to `least`.
+def speed_share(forward: Tensor, full_speed: float, least: float) -> Tensor:
+    """Compute the share of a reward that is left at a forward command, 1 to `least`.
 
     It falls linearly from 1 at rest to `least` at `full_speed`. Only speed forwards counts: the
     paper's matched robot jumps .32 and .24 m high at 1 and 2 m/s forwards, but .37 sideways and
     .38 m backwards (Table III).
 
     Args:
-        forward: Commanded forward velocity, negative backwards [m/s].
+        forward: Commanded forward velocity, negative backwards [m/s]; its negative for a share
+            that falls with the speed backwards.
         full_speed: Speed from which on the share is `least` [m/s].
         least: The smallest share, 0 to 1.
     """

@@ -158,19 +158,19 @@ def sparse_jump(env: Env) -> Tensor:
 def jump_height(env: Env) -> Tensor:
     """Increase of the trunk's travel from the lowest to the highest point [m]; an event."""
     command = _measured(env)
-    return command.state.travel_gain / command.step_s
+    return command.scaled_backwards(command.state.travel_gain) / command.step_s
 
 
 def flight_distance(env: Env) -> Tensor:
     """Increase of the ground that the best flight has covered [m]; an event."""
     command = _measured(env)
-    return command.state.flight_gain / command.step_s
+    return command.scaled_backwards(command.state.flight_gain) / command.step_s
 
 
 def clearance_gap(env: Env) -> Tensor:
     """Increase of the widest gap that a flight has cleared [m]; an event."""
     command = _measured(env)
-    return command.state.gap_gain / command.step_s
+    return command.scaled_backwards(command.state.gap_gain) / command.step_s
 
 
 def hop(env: Env) -> Tensor:
@@ -279,5 +279,5 @@ def liftoff_angle(env: Env, vertical: float, std: float, forward_speed: float) -
 def height_by_speed(env: Env, full_speed: float, least: float) -> Tensor:
     """As `jump_height`, less of it the faster forwards is commanded [m]; an event."""
     command = _measured(env)
-    share = liftoff.height_share(command.velocity[:, 0], full_speed, least)
-    return command.state.travel_gain * share / command.step_s
+    share = liftoff.speed_share(command.velocity[:, 0], full_speed, least)
+    return command.scaled_backwards(command.state.travel_gain) * share / command.step_s
