@@ -78,11 +78,11 @@ def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
 
 def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1,"
-    text += " backward_share: 0.5}"
+    text += " backward_share: 0.5, sideways_share: 0.25}"
     command = task(text, tmp_path).commands[COMMAND]
     assert (command.settings.liftoff_velocity, command.settings.late_s) == (2.2, 0.2)
     assert (command.jump_speed_added, command.guidance_sweep) == (0.9, 1.0)
-    assert command.backward_share == 0.5
+    assert (command.backward_share, command.sideways_share) == (0.5, 0.25)
     assert command.settings.ready_s == 0.26
 
 
@@ -101,6 +101,7 @@ def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
         ("jump: {late_s: 0}", "late_s"),
         ("jump: {ready_s: 3}", "ready_s"),
         ("jump: {backward_share: 1.5}", "backward_share|from 0 to 1"),
+        ("jump: {sideways_share: -0.5}", "sideways_share|from 0 to 1"),
         ("task: {scale: 3}", "'scale'|action_scale"),
         ("task: {action_scale: 0}", "action_scale|more than 0"),
     ],
@@ -210,8 +211,8 @@ def settings_of(cfg: Any) -> str:
 
 MOST_TERMS = 20
 """Number of reward terms that a shipped recipe may have in a phase."""
-MORE_TERMS = {"long": 21}
-"""The same of a layer for the Go2 that pays for the gap beside the distance."""
+MORE_TERMS = {"go2": 21}
+"""The same of the Go2's recipe, which pays for the gap beside the distance."""
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)

@@ -292,6 +292,27 @@ def test_the_size_of_jumps_backwards_earns_a_share(
         assert earned.tolist() == pytest.approx((0.5 * share).tolist()), name
 
 
+def test_the_length_of_jumps_to_the_sides_earns_a_share(
+    env: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A share of 0.4 straight to a side, of 0.64 at 3 parts to the side and 4 forwards."""
+    velocities = torch.zeros(N, 3)
+    velocities[1] = torch.tensor([0.0, 1.0, 0.0])
+    velocities[2] = torch.tensor([0.0, -0.5, 0.0])
+    velocities[3] = torch.tensor([0.8, 0.6, 1.0])
+    velocities[4] = torch.tensor([2.0, 0.0, 0.0])
+    command = pretend(env, {"command": velocities})
+    for gain in ("travel_gain", "flight_gain", "gap_gain"):
+        monkeypatch.setattr(command.state, gain, torch.full((N,), 0.5))
+    monkeypatch.setattr(command.cfg, "sideways_share", 0.4)
+    share = torch.ones(N)
+    share[1:4] = torch.tensor([0.4, 0.4, 0.64])
+    for name in ("flight_distance", "clearance_gap"):
+        earned = value(env, name) * env.step_dt
+        assert earned.tolist() == pytest.approx((0.5 * share).tolist()), name
+    assert (value(env, "jump_height") * env.step_dt).tolist() == pytest.approx([0.5] * N)
+
+
 def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:
     env.sim.data.qpos[2, 2:7] = v(0.3, 0.0, 1.0, 0.0, 0.0)
     env.episode_length_buf[5] = 10**6

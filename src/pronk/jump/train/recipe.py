@@ -53,7 +53,9 @@ GUIDANCE_SWEEP = "guidance_sweep"
 """Another one: `MotionCommandCfg.guidance_sweep`."""
 BACKWARD_SHARE = "backward_share"
 """Another one: `MotionCommandCfg.backward_share`."""
-COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE)
+SIDEWAYS_SHARE = "sideways_share"
+"""Another one: `MotionCommandCfg.sideways_share`."""
+COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE)
 """All entries of `jump` that are no fields of `JumpSettings`."""
 ACTION_SCALE = "action_scale"
 """Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
@@ -363,11 +365,14 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     command.jump_speed_added = settings.pop(SPEED_ADDED, command.jump_speed_added)
     command.guidance_sweep = settings.pop(GUIDANCE_SWEEP, command.guidance_sweep)
     command.backward_share = settings.pop(BACKWARD_SHARE, command.backward_share)
-    if not 0.0 <= command.backward_share <= 1.0:
-        raise ArtefactError(
-            f"{recipe.source_of('jump', BACKWARD_SHARE)}: jump: {BACKWARD_SHARE} is "
-            f"{command.backward_share:g}; expected a share from 0 to 1."
-        )
+    command.sideways_share = settings.pop(SIDEWAYS_SHARE, command.sideways_share)
+    for name in (BACKWARD_SHARE, SIDEWAYS_SHARE):
+        share = recipe.jump.get(name, 1.0)
+        if not 0.0 <= share <= 1.0:
+            raise ArtefactError(
+                f"{recipe.source_of('jump', name)}: jump: {name} is {share:g}; expected a share "
+                "from 0 to 1."
+            )
     names = [entry.name for entry in fields(command.settings)]
     for name in settings:
         if name not in names:

@@ -85,6 +85,9 @@ class MotionCommandCfg(CommandTermCfg):
     backward_share: float = 1.0
     """Share of the pay for height, distance and gap that is left for commands backwards at
     `BACKWARD_FULL_SPEED` and faster, 0 to 1."""
+    sideways_share: float = 1.0
+    """Share of the pay for distance and gap that is left for commands straight to a side, 0 to 1;
+    of other directions in proportion to their part to the side."""
     settings: JumpSettings = field(default_factory=JumpSettings)
     """Definition of a good jump."""
 
@@ -201,6 +204,14 @@ class MotionCommand(CommandTerm):
             return value
         share = speed_share(-self.velocity[:, 0], BACKWARD_FULL_SPEED, self.cfg.backward_share)
         return value * share
+
+    def scaled_sideways(self, value: Tensor) -> Tensor:
+        """Multiply a reward for the length of a jump, (N,), by its share to the sides."""
+        if self.cfg.sideways_share == 1.0:
+            return value
+        speed = torch.linalg.vector_norm(self.velocity[:, :2], dim=-1).clamp_min(1e-6)
+        sideways = self.velocity[:, 1].abs() / speed
+        return value * (1.0 - (1.0 - self.cfg.sideways_share) * sideways)
 
     @property
     def jumper(self) -> Tensor:

@@ -164,13 +164,15 @@ def jump_height(env: Env) -> Tensor:
 def flight_distance(env: Env) -> Tensor:
     """Increase of the ground that the best flight has covered [m]; an event."""
     command = _measured(env)
-    return command.scaled_backwards(command.state.flight_gain) / command.step_s
+    gain = command.scaled_sideways(command.scaled_backwards(command.state.flight_gain))
+    return gain / command.step_s
 
 
 def clearance_gap(env: Env) -> Tensor:
     """Increase of the widest gap that a flight has cleared [m]; an event."""
     command = _measured(env)
-    return command.scaled_backwards(command.state.gap_gain) / command.step_s
+    gain = command.scaled_sideways(command.scaled_backwards(command.state.gap_gain))
+    return gain / command.step_s
 
 
 def hop(env: Env) -> Tensor:
