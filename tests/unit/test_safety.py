@@ -276,6 +276,21 @@ def test_targets_are_moved_into_each_limit() -> None:
     assert LIMITS.joints.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
 
 
+def test_power_that_was_too_large_may_end_at_once() -> None:
+    """However far the targets of the tick before are from those with less power."""
+    limits = operating(power_w=1000.0, change=0.1)
+    before = POSE + 0.8
+    target, reason = moved(state(), before, before, limits=limits)
+    torque = KP * (target - POSE)
+    assert reason is Reason.POWER
+    assert float(torque**2 @ LIMITS.joints.loss) == pytest.approx(1000.0)
+    assert (before - target > 2 * limits.operating.change).all()
+    # Not in the other direction: from no torque on it grows by the change alone.
+    target, reason = moved(state(), before, POSE, limits=limits)
+    assert reason is Reason.CHANGE
+    np.testing.assert_allclose(target, POSE + 0.1)
+
+
 def test_with_a_reach_a_joint_clear_of_its_limits_gets_a_torque() -> None:
     limits = operating(target_reach=0.5, far_target=1.0)
     knee = 2
@@ -413,6 +428,12 @@ def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
     kp = drawn.stiffness
     kd = drawn.damping
     torque = kp * (target - q) - kd * v
+    # The nearest target that the change alone allows, and its torque.
+    changed = np.clip(
+        target, drawn.previous - limits.operating.change, drawn.previous + limits.operating.change
+    )
+    changed_torque = kp * (changed - q) - kd * v
+    is_weaker = (np.abs(torque) <= np.abs(changed_torque)) & (torque * changed_torque >= -slack)
     top = limits.joints.stall * (1.0 - v / limits.joints.no_load)
     bottom = -limits.joints.stall * (1.0 + v / limits.joints.no_load)
     applied = np.clip(torque, bottom, top)
@@ -438,10 +459,12 @@ def broken(drawn: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
             | (target > limits.joints.high - limits.operating.margin + reach + slack)
             | (out & inside)
         ).any(axis=-1),
-        # With a reach, a joint that nears a limit may be brought back from a far target at once.
+        # With a reach, a joint that nears a limit may be brought back from a far target at once,
+        # and with too much power torques may become smaller at once.
         "change": (
             (np.abs(target - drawn.previous) > limits.operating.change + slack)
             & ~(near & (reach > 0.0))
+            & ~is_weaker
         ).any(axis=-1),
         "torque": (np.abs(torque) > limits.joints.torque + slack).any(axis=-1),
         "power": power > limits.operating.power_w * (1.0 + slack),

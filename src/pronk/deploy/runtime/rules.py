@@ -212,7 +212,9 @@ def limit_targets(
 
     The result is the point nearest to the target of the command in the intersection of the three.
     If the bus power there is larger than `OperatingLimits.power_w`, all torques are scaled by one
-    factor, the solution of a quadratic equation.
+    factor, the solution of a quadratic equation. Towards no torque a target may then move by more
+    than `change`: a change that makes torques smaller needs no limit, and one tick of a jump in
+    which no target met both limits would let the robot fall.
 
     Args:
         position: Measured positions [rad], (..., n).
@@ -274,6 +276,10 @@ def limit_targets(
     denominator = np.where(excessive, work + root, 1.0)
     share = np.where(excessive, 2.0 * operating.power_w / denominator, 1.0)
     scaled = position + (torque * share[..., None] + damping * velocity) / divisor
+    slowest = np.minimum(slowest, without_torque)
+    fastest = np.maximum(fastest, without_torque)
+    low = np.maximum(np.maximum(floor, slowest), least_torque)
+    high = np.minimum(np.minimum(ceiling, fastest), largest_torque)
     scaled = np.minimum(np.maximum(scaled, low), high)
     limited = np.where(excessive[..., None] & is_stiff, scaled, limited)
     moved_by = np.where(excessive, _POWER, moved_by)
