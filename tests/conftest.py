@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from pronk.garbage import collect_less_often, end_without_collection
+
+collect_less_often()
+
 # A slow example on a busy machine is not a defect.
 settings.register_profile("pronk", deadline=None)
 settings.load_profile("pronk")
@@ -32,6 +36,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if folder in ("slow", "live"):
             item.add_marker(folder)
     items.sort(key=_place)
+
+
+def pytest_unconfigure() -> None:
+    end_without_collection()
 
 
 def _place(item: pytest.Item) -> int:
