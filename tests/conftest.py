@@ -12,8 +12,10 @@ import pytest
 from hypothesis import settings
 
 from pronk.garbage import collect_less_often, end_without_collection
+from pronk.opengl import keep_opengl_out
 
 collect_less_often()
+keep_opengl_out()
 
 # A slow example on a busy machine is not a defect.
 settings.register_profile("pronk", deadline=None)
