@@ -1,8 +1,8 @@
 """How often Python looks for unreachable objects.
 
-PyTorch, MuJoCo Warp and mjlab make 900,000 objects as they are imported, almost all of which stay to
-the end. By Python's own setting the collector looks at each of them many times: of the 10 s of CPU
-time of a process that imports them and ends, it took 4 s.
+PyTorch, MuJoCo Warp and mjlab make 900,000 objects as they are imported, almost all of which stay
+to the end. By Python's own setting the collector looks at each of them many times: of the 10 s of
+CPU time of a process that imports them and ends, it took 4 s.
 """
 
 from __future__ import annotations
