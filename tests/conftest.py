@@ -11,6 +11,12 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from pronk.garbage import collect_less_often, end_without_collection
+from pronk.opengl import keep_opengl_out
+
+collect_less_often()
+keep_opengl_out()
+
 # A slow example on a busy machine is not a defect.
 settings.register_profile("pronk", deadline=None)
 settings.load_profile("pronk")
@@ -32,6 +38,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if folder in ("slow", "live"):
             item.add_marker(folder)
     items.sort(key=_place)
+
+
+def pytest_unconfigure() -> None:
+    end_without_collection()
 
 
 def _place(item: pytest.Item) -> int:

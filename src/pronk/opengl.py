@@ -1,7 +1,8 @@
 """OpenGL for rendering, kept out of processes that do not render.
 
-MuJoCo loads the OpenGL that MUJOCO_GL names as it is imported, and cannot be imported where that is
-missing. Only the rendering process needs one (`pronk.jump.trial.films.render`).
+MuJoCo loads the OpenGL that MUJOCO_GL names, or GLFW where it names none, as it is imported: that
+takes a third of the time of its import, and it cannot be imported where the named one is missing.
+Only the rendering process needs one (`pronk.jump.trial.films.render`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,8 @@ def keep_opengl_out() -> None:
 
     `requested_opengl` still returns what the user has chosen.
     """
-    chosen = os.environ.get(_MUJOCO_VARIABLE)
-    if chosen:
-        os.environ.setdefault(_REQUESTED_VARIABLE, chosen)
-        os.environ[_MUJOCO_VARIABLE] = _NO_OPENGL
+    os.environ.setdefault(_REQUESTED_VARIABLE, os.environ.get(_MUJOCO_VARIABLE, ""))
+    os.environ[_MUJOCO_VARIABLE] = _NO_OPENGL
 
 
 def requested_opengl() -> str:

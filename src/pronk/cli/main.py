@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
+from pronk.garbage import collect_less_often, end_without_collection
 from pronk.opengl import keep_opengl_out
 from pronk.signals import interrupt
 from pronk.version import VERSION
@@ -303,6 +304,7 @@ def _sentence(box: str, program: str) -> str:
 
 def main() -> None:
     """Entry point of the `pronk` command."""
+    collect_less_often()
     keep_opengl_out()
     # Matrices are small here, and threads of the linear algebra would take the cores from those of
     # the simulations: a match of twelve joints takes 6.8 s in place of 9.2 s on two cores.
@@ -316,6 +318,7 @@ def main() -> None:
         sys.exit(ExitStatus.REFUSED)
     status = run(sys.argv[1:])
     _abandon_broken_output()
+    end_without_collection()
     sys.exit(status)
 
 

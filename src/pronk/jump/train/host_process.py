@@ -15,9 +15,13 @@ def train_packed(packed: bytes) -> None:
     """
     import cloudpickle
 
+    from pronk.garbage import collect_less_often, end_without_collection
+
+    collect_less_often()
     # From the agent, which has unpickled this function just so.
     config, log_dir = cloudpickle.loads(packed)
 
     from pronk.jump.train.launch import train_process
 
     train_process(config, log_dir)
+    end_without_collection()
