@@ -46,7 +46,7 @@ from pronk.jump.virtual.sim_params import SimParams, load_sim_params
 from pronk.policy.rollout import measurement
 from pronk.policy.runtime import load_policy
 from pronk.policy.script import STILL, Velocity
-from pronk.robots import load_robot
+from pronk.robots import RobotSpec, load_robot
 from pronk.robots.machine import State
 from pronk.tables import Cell, Column, Table, counted
 
@@ -67,10 +67,6 @@ SUPERVISED = (
     *(Reason.ROBOT_CLOCK, Reason.INTERRUPTED, Reason.BUS_VOLTAGE, Reason.FAR_TARGET),
     *(Reason.COLLAPSED, Reason.TRACKING, Reason.ORIENTATION),
 )
-LIMITS = Limits.of(load_robot("mini_cheetah"))
-
-
-SENSORS = LIMITS.sensors
 
 
 def _attitude(safety: SafetyFilter) -> float:
@@ -87,7 +83,7 @@ def _encoder(safety: SafetyFilter) -> float:
 
 def _path_share(safety: SafetyFilter) -> float:
     path, turned = safety.sensors.paths
-    return path / turned if turned > SENSORS.turned else math.inf
+    return path / turned if turned > safety.limits.sensors.turned else math.inf
 
 
 def _repeated(safety: SafetyFilter) -> float:
@@ -95,13 +91,14 @@ def _repeated(safety: SafetyFilter) -> float:
 
 
 def _moved(safety: SafetyFilter) -> float:
-    is_constant = safety.sensors.constant_s > SENSORS.repeat_s
+    is_constant = safety.sensors.constant_s > safety.limits.sensors.repeat_s
     return float(np.where(is_constant, safety.sensors.moved, 0.0).max())
 
 
 def _others(safety: SafetyFilter) -> float:
     both_constant_s = safety.sensors.constant_s.reshape(2, -1).min(axis=0)
-    return float(np.where(both_constant_s > SENSORS.repeat_s, safety.sensors.others, 0.0).max())
+    is_constant = both_constant_s > safety.limits.sensors.repeat_s
+    return float(np.where(is_constant, safety.sensors.others, 0.0).max())
 
 
 def _blocked(safety: SafetyFilter) -> float:
@@ -139,35 +136,59 @@ def _pushed(safety: SafetyFilter) -> float:
 
 def _seized(safety: SafetyFilter) -> float:
     response = safety.response
-    far = response.target_range > LIMITS.response.far
-    far &= response.torque_range > LIMITS.response.push_share * LIMITS.joints.torque
+    limits = safety.limits
+    far = response.target_range > limits.response.far
+    far &= response.torque_range > limits.response.push_share * limits.joints.torque
     return float(np.where(far, response.motion, math.inf).min())
 
 
-QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
-    "attitude less gyro [rad]": (SENSORS.attitude, _attitude),
-    "force off the vertical [rad]": (SENSORS.upright, _lean),
-    "position less velocity [rad]": (SENSORS.encoder, _encoder),
-    "least path of the attitude, share": (SENSORS.stuck_share, _path_share),
-    "unit repeats [s]": (SENSORS.repeat_s, _repeated),
-    "moved while constant [rad]": (SENSORS.moved, _moved),
-    "others moved while constant [rad]": (SENSORS.others_moved, _others),
-    "limited by torque without moving [s]": (LIMITS.blocked.blocked_s, _blocked),
-    "limited by torque [s]": (LIMITS.blocked.clipped_s, _clipped),
-    "slow drift of a position [rad]": (SENSORS.drift, _slow_drift),
-    "robot's clock off in a second [s]": (SENSORS.clock_s, _clock),
-    "least bus voltage [V]": (LIMITS.operating.bus_voltage, _voltage),
-    "least height of the trunk [m]": (LIMITS.collapsed, _height),
-    "trunk collapsed [s]": (LIMITS.response.low_s, _low),
-    "pushed without following [s]": (LIMITS.response.pushed_s, _pushed),
-    "least motion of a joint whose target moves far [rad]": (LIMITS.response.still, _seized),
+QUANTITIES: dict[str, Callable[[SafetyFilter], float]] = {
+    "attitude less gyro [rad]": _attitude,
+    "force off the vertical [rad]": _lean,
+    "position less velocity [rad]": _encoder,
+    "least path of the attitude, share": _path_share,
+    "unit repeats [s]": _repeated,
+    "moved while constant [rad]": _moved,
+    "others moved while constant [rad]": _others,
+    "limited by torque without moving [s]": _blocked,
+    "limited by torque [s]": _clipped,
+    "slow drift of a position [rad]": _slow_drift,
+    "robot's clock off in a second [s]": _clock,
+    "least bus voltage [V]": _voltage,
+    "least height of the trunk [m]": _height,
+    "trunk collapsed [s]": _low,
+    "pushed without following [s]": _pushed,
+    "least motion of a joint whose target moves far [rad]": _seized,
 }
-"""Limit, and the quantity, of the filter."""
+"""The quantities of the filter that have a limit."""
 
 
-def draw_params(number: int) -> SimParams:
-    """Draw a parameter set; number 0 is the shipped one."""
-    base = load_sim_params()
+def limits_of_quantities(limits: Limits) -> tuple[float, ...]:
+    """Return the limits of `QUANTITIES`, in their order."""
+    sensors = limits.sensors
+    return (
+        sensors.attitude,
+        sensors.upright,
+        sensors.encoder,
+        sensors.stuck_share,
+        sensors.repeat_s,
+        sensors.moved,
+        sensors.others_moved,
+        limits.blocked.blocked_s,
+        limits.blocked.clipped_s,
+        sensors.drift,
+        sensors.clock_s,
+        limits.operating.bus_voltage,
+        limits.collapsed,
+        limits.response.low_s,
+        limits.response.pushed_s,
+        limits.response.still,
+    )
+
+
+def draw_params(number: int, robot: RobotSpec) -> SimParams:
+    """Draw a parameter set of a robot; number 0 is the shipped one."""
+    base = load_sim_params(robot=robot)
     rng = np.random.default_rng([29, number])
     if number == 0:
         return base
@@ -184,7 +205,7 @@ def draw_params(number: int) -> SimParams:
         shipped,
         command_delay_s=float(rng.uniform(1e-3, 6e-3)),
         measurement_delay_s=float(rng.uniform(0.0, 3e-3)),
-        bus_voltage=float(rng.uniform(22.2, 25.2)),
+        bus_voltage=times(robot.joints[0].drive.bus_voltage, 0.925, 1.05),
         encoder_bits=int(rng.integers(12, 16)),
         velocity_window_s=float(rng.uniform(0.5e-3, 4e-3)),
         velocity_noise=times(shipped.velocity_noise, 1.0, 4.0),
@@ -263,11 +284,11 @@ FALLING_RAD = 0.5
 """True tilt of the trunk from which a robot is falling [rad]; turns at speed take 0.3."""
 
 
-def is_falling(machine: VirtualRobot) -> bool:
+def is_falling(machine: VirtualRobot, limits: Limits) -> bool:
     """Whether a virtual robot leans too far, or its trunk is truly down."""
     now = machine.snapshot()
     height = float(now.position[0, 2])
-    return tilt(now.orientation[0]) > FALLING_RAD or height < LIMITS.collapsed
+    return tilt(now.orientation[0]) > FALLING_RAD or height < limits.collapsed
 
 
 @dataclass(kw_only=True)
@@ -361,7 +382,7 @@ class Flight:
                 if safety.faulted:
                     self.damped = decision
                     self.damped_at = t
-                    self.is_falling = is_falling(machine)
+                    self.is_falling = is_falling(machine, safety.limits)
                     return
             else:
                 sent, decision = safety.judge(states or [newest], desired.command, t)
@@ -369,10 +390,10 @@ class Flight:
                 if sent is None:
                     self.damped = decision
                     self.damped_at = t
-                    self.is_falling = is_falling(machine)
+                    self.is_falling = is_falling(machine, safety.limits)
                     return
                 machine.send(sent)
-                for name, (_, quantity) in QUANTITIES.items():
+                for name, quantity in QUANTITIES.items():
                     more = min if name.startswith("least") else max
                     value = quantity(safety)
                     self.largest[name] = more(self.largest.get(name, value), value)
@@ -416,7 +437,7 @@ def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
     """Fly for two minutes without a fault."""
     flight = Flight(
         policy=policy,
-        params=draw_params(number % sets),
+        params=draw_params(number % sets, load_robot(load_policy(policy).contract.robot)),
         seed=_SEEDS * seed + number,
         loss=LOSS if number % 3 == 2 else 0.0,
         coarse=number // sets % 2 == 1,
@@ -444,12 +465,13 @@ def struck(policy: Path, seed: int, job: tuple[str, str, int]) -> list[Row]:
     """
     fault, clock, k = job
     begins = 0.0 if fault in SWAPPED else 8.2 + 0.137 * k
+    robot = load_robot(load_policy(policy).contract.robot)
     number = k
     while True:
         number += 1
         flight = Flight(
             policy=policy,
-            params=draw_params(number),
+            params=draw_params(number, robot),
             seed=_SEEDS * seed + 1000 + number,
             steady=WALK,
             fault="" if fault in (LATE, CLOCK_ALONE) else fault,
@@ -519,7 +541,7 @@ def supervision(
         out: File of rows in JSON, written as they come; a run goes on from those that are there.
         docs: Page whose sections of the rows that are there are written.
     """
-    load_policy(policy)
+    robot = load_robot(load_policy(policy).contract.robot)
     rows: list[Row] = []
     with console.progress() as report:
         for row in fly(policy, hours, sets, runs, tuple(clocks.split(",")), seed, jobs, out):
@@ -536,7 +558,7 @@ def supervision(
     command = f"python -m benchmarks supervision POLICY --seed {seed} --sets {sets}"
     flights = [row for row in rows if "flight" in row]
     if flights:
-        table = table_of_flights(flights, sets)
+        table = table_of_flights(flights, sets, Limits.of(robot))
         tables.append(table)
         if docs is not None:
             write_section(docs, "flights", f"Measured by `{command}`.\n\n{as_markdown(table)}")
@@ -550,15 +572,16 @@ def supervision(
     return finish({"rows": rows}, *tables)
 
 
-def table_of_flights(flights: list[Row], sets: int) -> Table:
+def table_of_flights(flights: list[Row], sets: int, limits: Limits) -> Table:
     """Make the table of the largest quantities of flights without a fault.
 
     Args:
         flights: Rows of `quiet`.
         sets: Number of parameter sets.
+        limits: Limits of the robot.
     """
     largest_rows: list[tuple[Cell, ...]] = []
-    for name, (limit, _) in QUANTITIES.items():
+    for name, limit in zip(QUANTITIES, limits_of_quantities(limits), strict=True):
         values = [row["largest"][name] for row in flights if name in row["largest"]]
         value = (min if name.startswith("least") else max)(values, default=math.nan)
         largest_rows.append((name, value, f"{limit:g}"))

@@ -146,6 +146,16 @@ def test_a_seized_joint_is_found_and_one_that_follows_late_is_not() -> None:
     assert found(late, swinging, 2.0)[0] is Reason.NONE
 
 
+def test_a_joint_that_stops_at_once_after_a_swing_is_not_seized() -> None:
+    """It followed its last targets within the lag, and its target stands still as it does."""
+
+    def stopping(t: float) -> np.ndarray:
+        swing = 1.0 * math.sin(2.0 * math.pi * 3.0 * t) if t < 0.5 else 0.0
+        return knee(POSE, POSE[KNEE] + swing)
+
+    assert found(stopping, stopping, 1.5)[0] is Reason.NONE
+
+
 def test_links_on_a_stand_may_be_clamped() -> None:
     hung = replace(LIMITS, operating=replace(LIMITS.operating, tilt=math.inf))
 

@@ -40,9 +40,10 @@ class ResponseHistory:
         """Time for which the commanded torque of each joint has been beyond `ResponseLimits.push`
         in one direction without the joint's moving that way [s], (joints,)."""
         self.target_range = np.zeros(joints)
-        """Range of the target of each joint over `SEIZED_S`, until 60 ms ago [rad], (joints,)."""
+        """Range of the target of each joint, of those from the begin of `SEIZED_S` until 60 ms ago
+        [rad], (joints,): whatever the lag up to 60 ms, they acted within `SEIZED_S`."""
         self.torque_range = np.zeros(joints)
-        """Range of stiffness times target over the same time [N m], (joints,)."""
+        """Range of stiffness times target of the same targets [N m], (joints,)."""
         self.motion = np.full(joints, np.inf)
         """Range of the position of each joint over `SEIZED_S` [rad], (joints,)."""
         self.trunk_height = np.inf
@@ -116,8 +117,8 @@ class ResponseHistory:
         self._positions.append(position)
         if len(self._positions) < _SAMPLES:
             return
-        targets = np.array(self._targets)[:-_LAG_SAMPLES]
-        torques = np.array(self._torques)[:-_LAG_SAMPLES]
+        targets = np.array(self._targets)[_LAG_SAMPLES:-_LAG_SAMPLES]
+        torques = np.array(self._torques)[_LAG_SAMPLES:-_LAG_SAMPLES]
         positions = np.array(self._positions)[_LAG_SAMPLES:]
         self.target_range = targets.max(axis=0) - targets.min(axis=0)
         self.torque_range = torques.max(axis=0) - torques.min(axis=0)
@@ -169,9 +170,11 @@ def pushed_in_vain(history: ResponseHistory, limits: Limits) -> str:
 def seized_joint(history: ResponseHistory, limits: Limits) -> str:
     """Find a joint that stands still while its target moves far.
 
-    Rule: over 0.4 s the position stayed within `still`, 0.01 rad, while the target, 60 ms earlier,
-    moved over more than `far`, 0.8 rad, and stiffness times target over more than 0.45 of the
-    effort limit. Least motion of walks and jumps in 0.25 s while targets moved as far: 0.033 rad.
+    Rule: over 0.4 s the position stayed within `still`, 0.01 rad, while the target, from the begin
+    of this time until 60 ms before its end, moved over more than `far`, 0.8 rad, and stiffness
+    times target over more than 0.45 of the effort limit. Targets before do not count: a Go2 that
+    stops follows the last of them within 40 ms, and then stands still. Least motion of walks and
+    jumps in 0.25 s while targets moved as far: 0.033 rad.
     """
     response = limits.response
     far = (history.target_range > response.far) & (
