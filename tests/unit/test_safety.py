@@ -180,7 +180,7 @@ def test_a_command_of_another_shape_latches(shape: Any) -> None:
         (state(orientation=rolled(0.81)), command(), Reason.TILT),
         (state(orientation=rolled(-3.0)), command(), Reason.TILT),
         (state(orientation=np.zeros(4)), command(), Reason.STATE_NOT_FINITE),
-        (state(velocity=at(np.zeros(N), -31.0)), command(), Reason.SPEED),
+        (state(velocity=at(np.zeros(N), -40.0)), command(), Reason.SPEED),
         (state(temperature=at(np.full(N, 40.0), 81.0)), command(), Reason.TEMPERATURE),
     ],
 )
@@ -289,6 +289,21 @@ def test_power_that_was_too_large_may_end_at_once() -> None:
     target, reason = moved(state(), before, POSE, limits=limits)
     assert reason is Reason.CHANGE
     np.testing.assert_allclose(target, POSE + 0.1)
+
+
+def test_a_joint_that_brakes_whatever_its_target_leaves_less_power_to_the_others() -> None:
+    """Faster than without load, its torque cannot be scaled with the others."""
+    joint = 0
+    limits = operating(power_w=1000.0)
+    velocity = at(np.zeros(N), 1.05 * LIMITS.joints.no_load[joint], joint)
+    target, reason = moved(state(velocity=velocity), POSE + 0.8, POSE + 0.8, limits=limits)
+    assert reason is Reason.POWER
+    torque = KP * (target - POSE) - KD * velocity
+    # What back-EMF leaves at 1.05 of the no-load speed: braking with 0.05 of the stall torque.
+    torque[joint] = min(torque[joint], -0.05 * LIMITS.joints.stall[joint])
+    assert float(torque**2 @ LIMITS.joints.loss) == pytest.approx(1000.0)
+    others = np.delete(torque, joint)
+    np.testing.assert_allclose(others, others[0])
 
 
 def test_with_a_reach_a_joint_clear_of_its_limits_gets_a_torque() -> None:

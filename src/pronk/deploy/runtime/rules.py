@@ -28,6 +28,8 @@ _ABSURD = 1e6
 """No measured or commanded number of a robot is as large, in any unit used here."""
 _NO_STIFFNESS = 1e-9
 """Stiffness below which a target moves nothing [N m/rad]."""
+_POWER_ROUNDS = 10
+"""Largest number of times that torques are scaled to the power of all drives."""
 _UNIT_SLACK = 0.1
 """Largest difference of a quaternion's square from 1 with which it is an attitude."""
 
@@ -270,21 +272,29 @@ def limit_targets(
     excessive = work + loss > operating.power_w
     if not excessive.any():
         return limited, moved_by, possible
-    # The share s of the torques solves s work + s^2 loss = power. Work and loss vanish together,
-    # and then there is nothing to scale.
-    root = np.sqrt(work * work + 4.0 * loss * operating.power_w)
-    denominator = np.where(excessive, work + root, 1.0)
-    share = np.where(excessive, 2.0 * operating.power_w / denominator, 1.0)
-    scaled = position + (torque * share[..., None] + damping * velocity) / divisor
+    moved_by = np.where(excessive, _POWER, moved_by)
     slowest = np.minimum(slowest, without_torque)
     fastest = np.maximum(fastest, without_torque)
     low = np.maximum(np.maximum(floor, slowest), least_torque)
     high = np.minimum(np.minimum(ceiling, fastest), largest_torque)
-    scaled = np.minimum(np.maximum(scaled, low), high)
-    limited = np.where(excessive[..., None] & is_stiff, scaled, limited)
-    moved_by = np.where(excessive, _POWER, moved_by)
-    _, work, loss = _torque_and_power(position, velocity, limited, stiffness, damping, limits)
-    possible &= work + loss <= operating.power_w * (1.0 + _SLACK)
+    # A joint that turns faster than without load brakes, whatever its target, so that one round
+    # may leave too much.
+    for _ in range(_POWER_ROUNDS):
+        # The share s of the torques solves s work + s^2 loss = power. Work and loss vanish
+        # together, and then there is nothing to scale.
+        root = np.sqrt(work * work + 4.0 * loss * operating.power_w)
+        denominator = np.where(excessive, work + root, 1.0)
+        share = np.where(excessive, 2.0 * operating.power_w / denominator, 1.0)
+        scaled = position + (torque * share[..., None] + damping * velocity) / divisor
+        scaled = np.minimum(np.maximum(scaled, low), high)
+        limited = np.where(excessive[..., None] & is_stiff, scaled, limited)
+        torque, work, loss = _torque_and_power(
+            position, velocity, limited, stiffness, damping, limits
+        )
+        excessive = work + loss > operating.power_w * (1.0 + _SLACK)
+        if not excessive.any():
+            break
+    possible &= ~excessive
     return limited, moved_by, possible
 
 
