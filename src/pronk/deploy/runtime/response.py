@@ -143,8 +143,8 @@ def collapsed_trunk(history: ResponseHistory, limits: Limits) -> str:
 
     Rule: the height of the trunk over its lowest foot, by the angles of the legs and the attitude,
     is below `LegKinematics.collapsed`, the folded pose and a tenth of the way up from it, for more
-    than `low_s`, 60 ms. Measured is the height over the foot that reaches down farthest, so a trunk
-    in the air does not count as low. Lowest of walks and jumps: 0.22 of the way.
+    than `low_s`, 120 ms. Measured is the height over the foot that reaches down farthest, so a
+    trunk in the air does not count as low. Lowest of walks and jumps: 0.22 of the way.
     """
     if history.low_s > limits.response.low_s:
         return f"{history.trunk_height:.2f} m, of {limits.collapsed:.2f} m at least"
