@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pronk.deploy.runtime.limits import SPEED_SHARE
 from pronk.deploy.runtime.safety import SafetyFilter
 from pronk.deploy.runtime.sweep import SweepController, SweepTask
 from pronk.deploy.runtime.sweep_recorder import record_sweep
@@ -279,4 +280,4 @@ def test_the_speed_limit_of_excitations_begins_at_the_pose() -> None:
     )
     no_load = np.array([joint.drive.no_load_speed for joint in plan.robot.joints])
     np.testing.assert_allclose(strict.joints.speed, no_load)
-    np.testing.assert_allclose(controller.limits.joints.speed, 1.2 * no_load)
+    np.testing.assert_allclose(controller.limits.joints.speed, SPEED_SHARE * no_load)
