@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, product
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -142,48 +143,25 @@ def _seized(safety: SafetyFilter) -> float:
     return float(np.where(far, response.motion, math.inf).min())
 
 
-QUANTITIES: dict[str, Callable[[SafetyFilter], float]] = {
-    "attitude less gyro [rad]": _attitude,
-    "force off the vertical [rad]": _lean,
-    "position less velocity [rad]": _encoder,
-    "least path of the attitude, share": _path_share,
-    "unit repeats [s]": _repeated,
-    "moved while constant [rad]": _moved,
-    "others moved while constant [rad]": _others,
-    "limited by torque without moving [s]": _blocked,
-    "limited by torque [s]": _clipped,
-    "slow drift of a position [rad]": _slow_drift,
-    "robot's clock off in a second [s]": _clock,
-    "least bus voltage [V]": _voltage,
-    "least height of the trunk [m]": _height,
-    "trunk collapsed [s]": _low,
-    "pushed without following [s]": _pushed,
-    "least motion of a joint whose target moves far [rad]": _seized,
+QUANTITIES: dict[str, tuple[Callable[[Limits], float], Callable[[SafetyFilter], float]]] = {
+    "attitude less gyro [rad]": (attrgetter("sensors.attitude"), _attitude),
+    "force off the vertical [rad]": (attrgetter("sensors.upright"), _lean),
+    "position less velocity [rad]": (attrgetter("sensors.encoder"), _encoder),
+    "least path of the attitude, share": (attrgetter("sensors.stuck_share"), _path_share),
+    "unit repeats [s]": (attrgetter("sensors.repeat_s"), _repeated),
+    "moved while constant [rad]": (attrgetter("sensors.moved"), _moved),
+    "others moved while constant [rad]": (attrgetter("sensors.others_moved"), _others),
+    "limited by torque without moving [s]": (attrgetter("blocked.blocked_s"), _blocked),
+    "limited by torque [s]": (attrgetter("blocked.clipped_s"), _clipped),
+    "slow drift of a position [rad]": (attrgetter("sensors.drift"), _slow_drift),
+    "robot's clock off in a second [s]": (attrgetter("sensors.clock_s"), _clock),
+    "least bus voltage [V]": (attrgetter("operating.bus_voltage"), _voltage),
+    "least height of the trunk [m]": (attrgetter("collapsed"), _height),
+    "trunk collapsed [s]": (attrgetter("response.low_s"), _low),
+    "pushed without following [s]": (attrgetter("response.pushed_s"), _pushed),
+    "least motion of a joint whose target moves far [rad]": (attrgetter("response.still"), _seized),
 }
-"""The quantities of the filter that have a limit."""
-
-
-def limits_of_quantities(limits: Limits) -> tuple[float, ...]:
-    """Return the limits of `QUANTITIES`, in their order."""
-    sensors = limits.sensors
-    return (
-        sensors.attitude,
-        sensors.upright,
-        sensors.encoder,
-        sensors.stuck_share,
-        sensors.repeat_s,
-        sensors.moved,
-        sensors.others_moved,
-        limits.blocked.blocked_s,
-        limits.blocked.clipped_s,
-        sensors.drift,
-        sensors.clock_s,
-        limits.operating.bus_voltage,
-        limits.collapsed,
-        limits.response.low_s,
-        limits.response.pushed_s,
-        limits.response.still,
-    )
+"""Limit of a robot, and the quantity of the filter."""
 
 
 def draw_params(number: int, robot: RobotSpec) -> SimParams:
@@ -393,7 +371,7 @@ class Flight:
                     self.is_falling = is_falling(machine, safety.limits)
                     return
                 machine.send(sent)
-                for name, quantity in QUANTITIES.items():
+                for name, (_, quantity) in QUANTITIES.items():
                     more = min if name.startswith("least") else max
                     value = quantity(safety)
                     self.largest[name] = more(self.largest.get(name, value), value)
@@ -581,10 +559,10 @@ def table_of_flights(flights: list[Row], sets: int, limits: Limits) -> Table:
         limits: Limits of the robot.
     """
     largest_rows: list[tuple[Cell, ...]] = []
-    for name, limit in zip(QUANTITIES, limits_of_quantities(limits), strict=True):
+    for name, (limit_of, _) in QUANTITIES.items():
         values = [row["largest"][name] for row in flights if name in row["largest"]]
         value = (min if name.startswith("least") else max)(values, default=math.nan)
-        largest_rows.append((name, value, f"{limit:g}"))
+        largest_rows.append((name, value, f"{limit_of(limits):g}"))
     for row in flights:
         if row["alarm"]:
             console.say(f"flight {row['flight']}, {row['alarm']}")
