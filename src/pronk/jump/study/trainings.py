@@ -152,7 +152,6 @@ def check_arm(arm: TrainingArm) -> None:
     Raises:
         PronkError: The gains, the recipe or the phases are impossible.
     """
-    from pronk.jump.train.gains import gains_of
     from pronk.jump.train.recipe import load_recipes
     from pronk.robots import load_robot
 
@@ -162,7 +161,7 @@ def check_arm(arm: TrainingArm) -> None:
 
         check_training(settings)
         return
-    gains_of(settings, load_robot(str(settings.robot)))
+    settings.training_gains(load_robot(str(settings.robot)))
     if settings.recipe:
         load_recipes(settings.recipe)
 

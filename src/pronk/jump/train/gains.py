@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,9 +35,6 @@ from pronk.identify.match.ranges import LOWEST_OF_GAIN
 from pronk.identify.match.uncertainty import LEAST_SHARE
 from pronk.identify.simulators.info import SimulatorInfo, mujoco_info
 from pronk.robots.robot import Joint, RobotSpec
-
-if TYPE_CHECKING:
-    from pronk.jump.train.settings import TrainSettings
 
 NAIVE = "naive"
 """The choice of the nominal gains, which needs no file."""
@@ -171,25 +168,6 @@ def training_gains(
         sha256=sha256(path),
         virtual=matched.virtual,
         unmatched=matched.unmatched,
-    )
-
-
-def gains_of(settings: TrainSettings, robot: RobotSpec) -> TrainingGains:
-    """Return the gains that a new run trains with.
-
-    Args:
-        settings: Settings of the run, completed.
-        robot: The robot.
-
-    Raises:
-        PronkError: As `training_gains`.
-    """
-    return training_gains(
-        settings.gains or NAIVE,
-        robot,
-        like=settings.ranges_from,
-        allow_unmatched=bool(settings.allow_unmatched),
-        by_joint=bool(settings.draws.by_joint),
     )
 
 

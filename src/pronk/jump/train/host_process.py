@@ -21,7 +21,7 @@ def train_packed(packed: bytes) -> None:
     # From the agent, which has unpickled this function just so.
     config, log_dir = cloudpickle.loads(packed)
 
-    from pronk.jump.train.launch import train_process
+    from pronk.jump.train.train_process import train_process
 
     train_process(config, log_dir)
     end_without_collection()

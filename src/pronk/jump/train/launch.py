@@ -1,4 +1,4 @@
-"""The processes of one training: this one, or one for each GPU of each host, by torchrunx.
+"""Trainings by several processes, one for each GPU of each host, started by torchrunx.
 
 torchrunx starts an agent on each host, which starts the processes; on other hosts over SSH. Process
 r of all draws from seed + r. The processes average gradients, and process 0 alone, on the first
@@ -10,30 +10,20 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import os
 import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import torch
-from mjlab.envs import ManagerBasedRlEnv
-from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.scripts import train as mjlab_train
-from mjlab.utils.os import dump_yaml
-from mjlab.utils.torch import configure_torch_backends
-from mjlab.utils.wandb import add_wandb_tags
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.jump.train import devices
 from pronk.jump.train.host_process import train_packed
 from pronk.jump.train.hosts import COPIED_VARIABLES
-from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.runner import PronkRunner
 from pronk.signals import interrupt
 
 LOCAL_HOST = "localhost"
@@ -98,50 +88,6 @@ def launch(
         raise KeyboardInterrupt(signal_name)
 
 
-def train_process(config: mjlab_train.TrainConfig, log_dir: Path) -> None:
-    """Do what one process does: all of a session, with what the libraries print in a file.
-
-    It is mjlab's `run_train` for tasks of this package, which on a CPU knows one process only.
-
-    Args:
-        config: mjlab's configuration of the training.
-        log_dir: Folder of the run.
-    """
-    rank = int(os.environ.get("RANK", "0"))
-    log_file = log_dir / ("train.log" if rank == 0 else f"train.{rank}.log")
-    device = "cpu"
-    if os.environ["CUDA_VISIBLE_DEVICES"]:
-        local_rank = os.environ.get("LOCAL_RANK", "0")
-        device = f"cuda:{local_rank}"
-        torch.cuda.set_device(device)
-        # The device that MuJoCo renders on.
-        os.environ["MUJOCO_EGL_DEVICE_ID"] = local_rank
-    config.agent.seed += rank
-    config.env.seed = config.agent.seed
-    with (
-        log_file.open("a", encoding="utf-8", buffering=1) as file,
-        contextlib.redirect_stdout(file),
-        _closed_process_group(),
-    ):
-        devices.compile_kernels(device)
-        configure_torch_backends()
-        env = RslRlVecEnvWrapper(
-            ManagerBasedRlEnv(cfg=config.env, device=device), clip_actions=config.agent.clip_actions
-        )
-        agent_values = asdict(config.agent)
-        if rank == 0:
-            # The runner changes what it is given.
-            dump_yaml(log_dir / "params" / "env.yaml", asdict(config.env))
-            dump_yaml(log_dir / "params" / "agent.yaml", agent_values)
-        runner = PronkRunner(env, agent_values, str(log_dir), device)
-        add_wandb_tags(config.agent.wandb_tags)
-        runner.add_git_repo_to_log(mjlab_train.__file__)
-        if config.agent.resume:
-            runner.load(str(RunFolder(log_dir).checkpoint()))
-        runner.learn(config.agent.max_iterations, init_at_random_ep_len=True)
-        env.close()
-
-
 def _log_handlers(hosts: tuple[str, ...], processes: int, log_dir: Path) -> list[logging.Handler]:
     """Return where what is printed goes: all of it to files, that of process 0 here as well."""
     from torchrunx.utils.log_handling import RedirectHandler, file_handlers, get_handler_filter
@@ -184,18 +130,3 @@ def _wait_for_checkpoint(log_dir: Path, first: Path | None) -> None:
                 if checkpoint.read_checkpoint(path)["infos"].get("stopped"):
                     return
         time.sleep(0.2)
-
-
-@contextlib.contextmanager
-def _closed_process_group() -> Iterator[None]:
-    """Leave the process group of a CPU after the block.
-
-    If one process fails, the others then notice at once that it is gone, where they would wait half
-    an hour for it.
-    """
-    try:
-        yield
-    finally:
-        distributed = torch.distributed
-        if distributed.is_initialized() and distributed.get_backend() == "gloo":
-            distributed.destroy_process_group()

@@ -14,9 +14,9 @@ from mjlab.scripts.train import TrainConfig
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256, written_whole
 from pronk.jump.train import devices, provenance
-from pronk.jump.train.gains import NAIVE, TrainingGains, gains_of, training_gains
+from pronk.jump.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.jump.train.hosts import Host, check_hosts
-from pronk.jump.train.launch import LOCAL_HOST, launch, train_process
+from pronk.jump.train.launch import LOCAL_HOST, launch
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
@@ -31,6 +31,7 @@ from pronk.jump.train.rl.runner import JumpRunnerCfg
 from pronk.jump.train.settings import TrainSettings
 from pronk.jump.train.tasks import Task, load_task
 from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives
+from pronk.jump.train.train_process import train_process
 from pronk.robots.robot import RobotSpec
 from pronk.tables import counted
 
@@ -105,7 +106,7 @@ def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | Non
             task does not have.
     """
     task = load_task(str(settings.robot))
-    gains = gains_of(settings, task.robot)
+    gains = settings.training_gains(task.robot)
     recipe = load_recipes(settings.recipe) if settings.recipe else None
     _env_cfg(task, gains, settings, recipe)
     return gains, recipe

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import tyro
 
 from pronk.errors import PronkError
 from pronk.jump.train.hosts import parse_hosts
 from pronk.jump.train.phases import TASKS
+
+if TYPE_CHECKING:
+    from pronk.jump.train.gains import TrainingGains
+    from pronk.robots.robot import RobotSpec
 
 WEAKEST_DRIVE = 0.3
 """Smallest share of its torque that a drive may be drawn with: with less a robot cannot stand."""
@@ -180,6 +184,25 @@ class TrainSettings:
         if self.gains in (None, "naive"):
             return self.ranges_from
         return Path(self.gains)
+
+    def training_gains(self, robot: RobotSpec) -> TrainingGains:
+        """Return the gains that a new run with these settings trains with.
+
+        Args:
+            robot: The robot.
+
+        Raises:
+            PronkError: As `pronk.jump.train.gains.training_gains`.
+        """
+        from pronk.jump.train.gains import NAIVE, training_gains
+
+        return training_gains(
+            self.gains or NAIVE,
+            robot,
+            like=self.ranges_from,
+            allow_unmatched=bool(self.allow_unmatched),
+            by_joint=bool(self.draws.by_joint),
+        )
 
     def completed(self) -> Self:
         """Return them with the defaults of a new run in place of None.
