@@ -47,7 +47,10 @@ def _jumped(run: TrialRun) -> float:
 
 
 def _fell(run: TrialRun) -> float:
-    return float(run.figures.fell)
+    figures = run.figures
+    # A robot that its drives cannot hold never stood, so that it did not fall either.
+    never_stood = not (figures.standing or figures.fell)
+    return math.nan if never_stood else float(figures.fell)
 
 
 def _height(run: TrialRun) -> float:
@@ -93,7 +96,8 @@ OUTCOMES: Mapping[str, JumpOutcome] = {
     "fell": JumpOutcome(
         name="fell",
         unit="%",
-        meaning="share of all runs in which the robot fell, before, in or after the jump",
+        meaning="share of the runs in which the robot fell, before, in or after the jump; runs in "
+        "which its drives could not hold it up to begin with do not count",
         value=_fell,
         is_share=True,
         digits=1,
