@@ -106,10 +106,10 @@ class Contract(
     gains: str
     """`matched` or `naive`."""
     gains_sha256: str
-    """Hex SHA-256 of the `gains.yaml` that nominals or, with naive gains, ranges and delay come
-    from; empty without one."""
+    """Hex SHA-256 of the `gains.yaml` that the gains come from; empty for naive gains, also where
+    their ranges and delay come from a file (`ranges_sha256` of `provenance`)."""
     virtual: bool
-    """True if that file rests on pronk's virtual robot."""
+    """True if the `gains.yaml` of gains or ranges rests on pronk's virtual robot."""
     observation: tuple[ObservationPart, ...]
     policy_rate_hz: float
     timestep_s: float
