@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -224,6 +225,19 @@ def test_trainings_of_other_settings_are_not_mixed(tmp_path: Path) -> None:
     )
     with pytest.raises(PronkError, match="run was begun there with other settings"):
         finished([other], LocalExecutor(root), root)
+
+
+def test_only_trainings_of_other_settings_are_named_to_be_deleted(tmp_path: Path) -> None:
+    root = study_root(tmp_path)
+    fields = {"kind": "training", "settings": {"seed": 1}}
+    same = export_task("same", resume_marker="work/same/actuators.py", **fields)
+    changed = export_task("changed", resume_marker="work/changed/actuators.py", **fields)
+    finished([same, changed], LocalExecutor(root), root)
+    changed = replace(changed, settings={"seed": 2})
+    with pytest.raises(PronkError) as refusal:
+        finished([same, changed], LocalExecutor(root), root)
+    assert str(root / "work" / "changed") in str(refusal.value)
+    assert str(root / "work" / "same") not in str(refusal.value)
 
 
 def test_a_policy_of_other_settings_is_not_replaced_where_its_provenance_is_missing(

@@ -200,6 +200,7 @@ class StudyState:
             PronkError: There is such a training or policy; nothing was changed.
         """
         changed = []
+        folders = []
         has_robot_file = False
         for task in tasks:
             record = self.records.get(task.name)
@@ -221,12 +222,13 @@ class StudyState:
             )
             if is_begun and record.key != task.key(self.root):
                 changed.append(task.name)
+                folders.append(str(self.root / task.folder))
                 has_robot_file |= str(task.settings.get("robot")).startswith(f"{INPUTS}/")
         if changed:
             text = (
                 f"--out {self.root}: {', '.join(changed)} was begun there with other settings, "
                 "gains, recipe or robot; give another folder, or delete "
-                f"{self.root / tasks[0].folder} and its like to train anew."
+                f"{', '.join(folders)} to train anew."
             )
             if has_robot_file:
                 text += (
