@@ -232,6 +232,14 @@ def test_a_plan_of_some_arms_counts_those_alone(tmp_path: Path) -> None:
         assert word in text
 
 
+def test_the_walking_policy_of_an_arm_is_relative_to_the_file(tmp_path: Path) -> None:
+    """Not to the folder in which the command is run."""
+    arms = {"a": {"gains": "naive", "options": "--init-checkpoint walks/walk.pt"}}
+    path = written(tmp_path, arms=arms, training={"task": "jump"})
+    text = refused("study", path, "--device", "cpu", "--out", tmp_path / "out")
+    assert str(tmp_path / "walks" / "walk.pt") in text
+
+
 def test_the_study_of_the_examples_is_as_large_as_it_says() -> None:
     path = Path(__file__).parents[2] / "examples" / "studies" / "match_worth" / "study.yaml"
     config = load_study(path)

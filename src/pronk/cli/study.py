@@ -185,7 +185,11 @@ def _training_arms(config: StudyConfig, folder: Path, study_file: Path) -> dict[
             values = parsed_command([*words, *options])
             settings = replace(values["settings"], gains=gains)
             recipe = tuple(folder / path for path in settings.recipe)
-            settings = replace(settings, recipe=recipe).completed()
+            settings = replace(settings, recipe=recipe)
+            if settings.init_checkpoint is not None:
+                checkpoint = folder / settings.init_checkpoint
+                settings = replace(settings, init_checkpoint=checkpoint)
+            settings = settings.completed()
         except PronkError as error:
             raise PronkError(f"{study_file}: arms.{name}: {error}") from None
         if arm.randomization is not None and (settings.draws.ellipsoid or settings.draws.by_joint):
