@@ -104,8 +104,11 @@ def study(
             figures={**plan_figures(selection, estimate), "tables": tables},
             following=[shlex.join([*words, *place.words])],
         )
-    is_trained = selection.trainings > 0
-    chosen = choose_place(place, "cpu" if not is_trained and device == "auto" else device)
+    if selection.trainings == 0 and device == "auto":
+        # Trials of finished policies need no GPU, also by a command that gave trainings theirs.
+        device = "cpu"
+        place = replace(place, gpus=None, per_gpu=None)
+    chosen = choose_place(place, device)
     console.say(
         f"{config.title}: {counted(selection.trainings, 'training')}, "
         f"{counted(selection.trials, 'trial')} of {counted(selection.jumps, 'jump')} in all, on "
