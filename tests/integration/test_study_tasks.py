@@ -145,6 +145,18 @@ def test_the_result_of_a_trial_does_not_depend_on_its_processes(tmp_path: Path) 
     assert export_task("training", cores=4.0).threads == 4
 
 
+def test_a_task_is_skipped_for_the_one_that_failed_and_not_for_one_done_before(
+    tmp_path: Path,
+) -> None:
+    root = study_root(tmp_path)
+    good = export_task("good")
+    finished([good], LocalExecutor(root), root)
+    bad = export_task("bad", "inputs/bad.yaml")
+    behind = export_task("behind", needs=("good", "bad"))
+    status = finished([good, bad, behind], LocalExecutor(root), root)["behind"]
+    assert (status.state, status.reason) == ("skipped", "bad has failed")
+
+
 def test_a_command_that_ends_without_its_output_has_failed(tmp_path: Path) -> None:
     root = study_root(tmp_path)
     task = export_task("short", outputs=("work/short/actuators.py", "work/short/policy.onnx"))

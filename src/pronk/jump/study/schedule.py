@@ -160,18 +160,19 @@ class _Loop:
             needs = (task.kind, task.gpu, task.cores)
             if needs in full:
                 continue
-            needed = [self.statuses[need].state for need in task.needs]
-            if any(state in ("failed", "skipped") for state in needed):
-                failed = [need for need in task.needs if self.statuses[need].state != "done"]
+            needed = [self.statuses[need] for need in task.needs]
+            failed = [need.name for need in needed if need.state in ("failed", "skipped")]
+            if failed:
                 self._set(name, state="skipped", reason=f"{failed[0]} has failed")
                 continue
-            if any(state not in ("done", "kept") for state in needed):
+            if any(need.state not in ("done", "kept") for need in needed):
                 continue
             if name not in self.keys:
                 self.keys[name] = task.key(self.root)
                 if self.failures[name] + self.losses[name] == 0 and self.state.is_done(task):
                     self._set(name, state="kept")
                     continue
+            goes_on = task.goes_on(self.root)
             place = self.executor.try_start(task)
             if not place:
                 full.add(needs)
