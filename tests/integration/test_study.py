@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from pronk.jump.study.config import RandomizationConfig
 from pronk.jump.study.outcomes import OUTCOMES
 from pronk.jump.study.study import randomized_gains, read_trial
 from pronk.jump.study.study_results import load_study_results
+from pronk.jump.study.tasks import StudyState
 from pronk.jump.study.trainings import (
     SPREADS,
     spread_over_seeds,
@@ -281,6 +283,22 @@ def test_trials_of_several_versions_are_named(whole_study: Path, study_copy: Pat
         assert version in results.mixed_versions
     assert results.mixed_versions in (study_copy / "report.html").read_text()
     assert not load_study_results(whole_study / "out" / "study.json").mixed_versions
+
+
+@pytest.mark.slow
+def test_trials_of_several_sources_are_named(whole_study: Path, study_copy: Path) -> None:
+    """As in a study that goes on with another commit, whose version is the same."""
+    results = load_study_results(study_copy / "study.json")
+    present = results.versions["sources"]
+    assert not results.mixed_versions
+    state = StudyState(study_copy)
+    name = "hopper, seed 1, on whole"
+    state.set(name, replace(state.records[name], sources=("0123456789ab",)))
+    command = invoke(["study", whole_study / "study.yaml", "--out", study_copy])
+    assert command.exit_code == 0
+    for sources in (present, "0123456789ab"):
+        assert sources in command.stderr
+    assert "done before" in command.output
 
 
 @pytest.mark.slow

@@ -252,6 +252,26 @@ def test_only_trainings_of_other_settings_are_named_to_be_deleted(tmp_path: Path
     assert str(root / "work" / "same") not in str(refusal.value)
 
 
+def test_a_task_goes_back_to_the_sources_of_all_its_starts(tmp_path: Path) -> None:
+    """A study that goes on with another commit has results of both."""
+    root = study_root(tmp_path)
+    task = export_task("one")
+    finished([task], LocalExecutor(root), root)
+    (present,) = StudyState(root).records["one"].sources
+
+    # As if an earlier pronk had begun the task.
+    state = StudyState(root)
+    record = state.records["one"]
+    state.set("one", replace(record, status="started", sources=("earlier",)))
+    finished([task], LocalExecutor(root), root)
+    assert StudyState(root).records["one"].sources == ("earlier", present)
+
+    # Nothing of the earlier ones is left.
+    shutil.rmtree(root / task.folder)
+    finished([task], LocalExecutor(root), root)
+    assert StudyState(root).records["one"].sources == (present,)
+
+
 def test_a_policy_of_other_settings_is_not_replaced_where_its_provenance_is_missing(
     tmp_path: Path,
 ) -> None:

@@ -30,6 +30,7 @@ from pronk.jump.study.tasks import (
     last_lines,
     program,
     program_environment,
+    sources_of,
     store_file,
 )
 from pronk.processes import exit_words
@@ -97,6 +98,8 @@ class RemoteTask:
     """Name of this start, with which its messages are marked."""
     version: str
     """Version of pronk that started it."""
+    sources: str
+    """Hash of its sources, as of `sources_of`."""
 
 
 @dataclass
@@ -163,6 +166,12 @@ def run_remote_task(
             "the same version on all nodes",
         }
     task = remote.task
+    if remote.sources != sources_of(task.kind):
+        return {
+            "ended": "failed",
+            "reason": f"{socket.gethostname()} has other sources of pronk than this host, though "
+            f"of the same version {VERSION}; install the same on all nodes",
+        }
     with tempfile.TemporaryDirectory(prefix="pronk-task-") as folder:
         root = Path(folder)
         for path, content in zip(paths, ray.get(list(contents)), strict=True):
@@ -255,7 +264,13 @@ class RayExecutor:
         words = task.words(self.root)
         paths = sorted({*task.inputs, *self._resumed_files(task)})
         attempt = uuid.uuid4().hex
-        remote = RemoteTask(task=task, words=words, attempt=attempt, version=VERSION)
+        remote = RemoteTask(
+            task=task,
+            words=words,
+            attempt=attempt,
+            version=VERSION,
+            sources=sources_of(task.kind),
+        )
         function = ray.remote(run_remote_task).options(
             num_cpus=needs["CPU"], num_gpus=needs["GPU"], max_retries=0, name=task.name
         )

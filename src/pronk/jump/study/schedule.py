@@ -181,7 +181,7 @@ class _Loop:
             record = TaskRecord(
                 key=self.keys[name], status="started", attempts=attempts, place=place
             )
-            self.state.set(name, record)
+            self.state.start(task, record, goes_on=goes_on)
             self.running[name] = _Running(task=task, place=place, begun=time.monotonic())
             self._set(name, state="running", place=place, attempts=attempts)
 

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,12 +45,15 @@ from pronk.jump.study.study_results import (
     OWN_ROBOT,
     RUNS_FILE,
     SEVERAL_VERSIONS,
+    SOURCES,
     STUDY_FILE,
+    TRAINING_VERSIONS,
     TRIALS,
     ComparedArms,
     OutcomeCell,
     StudyResults,
     save_study,
+    version_of_training,
 )
 from pronk.jump.study.study_results import (
     WRITER as STUDY_WRITER,
@@ -57,6 +62,7 @@ from pronk.jump.study.tasks import (
     INPUTS,
     StudyState,
     StudyTask,
+    TaskRecord,
     copied_input,
     written_input,
 )
@@ -617,7 +623,10 @@ def collect_results(
         robot_jumps={robot.name: robot.jumps for robot in plan.robots},
         missing=tuple(missing),
         failed=tuple(failed),
-        versions=_joined_versions(versions),
+        versions={
+            **(_joined_versions(versions) or software_versions()),
+            **_joined_versions(_training_versions(plan, root, statuses)),
+        },
     )
     write_text(root / RUNS_FILE, runs_csv(plan, jumps))
     save_study(root / STUDY_FILE, results)
@@ -626,11 +635,12 @@ def collect_results(
 
 def _read_jumps(
     plan: StudyPlan, root: Path, statuses: Mapping[str, TaskStatus]
-) -> tuple[Jumps, list[dict[str, str]], list[str]]:
+) -> tuple[Jumps, list[Mapping[str, str]], list[str]]:
     """Return the jumps of all trials that are done, their versions, and names of the others."""
     jumps: Jumps = {}
-    versions = []
+    versions: list[Mapping[str, str]] = []
     missing = []
+    records = StudyState(root).records
     for arm in plan.arms:
         for robot in plan.robots:
             if arm.name not in robot.arms:
@@ -644,6 +654,7 @@ def _read_jumps(
                 trial = read_trial(root / trial_folder(arm, seed, robot))
                 by_seed[seed] = trial.rows
                 versions.append(trial.versions)
+                versions += _sources_of_record(records[name])
             jumps[arm.name, robot.name] = by_seed
     return jumps, versions, missing
 
@@ -659,21 +670,51 @@ def read_trial(folder: Path) -> StoredCell:
     return replace(stored, versions=stored.versions or versions)
 
 
-def _joined_versions(stored_versions: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """Return the versions of software of all trials, several of one as one text.
+def _training_versions(
+    plan: StudyPlan, root: Path, statuses: Mapping[str, TaskStatus]
+) -> list[Mapping[str, str]]:
+    """Return the versions that decided each session of the trainings that are done."""
+    versions: list[Mapping[str, str]] = []
+    records = StudyState(root).records
+    for arm in plan.arms:
+        if arm.training is None:
+            continue
+        for seed in plan.seeds(arm):
+            name = training_name(arm.name, seed)
+            if name not in statuses or statuses[name].state not in ("done", "kept"):
+                continue
+            sessions = _sources_of_record(records[name])
+            path = root / training_folder(arm.training, seed) / "provenance.json"
+            # The copy of a study needs the policies of its trainings alone.
+            with suppress(OSError, ValueError, LookupError, TypeError):
+                for session in json.loads(path.read_text(encoding="utf-8"))["sessions"]:
+                    sessions.append(msgspec.convert(session["versions"], dict[str, str]))
+            for session_versions in sessions:
+                deciding = {}
+                for software in TRAINING_VERSIONS:
+                    if software in session_versions:
+                        deciding[version_of_training(software)] = session_versions[software]
+                versions.append(deciding)
+    return versions
 
-    Trials that are kept may be of other versions than those of this process, which are returned
-    where there is no trial.
+
+def _sources_of_record(record: TaskRecord) -> list[Mapping[str, str]]:
+    """Return the hashes of pronk's sources that the result of a task goes back to."""
+    return [{SOURCES: sources} for sources in record.sources]
+
+
+def _joined_versions(stored_versions: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """Return the versions of software of all trials or trainings, several of one as one text.
+
+    Those that are kept may be of other versions than those of this process.
 
     Args:
-        stored_versions: Versions of each trial.
+        stored_versions: Versions of each.
     """
     versions: dict[str, set[str]] = {}
     for stored in stored_versions:
         for name, version in stored.items():
             versions.setdefault(name, set()).add(version)
-    if not versions:
-        return software_versions()
     return {name: SEVERAL_VERSIONS.join(sorted(several)) for name, several in versions.items()}
 
 

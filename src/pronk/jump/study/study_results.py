@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -38,6 +38,20 @@ MAX_UNEVEN = 5
 """Largest number of robots that the note on unequal shares of jumps names."""
 SEVERAL_VERSIONS = " and "
 """What joins the versions of a software where trials have several."""
+SOURCES = "sources"
+"""Name of the hashes of pronk's sources among versions. The version of pronk is the same in many
+commits."""
+TRAINING_VERSIONS = (
+    "pronk",
+    SOURCES,
+    "mjlab",
+    "mujoco",
+    "mujoco_warp",
+    "warp",
+    "torch",
+    "rsl_rl",
+)
+"""Software whose version decides what a training computes."""
 TRIALS = "trials"
 """Folder of the trials in that of a study."""
 NO_INTERVAL = (
@@ -171,23 +185,28 @@ class StudyResults:
     """Trainings that failed, with the reasons."""
     versions: dict[str, str] = field(default_factory=dict)
     """Versions of software that the trials were computed with, several joined by
-    `SEVERAL_VERSIONS`."""
+    `SEVERAL_VERSIONS`, and under `SOURCES` the hashes of pronk's sources; by `version_of_training`
+    the same of the trainings, except of finished policies and in results of an earlier pronk."""
 
     @property
     def mixed_versions(self) -> str:
-        """A sentence on trials of different physics in one table; empty if all are of the same."""
-        mixed = []
-        for name in DECIDING_VERSIONS:
-            version = self.versions.get(name, "")
-            if SEVERAL_VERSIONS in version:
-                mixed.append(f"{name} {version}")
-        if not mixed:
-            return ""
-        return (
-            f"The trials are not all of one version ({', '.join(mixed)}), which decides what is "
-            "simulated: a difference between arms or robots may be one between versions. Delete "
-            f"the folder {TRIALS} and run the command again; trainings are kept."
-        )
+        """Sentences on trials and trainings of several versions; empty if all are of the same."""
+        sentences = []
+        mixed = _several(self.versions, (*DECIDING_VERSIONS, SOURCES))
+        if mixed:
+            sentences.append(
+                f"The trials are not all of one version ({mixed}), which decides what is "
+                "simulated: a difference between arms or robots may be one between versions. "
+                f"Delete the folder {TRIALS} and run the command again; trainings are kept."
+            )
+        mixed = _several(self.versions, [version_of_training(name) for name in TRAINING_VERSIONS])
+        if mixed:
+            sentences.append(
+                f"The trainings are not all of one version ({mixed}), which decides what is "
+                "trained: a difference between arms may be one between versions. state.json and "
+                "each training's provenance.json say which has which."
+            )
+        return " ".join(sentences)
 
     def cell(self, arm: str, robot: str, outcome: str) -> OutcomeCell:
         """Return one outcome of one arm on one robot; without a value if it was not tried there."""
@@ -195,6 +214,21 @@ class StudyResults:
             if (cell.arm, cell.robot, cell.outcome) == (arm, robot, outcome):
                 return cell
         return OutcomeCell(arm=arm, robot=robot, outcome=outcome, jumps=0)
+
+
+def version_of_training(name: str) -> str:
+    """Return under which name the version of a software has its place that trainings ran with."""
+    return f"training {name}"
+
+
+def _several(versions: Mapping[str, str], names: Sequence[str]) -> str:
+    """Return the software of which there are several versions, with these versions."""
+    several = []
+    for name in names:
+        version = versions.get(name, "")
+        if SEVERAL_VERSIONS in version:
+            several.append(f"{name} {version}")
+    return ", ".join(several)
 
 
 def save_study(path: Path, results: StudyResults) -> None:

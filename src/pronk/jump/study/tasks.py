@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ import msgspec
 import pronk
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import locked_folder, sha256, write_text, written_whole
+from pronk.jump.train.versions import sources_sha256
 
 STATE_FILE = "state.json"
 """Name of the file with the states of all tasks, in the folder of the study."""
@@ -35,6 +36,13 @@ INPUTS = "inputs"
 """Folder with copies of the files that tasks read, named by their content."""
 
 TaskKind = Literal["training", "trial"]
+_SOURCES: Mapping[TaskKind, tuple[str, ...]] = {
+    "training": ("identify/match", "jump/train", "policy", "robots"),
+    "trial": ("jump/trial", "jump/virtual", "policy", "robots"),
+}
+"""Folders of the package whose files decide what a task computes. That of trainings that are
+compared with one another has to be one pronk, as has that of trials; its version alone does not
+tell two commits apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +90,18 @@ class StudyTask:
         text = json.dumps([self.kind, dict(self.settings), hashes], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def goes_on(self, root: Path) -> bool:
+        """Return whether the next start goes on with what an earlier one has written."""
+        if self.resume_marker:
+            return (root / self.resume_marker).is_file()
+        folder = root / self.folder
+        return folder.is_dir() and any(folder.iterdir())
+
     def words(self, root: Path) -> tuple[str, ...]:
         """Return the words after `pronk` to start or go on with, and make the folder fit for it."""
         if not self.resume_marker:
             return self.command
-        if (root / self.resume_marker).is_file():
+        if self.goes_on(root):
             return self.resume_command
         # The command was killed before it could write what it needs to go on.
         shutil.rmtree(root / self.folder, ignore_errors=True)
@@ -133,6 +148,9 @@ class TaskRecord:
     """Where it ran last: a GPU, a CPU or a node."""
     reason: str = ""
     """Why it failed."""
+    sources: tuple[str, ...] = ()
+    """Hashes of pronk's sources at its starts, of those that the result goes back to; empty where
+    an earlier pronk started it."""
 
 
 class StudyState:
@@ -238,6 +256,22 @@ class StudyState:
                 )
             raise PronkError(text)
 
+    def start(self, task: StudyTask, record: TaskRecord, *, goes_on: bool) -> None:
+        """Remember a task that has just been started, and the sources of pronk that it rests on.
+
+        Args:
+            task: The task.
+            record: Its record, without sources.
+            goes_on: Whether it goes on with what earlier starts have written, whose sources then
+                count as well.
+        """
+        sources = [sources_of(task.kind)]
+        before = self.records.get(task.name)
+        if goes_on and before is not None and before.key == record.key:
+            sources = [*before.sources, *sources]
+        record.sources = tuple(dict.fromkeys(sources))
+        self.set(task.name, record)
+
     def finish(self, task: StudyTask, record: TaskRecord) -> TaskRecord:
         """Remember a task whose command has ended well; it has failed if an output is missing."""
         missing = [path for path in task.outputs if not (self.root / path).is_file()]
@@ -259,6 +293,12 @@ def file_hash(path: Path) -> str:
     """
     status = path.stat()
     return _hash_of_version(path, status.st_mtime_ns, status.st_size)
+
+
+@cache
+def sources_of(kind: TaskKind) -> str:
+    """Return the beginning of the hash of the sources that decide what a task computes."""
+    return sources_sha256(_SOURCES[kind], (".py", ".xml", ".yaml"))[:12]
 
 
 @lru_cache(maxsize=10_000)

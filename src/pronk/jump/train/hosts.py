@@ -240,7 +240,7 @@ def answer(question: HostQuestion) -> HostFacts:
 
 def own_facts(robot: str) -> HostFacts:
     """Return what this machine computes with, without its devices."""
-    from pronk.jump.train.versions import package_versions
+    from pronk.jump.train.versions import package_versions, sources_sha256
     from pronk.robots import load_robot
 
     model_text = load_robot(robot).build_spec().to_xml()
@@ -253,21 +253,11 @@ def own_facts(robot: str) -> HostFacts:
     return HostFacts(
         host_name=socket.getfqdn(),
         versions=package_versions(),
-        sources_sha256=_sources_sha256(),
+        sources_sha256=sources_sha256(),
         robot_sha256=hashlib.sha256(model_text.encode()).hexdigest(),
         boot_id=boot_id,
         address=address,
     )
-
-
-def _sources_sha256() -> str:
-    """Return the hash of the sources of this pronk: names and contents of its Python files."""
-    package = Path(__file__).parents[2]
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 @contextlib.contextmanager
