@@ -27,7 +27,7 @@ from pronk.jump.study.study_results import (
 from pronk.report.study_figures import draw_robots, draw_tolerance, has_robots, has_series
 from pronk.report.study_page import comparison_sentence
 from pronk.report.style import save_figure
-from pronk.tables import Table
+from pronk.tables import Table, counted
 
 SECTION = "the study"
 """Name of the sections of both pages."""
@@ -59,7 +59,7 @@ def study_section(results: StudyResults, command: str, figures: str) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
     parts = [
         f"Measured by `{command}` on pronk's virtual robot: {len(results.arms)} arms, "
-        f"{len(results.commands)} commands, {results.jumps} jumps with each of every policy on a "
+        f"{len(results.commands)} commands, {_jumps_text(results)} with each of every policy on a "
         f"robot ({versions})."
     ]
     sentences = []
@@ -93,12 +93,35 @@ def evidence_section(results: StudyResults, command: str) -> str:
     return "\n\n".join(parts)
 
 
+def _jumps_text(results: StudyResults) -> str:
+    """Return the number of jumps with each command, and on how many robots it is another one."""
+    counts: dict[int, int] = {}
+    for jumps in results.robot_jumps.values():
+        if jumps != results.jumps:
+            counts[jumps] = counts.get(jumps, 0) + 1
+    text = f"{results.jumps} jumps"
+    if counts:
+        exceptions = []
+        for jumps, robots in counts.items():
+            exceptions.append(f"{jumps} on {robots} of the {len(results.robots)} robots")
+        text += f" ({', '.join(exceptions)})"
+    return text
+
+
 def _missing(results: StudyResults) -> list[str]:
-    """Return a sentence on trials and trainings that are missing, if there are any."""
+    """Return sentences on what is missing, by arm, and on versions that are mixed, if there are."""
     parts = []
     if results.missing:
-        parts.append(f"{len(results.missing)} trials are missing: {'; '.join(results.missing)}.")
+        by_arm = []
+        for arm in results.arms:
+            # Names of trials begin with those of their arm.
+            count = sum(name.startswith(f"{arm}, seed ") for name in results.missing)
+            if count:
+                by_arm.append(f"{arm} {count}")
+        parts.append(f"{counted(len(results.missing), 'trial')} missing: {', '.join(by_arm)}.")
     parts += results.failed
+    if results.mixed_versions:
+        parts.append(results.mixed_versions)
     return parts
 
 

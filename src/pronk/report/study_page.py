@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,10 +38,12 @@ def comparison_sentence(comparison: ComparedArms) -> str:
         title = f"{name} ({', '.join(comparison.commands)})"
     else:
         title = name
-    return (
-        f"{title}: {comparison.arm} less {comparison.against}, on "
-        f"{', '.join(comparison.robots)}: {text} {definition.unit}, {comparison.verdict}."
+    compared = (
+        f"{title}: {comparison.arm} less {comparison.against}, on {', '.join(comparison.robots)}"
     )
+    if not math.isfinite(comparison.value):
+        return f"{compared}: {comparison.verdict}."
+    return f"{compared}: {text} {definition.unit}, {comparison.verdict}."
 
 
 def study_part(path: Path) -> Part:
