@@ -6,8 +6,9 @@ evidence is, with stiffness and damping correlated as the match found them; dry 
 command delay are drawn in their intervals (`joint_draws`).
 
 Nominal gains are those of the real drives, put into the simulator as they are (reading A20 of S4);
-the paper calls such a policy naive. Everything else stays the same, so that two policies differ by
-the gains alone.
+the paper calls such a policy naive. With ranges and delay of a match everything else stays the
+same, but for the dry friction: that of the robot's drives goes with nominal gains, and that of the
+match with matched ones where the file has it (schema 2).
 """
 
 from __future__ import annotations
