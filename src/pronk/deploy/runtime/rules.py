@@ -251,8 +251,7 @@ def limit_targets(
         fastest = np.where(ahead < lowest, np.maximum(fastest, floor), fastest)
     least_torque = without_torque - reach
     largest_torque = without_torque + reach
-    low = np.maximum(np.maximum(floor, slowest), least_torque)
-    high = np.minimum(np.minimum(ceiling, fastest), largest_torque)
+    low, high = _intersection((floor, ceiling), (slowest, fastest), (least_torque, largest_torque))
     limited = np.minimum(np.maximum(target, low), high)
     torque_is_possible = is_stiff | (damping * np.abs(velocity) <= joints.torque)
     possible: Mask = ((low <= high) & torque_is_possible).all(axis=-1)
@@ -275,8 +274,7 @@ def limit_targets(
     moved_by = np.where(excessive, _POWER, moved_by)
     slowest = np.minimum(slowest, without_torque)
     fastest = np.maximum(fastest, without_torque)
-    low = np.maximum(np.maximum(floor, slowest), least_torque)
-    high = np.minimum(np.minimum(ceiling, fastest), largest_torque)
+    low, high = _intersection((floor, ceiling), (slowest, fastest), (least_torque, largest_torque))
     # A joint that turns faster than without load brakes, whatever its target, so that one round
     # may leave too much.
     for _ in range(_POWER_ROUNDS):
@@ -296,6 +294,15 @@ def limit_targets(
             break
     possible &= ~excessive
     return limited, moved_by, possible
+
+
+def _intersection(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the lower and the upper ends of the intersection of intervals of targets [rad]."""
+    low, high = intervals[0]
+    for bottom, top in intervals[1:]:
+        low = np.maximum(low, bottom)
+        high = np.minimum(high, top)
+    return low, high
 
 
 def _torque_and_power(
