@@ -7,6 +7,7 @@ import math
 import struct
 import subprocess
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +34,14 @@ from pronk.deploy.links.dds.image import (
 )
 from pronk.deploy.links.dds.messages import LowCmd, LowState
 from pronk.deploy.links.lcm import codec as lcm
-from pronk.deploy.links.lcm.layouts import CHEETAH, KNEE_RATIO, WTW, LcmLayout, find_layout
+from pronk.deploy.links.lcm.layouts import (
+    CHEETAH,
+    KNEE_RATIO,
+    WTW,
+    LcmLayout,
+    find_layout,
+    layout_for,
+)
 from pronk.deploy.links.lcm.messages import (
     CONTROL_PARAMETER,
     LCM_MESSAGES,
@@ -45,7 +53,7 @@ from pronk.deploy.links.lcm.messages import (
     LcmMessage,
 )
 from pronk.errors import HardwareError
-from pronk.robots import load_robot
+from pronk.robots import RobotSpec, load_robot, robot_file_path
 from pronk.robots.machine import Command, RefusedError, State
 
 ROBOT = load_robot("mini_cheetah")
@@ -508,3 +516,95 @@ def test_layouts_and_robots_that_do_not_exist_are_refused() -> None:
         find_layout("go2")
     with pytest.raises(HardwareError, match="so101"):
         dds.joint_map(load_robot("so101"))
+
+
+# --- Other quadrupeds -----------------------------------------------------------------------------
+
+GO2 = load_robot("go2")
+GO2_POSE = np.array([joint.default_position for joint in GO2.joints])
+UNITREE_POSE = np.tile([0.0, 0.9, -1.8], 4)
+"""A standing Go2 in Unitree's own angles: hip, thigh, calf of each leg [rad]."""
+
+
+def test_a_go2_behind_the_bridge_has_unitrees_signs() -> None:
+    wire = LcmWire(layout_for(GO2, "wtw"))
+    attitude, _ = wire.encode_state(some_state())
+    joints = WTW_LEG_CONTROL_DATA.encode(
+        {"q": UNITREE_POSE, "qd": UNITREE_POSE, "tau_est": UNITREE_POSE}
+    )
+    state = wire.state_decoder()((attitude, joints), 0.0)
+    assert state is not None
+    for values in (state.position, state.velocity, state.torque):
+        np.testing.assert_allclose(values, GO2_POSE, atol=1e-6)
+    command = Command(position=GO2_POSE, stiffness=np.ones(12), damping=np.ones(12))
+    fields = WTW_PD_TAU_TARGETS.decode(wire.encode(command))
+    np.testing.assert_allclose(fields["q_des"], UNITREE_POSE)
+    # A speed or a torque of another program is refused for any robot.
+    moving = WTW_PD_TAU_TARGETS.encode({"q_des": UNITREE_POSE, "tau_ff": 1.0})
+    assert refusal(lambda: wire.decode(moving)) == "feed-forward"
+
+
+def test_the_mini_cheetah_keeps_its_layouts() -> None:
+    assert layout_for(ROBOT, "cheetah") is CHEETAH
+    assert layout_for(ROBOT, "wtw") is WTW
+    np.testing.assert_array_equal(JOINTS.sign, np.tile([1.0, -1.0, -1.0], 4))
+    np.testing.assert_array_equal(dds.joint_map(GO2).sign, np.ones(12))
+
+
+def go2_with(folder: Path, change: Callable[[ElementTree.Element], None]) -> RobotSpec:
+    """Return the Go2 with a change of its model's trunk."""
+    source = Path(str(robot_file_path("go2"))).parent
+    tree = ElementTree.parse(source / "go2.xml")
+    trunk = tree.find(".//body[@name='trunk']")
+    assert trunk is not None
+    change(trunk)
+    tree.write(folder / "go2.xml")
+    # The mirror symmetry of its legs is verified, and not of this change.
+    text = (source / "robot.yaml").read_text().replace("mirror: {FL: FR, RR: FR, RL: FR}", "")
+    (folder / "robot.yaml").write_text(text)
+    return load_robot(folder / "robot.yaml")
+
+
+def left_first(trunk: ElementTree.Element) -> None:
+    """Put the front left leg before the front right one, as Unitree's URDF of the Go2 has them."""
+    left = trunk.find("body[@name='FL_hip']")
+    assert left is not None
+    trunk.remove(left)
+    trunk.insert(list(trunk).index(trunk.find("body[@name='FR_hip']")), left)
+
+
+def other_axis(trunk: ElementTree.Element) -> None:
+    """Have a thigh turn about z."""
+    joint = trunk.find(".//joint[@name='RL_hip_pitch']")
+    assert joint is not None
+    joint.set("axis", "0 0 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(left_first, "front left, front right"), (other_axis, "RL_hip_pitch")],
+)
+def test_a_model_with_other_legs_is_refused(
+    change: Callable[[ElementTree.Element], None], words: str, tmp_path: Path
+) -> None:
+    robot = go2_with(tmp_path, change)
+    with pytest.raises(HardwareError, match=words):
+        dds.joint_map(robot)
+    for name in ("cheetah", "wtw"):
+        with pytest.raises(HardwareError, match=words):
+            layout_for(robot, name)
+
+
+def test_a_robots_clock_that_begins_anew_goes_on() -> None:
+    decoder = dds.DdsStateDecoder(JOINTS, Counter())
+    times = []
+    for number in range(-3, 3):
+        robot_time = (2**32 + 2 * number) / 1000.0
+        state = some_state()
+        state = replace(state, robot_time=robot_time, gyro=state.gyro + 0.01 * number)
+        taken = decoder.take(dds.encode_dds_state(JOINTS, state), 100.0 + 0.002 * number)
+        assert taken is not None
+        assert taken.robot_time is not None
+        times.append(taken.robot_time)
+    np.testing.assert_allclose(np.diff(times), 0.002, atol=1e-6)
+    assert decoder.counts == Counter()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pronk.deploy.bench.server import ServerTransport
 from pronk.deploy.links.lcm import codec
-from pronk.deploy.links.lcm.layouts import find_layout
+from pronk.deploy.links.lcm.layouts import layout_for
 from pronk.deploy.links.lcm.link import open_lcm, url_of
 from pronk.deploy.links.lcm.messages import (
     BEACON_CHANNEL,
@@ -47,7 +47,7 @@ class LcmServerTransport(ServerTransport):
             url: An LCM address instead of the port.
         """
         super().__init__(robot, mode, tuple(codec.CONTROL_MODES.values()))
-        self._layout = find_layout(layout)
+        self._layout = layout_for(robot, layout)
         if url is None:
             url = url_of(port=port)
         self._lcm = open_lcm(url)

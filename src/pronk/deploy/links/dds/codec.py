@@ -1,9 +1,10 @@
 """States and commands to Unitree's DDS messages and back.
 
 Joints. Slots 0 to 11 are FR, FL, RR, RL, each hip, thigh, calf: pronk's own order, FR FL HR HL,
-each hip_roll, hip_pitch, knee; slots 12 to 19 drive nothing. On a Go2 the hip turns about +x, thigh
-and calf about +y, all zero with the leg straight down. The Mini Cheetah's hip_pitch and knee turn
-about -y, with the same zeros, so behind these messages (which only its virtual robot has)
+each hip_roll, hip_pitch, knee (`leg_axes` refuses a model with another order); slots 12 to 19 drive
+nothing. On a Go2 the hip turns about +x, thigh and calf about +y, all zero with the leg straight
+down. The Mini Cheetah's hip_pitch and knee turn about -y, with the same zeros, so behind these
+messages (which only its virtual robot has)
 
     hip = hip_roll,  thigh = -hip_pitch,  calf = -knee
 
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.deploy.links.dds.image import c_image_dtype, deserialize_image, serialize_image
 from pronk.deploy.links.dds.messages import LowCmd, LowState
+from pronk.deploy.links.leg_axes import axis_signs
 from pronk.deploy.links.numbering import StateNumbering, unit_quaternion
 from pronk.errors import HardwareError
 from pronk.robots.machine import Command, RefusedError, State, check_command
@@ -43,6 +45,8 @@ VEL_STOP = 16000.0
 VIRTUAL_SERIAL = (0x4E4F5250, 0x4D49534B)
 """`sn` that identifies a virtual robot: `PRONKSIM`."""
 TICKS_PER_S = 1000
+_TICKS = 2**32
+"""Number of ticks after which the robot's clock begins anew: 49.7 days."""
 STATE_RATE_HZ = 500.0
 _JOINTS = 12
 # Plausible targets and gains: no joint turns twice, and these gains are ten times the usual ones.
@@ -63,23 +67,30 @@ class JointMap:
     """Whether no real robot of this name uses these messages."""
 
 
-_JOINT_MAPS = {
-    # Unitree's own deployments damp a Go2 with 3 to 8.
-    "go2": JointMap(sign=np.ones(_JOINTS), sink_damping=3.0, virtual_only=False),
-    "mini_cheetah": JointMap(
-        sign=np.tile([1.0, -1.0, -1.0], 4), sink_damping=1.0, virtual_only=True
-    ),
-}
+_SINK_DAMPING = {"go2": 3.0, "mini_cheetah": 1.0}
+"""Damping with which each robot sinks softly [N m s/rad]. Unitree's own deployments damp a Go2 with
+3 to 8."""
+_VIRTUAL_ONLY = ("mini_cheetah",)
+"""Robots of which only the virtual one uses these messages."""
 
 
 def joint_map(robot: RobotSpec) -> JointMap:
-    """The map of a robot; HardwareError for one that does not fit behind Unitree's messages."""
-    if robot.name not in _JOINT_MAPS:
+    """Return the map of a robot.
+
+    Raises:
+        HardwareError: The robot does not fit behind Unitree's messages, or its legs have another
+            order.
+    """
+    if robot.name not in _SINK_DAMPING or len(robot.joints) != _JOINTS:
         raise HardwareError(
-            f"{robot.name} has no place in Unitree's messages; "
-            f"the robots that have are {', '.join(_JOINT_MAPS)}."
+            f"{robot.name} with {len(robot.joints)} joints has no place in Unitree's messages; the "
+            f"robots that have are {', '.join(_SINK_DAMPING)}, with {_JOINTS} joints."
         )
-    return _JOINT_MAPS[robot.name]
+    return JointMap(
+        sign=axis_signs(robot),
+        sink_damping=_SINK_DAMPING[robot.name],
+        virtual_only=robot.name in _VIRTUAL_ONLY,
+    )
 
 
 def encode_dds_command(joints: JointMap, command: Command) -> bytes:
@@ -175,7 +186,7 @@ def encode_dds_state(joints: JointMap, state: State) -> bytes:
     record = _record_with_head(LowState)
     record["sn"] = VIRTUAL_SERIAL
     robot_time = state.time if state.robot_time is None else state.robot_time
-    record["tick"] = round(robot_time * TICKS_PER_S) % 2**32
+    record["tick"] = round(robot_time * TICKS_PER_S) % _TICKS
     record["power_v"] = state.bus_voltage
     if state.remote:
         record["wireless_remote"] = np.frombuffer(state.remote, np.uint8)
@@ -203,6 +214,9 @@ class DdsStateDecoder(StateNumbering):
         self.virtual = False
         """Whether the last message was a virtual robot's."""
         self._joints = joints
+        self._ticks: int | None = None
+        """The robot's clock, which goes on where that of the messages begins anew; None before a
+        state."""
 
     def take(self, data: bytes, arrived: float) -> State | None:
         """Decode a message that arrived at a time [s]; temperatures that are all zero are none.
@@ -224,6 +238,9 @@ class DdsStateDecoder(StateNumbering):
         serial = record["sn"][0]
         self.virtual = (int(serial[0]), int(serial[1])) == VIRTUAL_SERIAL
         tick = int(record["tick"][0])
+        if self._ticks is None:
+            self._ticks = tick
+        self._ticks += (tick - self._ticks + _TICKS // 2) % _TICKS - _TICKS // 2
         temperature = None
         if motors["temperature"].any():
             temperature = motors["temperature"].astype(np.float64)
@@ -238,7 +255,7 @@ class DdsStateDecoder(StateNumbering):
             accelerometer=accelerometer.astype(np.float64),
             bus_voltage=float(record["power_v"][0]),
             orientation=unit_quaternion("imu_state.quaternion", quaternion.astype(np.float64)),
-            robot_time=tick / TICKS_PER_S,
+            robot_time=self._ticks / TICKS_PER_S,
             temperature=temperature,
             remote=record["wireless_remote"][0].tobytes(),
         )

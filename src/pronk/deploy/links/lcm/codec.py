@@ -5,8 +5,9 @@ q_des, kp_joint and kd_joint of its commands. `wtw` is the bridge of walk-these-
 Go2 forks that kept its messages).
 
 Joints. All three orders agree: legs FR FL HR HL (RR and RL in the stacks), then abad, hip, knee.
-Signs: Cheetah-Software's are pronk's own. Unitree's hip pitch and knee axes point the other way
-(thigh +0.8, calf -1.6 where pronk has -0.8, +1.6); the abduction axes are the same.
+Signs: Cheetah-Software's are those of pronk's Mini Cheetah. Unitree's hip pitch and knee axes point
+the other way (thigh +0.8, calf -1.6 where that has -0.8, +1.6), as those of pronk's Go2 do; the
+abduction axes are the same. `layout_for` reads the axes of a robot from its model.
 
 The knee's gains. Cheetah-Software converts the knee's angle, speed and torque by its extra ratio
 6 / 9.33, but not its gains (`rt_spi.cpp`): a wire gain k acts as k / 0.6429^2 = 2.42 k at the
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.arrays import Array
-from pronk.deploy.links.lcm.layouts import JOINT_COUNT, WTW, LcmLayout
+from pronk.deploy.links.lcm.layouts import JOINT_COUNT, LcmLayout
 from pronk.deploy.links.lcm.messages import CONTROL_PARAMETER, VIRTUAL_ROBOT, LcmMessage
 from pronk.deploy.links.numbering import StateNumbering, unit_quaternion
 from pronk.robots.machine import Command, RefusedError, State, check_command
@@ -79,9 +80,8 @@ def decode_lcm_command(layout: LcmLayout, data: bytes) -> Command:
     position = _checked(message, "position", fields["q_des"])
     stiffness = _checked(message, "stiffness", fields[layout.stiffness_field])
     damping = _checked(message, "damping", fields[layout.damping_field])
-    if layout is WTW:
-        # Of Cheetah-Software's message the robot reads nothing else. The comparison is without the
-        # warning that a conversion of a signalling NaN to bool gives.
+    if layout.obeys_feed_forward:
+        # Compared without the warning that a conversion of a signalling NaN to bool gives.
         speed_commanded = (fields["qd_des"] != 0.0).any()
         torque_commanded = (fields["tau_ff"] != 0.0).any()
         if speed_commanded or torque_commanded:

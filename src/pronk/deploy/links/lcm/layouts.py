@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,11 +16,14 @@ from pronk.deploy.links.lcm.messages import (
     WTW_STATE_ESTIMATOR,
     LcmMessage,
 )
+from pronk.deploy.links.leg_axes import axis_signs
 from pronk.errors import HardwareError
 from pronk.robots.machine import TorqueKind
 from pronk.robots.robot import RobotSpec
 
 JOINT_COUNT = 12
+MINI_CHEETAH_AXES = np.tile([1.0, -1.0, -1.0], 4)
+"""`leg_axes.axis_signs` of the Mini Cheetah."""
 KNEE_RATIO = 0.6429
 """Motor to joint beyond the hips' 6:1, as `rt_spi.cpp` has it (6 / 9.33 = .6431)."""
 
@@ -47,8 +50,10 @@ class LcmLayout:
     """Field of the specific force in the trunk's frame in an attitude."""
     numbered: bool
     """Whether commands and states carry `timestamp_us` and `id`."""
+    obeys_feed_forward: bool
+    """Whether the robot obeys the speeds and torques of a command."""
     signs: Array
-    """pronk's angles are signs times the wire's, shape (12,)."""
+    """pronk's angles are signs times the wire's, shape (12,); here those of the Mini Cheetah."""
     gain_ratios: Array
     """The wire's stiffness and damping divided by the joint's own, shape (12,)."""
     torque_kind: TorqueKind
@@ -65,6 +70,7 @@ CHEETAH = LcmLayout(
     gyro_field="omega",
     accelerometer_field="acc",
     numbered=False,
+    obeys_feed_forward=False,
     signs=np.ones(JOINT_COUNT),
     gain_ratios=np.tile([1.0, 1.0, KNEE_RATIO**2], 4),
     # spi_data_t carries none, and what leg_control_data_lcmt calls tau_est is computed from the
@@ -81,6 +87,7 @@ WTW = LcmLayout(
     gyro_field="omegaBody",
     accelerometer_field="aBody",
     numbered=True,
+    obeys_feed_forward=True,
     signs=np.tile([1.0, -1.0, -1.0], 4),
     gain_ratios=np.ones(JOINT_COUNT),
     # Unitree's tauEst, which the motor board computes from its current.
@@ -90,14 +97,15 @@ LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
 
 
 def layout_for(robot: RobotSpec, name: str) -> LcmLayout:
-    """Look the layout of a robot up.
+    """Return the layout of a robot, with the signs of its joints.
 
     Args:
         robot: The robot.
         name: Name of the layout.
 
     Raises:
-        HardwareError: The layout is unknown, or its messages are for another number of joints.
+        HardwareError: The layout is unknown, or its messages are for another number of joints, or
+            for legs in another order.
     """
     layout = find_layout(name)
     if len(robot.joints) != JOINT_COUNT:
@@ -105,11 +113,14 @@ def layout_for(robot: RobotSpec, name: str) -> LcmLayout:
             f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {name} are for "
             f"{JOINT_COUNT}."
         )
-    return layout
+    signs = layout.signs * MINI_CHEETAH_AXES * axis_signs(robot)
+    if np.array_equal(signs, layout.signs):
+        return layout
+    return replace(layout, signs=signs)
 
 
 def find_layout(name: str) -> LcmLayout:
-    """Look a layout up; HardwareError for an unknown name."""
+    """Return the layout of a name for the Mini Cheetah; HardwareError for an unknown name."""
     if name not in LAYOUTS:
         raise HardwareError(f"no LCM layout {name!r}; there are {', '.join(LAYOUTS)}.")
     return LAYOUTS[name]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pronk.deploy.links.lcm.codec import LcmStateDecoder
-from pronk.deploy.links.lcm.layouts import JOINT_COUNT, WTW, LcmLayout, layout_for
+from pronk.deploy.links.lcm.layouts import JOINT_COUNT, LcmLayout, layout_for
 from pronk.deploy.links.lcm.link import MULTICAST_GROUP, url_of
 from pronk.deploy.links.lcm.messages import BEACON_CHANNEL
 from pronk.deploy.links.listener import HeardMessage, Listener, WireCommand
@@ -54,7 +54,7 @@ def read_lcm_command(layout: LcmLayout, data: bytes) -> WireCommand:
     message = layout.command
     fields = message.decode(data)
     names = ["q_des", layout.stiffness_field, layout.damping_field]
-    if layout is WTW:
+    if layout.obeys_feed_forward:
         names += ["qd_des", "tau_ff"]
     numbers = {"qd_des": np.zeros(JOINT_COUNT), "tau_ff": np.zeros(JOINT_COUNT)}
     for name in names:
