@@ -197,6 +197,20 @@ def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) ->
         assert reason_of(state(), c, earlier=(s,)) is reason
 
 
+def test_a_state_that_is_not_finite_is_named_wherever_it_came_in_the_tick() -> None:
+    broken = state(position=at(POSE, math.nan))
+    for measured, earlier in ((broken, (state(),)), (state(), (broken,))):
+        assert reason_of(measured, command(), earlier=earlier) is Reason.STATE_NOT_FINITE
+
+
+def test_the_most_severe_fault_of_a_tick_decides() -> None:
+    fallen = state(orientation=rolled(1.2))
+    for measured, earlier in ((fallen, (state(),)), (state(), (fallen,))):
+        sent, decision, safety = judged(measured, command(), dead_man=False, earlier=earlier)
+        assert sent is None
+        assert decision.reason is safety.reason is Reason.TILT
+
+
 def test_just_within_the_limits_is_no_fault() -> None:
     s = state(
         position=at(POSE, 2.69),

@@ -107,16 +107,15 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     state_is_finite, state = _finite(
         checked.position, checked.velocity, checked.orientation, checked.imu
     )
-    command_is_finite, command = _finite(
-        checked.target, checked.stiffness, checked.damping, checked.previous
-    )
+    command_is_finite, command = _finite(checked.target, checked.stiffness, checked.damping)
+    # What was sent is finite; the measured position after damping is a state's.
+    previous_is_finite, previous = _finite(checked.previous)
     position = state[..., :n]
     velocity = state[..., n : 2 * n]
     quaternion = state[..., 2 * n : 2 * n + 4]
     target = command[..., :n]
     stiffness = command[..., n : 2 * n]
-    damping = command[..., 2 * n : 3 * n]
-    previous = command[..., 3 * n :]
+    damping = command[..., 2 * n :]
     state_age = np.asarray(checked.state_age)
     command_age = np.asarray(checked.command_age)
 
@@ -142,10 +141,11 @@ def apply_rules(checked: SafetyInput, limits: Limits) -> SafetyResult:
     quantities = np.concatenate((position, velocity, checked.torque, checked.temperature), axis=-1)
     outside = (quantities < smallest) | (quantities > largest)
     beyond = np.asarray(outside.reshape(*position.shape[:-1], 4, n).any(axis=-1))
-    gains = command[..., n : 3 * n]
+    gains = command[..., n:]
     bad_gains = ((gains < 0.0) | (gains > limits.gains)).any(axis=-1)
     # A quaternion far from unit length is no attitude.
-    bad_state = ~state_is_finite | np.isnan(state_age) | (np.abs(square - 1.0) > _UNIT_SLACK)
+    bad_state = ~state_is_finite | ~previous_is_finite | np.isnan(state_age)
+    bad_state = bad_state | (np.abs(square - 1.0) > _UNIT_SLACK)
     bad_command = ~command_is_finite | np.isnan(command_age) | np.isnan(checked.valid_for)
     expiry = np.minimum(checked.valid_for, ages.expiry_s)
 

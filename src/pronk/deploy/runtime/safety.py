@@ -122,9 +122,10 @@ class SafetyFilter:
         if limits is None:
             limits = self.limits
         result = apply_rules(self._input(states, command, t, dead_man), limits)
-        # A fault in any of the states decides; the newest if there is none.
+        # A fault in any of the states decides, the first of the most severe ones; the newest state
+        # if there is none.
         is_fault = result.level >= int(FilterAction.DAMP)
-        row = int(np.argmax(is_fault)) if is_fault.any() else -1
+        row = int(np.argmax(result.level)) if is_fault.any() else -1
         decision = Decision(Reason(int(result.reason[row])))
         if is_fault.any():
             detail = fault_detail(decision.reason, states[row], command, limits, t)
