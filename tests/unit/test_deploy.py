@@ -420,6 +420,20 @@ def test_damping_comes_at_once(request_: OperatorRequest) -> None:
     assert run.machine.quitting is (request_ is OperatorRequest.QUIT)
 
 
+def test_a_robot_that_is_to_be_left_does_not_stand_up_again() -> None:
+    run = Run(damp_s=0.1).standing()
+    run.tick(0.0, OperatorRequest.QUIT)
+    run.tick(0.01, OperatorRequest.STAND)
+    assert run.tick(5.0).command is None
+    assert (run.mode, run.machine.quitting) == (Mode.DAMP, True)
+    # A fault meanwhile is not released either.
+    run.safety.fault(Reason.DEAD_MAN, run.t)
+    run.machine.faulted(run.t)
+    run.machine.enter(Mode.FAULT, run.t)
+    run.tick(5.0, OperatorRequest.STAND)
+    assert (run.mode, run.machine.quitting) == (Mode.FAULT, True)
+
+
 def test_a_policy_without_a_first_action_is_a_fault() -> None:
     run = Run().standing()
     run.tick(0.0, OperatorRequest.WALK)
@@ -642,6 +656,14 @@ def test_keys_of_a_terminal() -> None:
     assert command.jump
     assert command.request is OperatorRequest.WALK
     assert command.command[2] == pytest.approx(0.4)
+    # Of keys that come together, those that stop the robot count, in whatever order.
+    for keys, request in (
+        (b"01", OperatorRequest.DAMP),
+        (b"102", OperatorRequest.DAMP),
+        (b"q1", OperatorRequest.QUIT),
+        (b"12", OperatorRequest.WALK),
+    ):
+        assert pressed(keys, 1.15).request is request
     # The jump's press lasts half a second, the dead-man key four fifths.
     assert keyboard.command(1.61, Mode.POLICY).jump is False
     assert keyboard.command(1.79, Mode.POLICY).dead_man
@@ -676,6 +698,9 @@ def test_a_gamepad(tmp_path: Path) -> None:
     assert command.dead_man
     assert command.request is OperatorRequest.WALK
     assert command.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
+    # B damps, whatever is pressed right after it.
+    assert moved(0.15, (1, 1, 1), (1, 1, 0)).request is OperatorRequest.DAMP
+    assert moved(0.16, (1, 1, 0), (1, 1, 1), (1, 1, 9)).request is OperatorRequest.DAMP
     # The jump input of a press, short or long, lasts as long as in training.
     assert moved(0.2, (1, 1, 5)).jump
     assert moved(0.68, (0, 1, 5)).jump

@@ -208,8 +208,12 @@ class StateMachine:
             self.enter(Mode.DAMP, t)
 
     def request(self, request: OperatorRequest) -> None:
-        """Take a request; it is kept until it can be granted or another comes."""
-        self._request = request
+        """Take a request; it is kept until it can be granted or another comes.
+
+        None comes after that to quit: a robot that is to be left must not stand up again.
+        """
+        if not self.quitting:
+            self._request = request
 
     def faulted(self, t: float) -> None:
         """Enter `FAULT`, because the filter damps; a fault ends a sweep."""

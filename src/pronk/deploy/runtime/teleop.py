@@ -197,6 +197,14 @@ HELP = """\
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
 
+
+def _more_urgent(first: OperatorRequest, second: OperatorRequest) -> OperatorRequest:
+    """Return which of two requests of the same reading counts: to damp or quit, else the later."""
+    if first in (OperatorRequest.DAMP, OperatorRequest.QUIT):
+        return first
+    return second
+
+
 _STEPS = {
     "w": (0, 0.25),
     "s": (0, -0.25),
@@ -276,7 +284,7 @@ class Keyboard(Operator):
             elif key in "\r\n":
                 self._jump_pressed = now
             elif key in _REQUESTS:
-                request = _REQUESTS[key]
+                request = _more_urgent(request, _REQUESTS[key])
         forward, sideways, yaw_rate = self._command
         return OperatorCommand(
             command=(forward, sideways, yaw_rate),
@@ -332,7 +340,8 @@ class Gamepad(Operator):
         pad = self._reader.read(now)
         request = OperatorRequest.NONE
         for button in pad.pressed:
-            request = _PAD_REQUESTS.get(button, request)
+            if button in _PAD_REQUESTS:
+                request = _more_urgent(request, _PAD_REQUESTS[button])
         return OperatorCommand(
             command=pad.velocity, jump=pad.jump, dead_man=pad.dead_man, request=request
         )
