@@ -25,7 +25,7 @@ from pronk.deploy.runtime.plan import SERVO_PRIORITY, RunPlan
 from pronk.deploy.runtime.policy_process import serve_policy
 from pronk.deploy.runtime.records import OPERATOR, Event
 from pronk.deploy.runtime.servo import serve_robot
-from pronk.deploy.runtime.standby import serve_standby
+from pronk.deploy.runtime.standby import HAS_STANDBY, NO_STANDBY, serve_standby
 from pronk.deploy.runtime.teleop import Operator, OperatorCommand
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.policy.deployable import UNKNOWN_DELAY_S, DeployablePolicy, open_policy
@@ -185,7 +185,9 @@ class Deployment:
                     raise LogError(reply.decode())
             if self.standby is not None:
                 silent = "the process that damps in place of the servo did not start."
-                self._first_message(self.standby, HardwareError(silent))
+                reply = self._first_message(self.standby, HardwareError(silent))
+                if reply not in (HAS_STANDBY, NO_STANDBY):
+                    raise HardwareError(_unopened(plan, reply.decode()))
             # Last, so that its first tick is logged.
             with terminal_blocked():
                 self.servo.start()
@@ -397,14 +399,17 @@ class Deployment:
             summary.log_error = f"{summary.log_error.rstrip('.')}; {extent}"
 
     def _first_message(self, process: BaseProcess, silent: PronkError) -> bytes:
-        """Return the first message of a process; raise `silent` if none comes."""
+        """Return the first message of a process; raise `silent` if it ends or sends none."""
         end = self._ends[process]
         until = time.monotonic() + _START_S
         while not end.poll(0.05):
             self.write(OperatorCommand())
             if process.exitcode is not None or time.monotonic() > until:
                 raise silent
-        return end.recv_bytes()
+        try:
+            return end.recv_bytes()
+        except EOFError:
+            raise silent from None
 
     def _await_servo(self) -> None:
         """Wait until the servo has opened the link."""
@@ -415,11 +420,16 @@ class Deployment:
             self.events_seen()
             if self.servo.exitcode is not None:
                 reason = " ".join(self.summary.refusals) or "its process ended without an error."
-                raise HardwareError(f"the link {self.plan.link.robot} was not opened: {reason}")
+                raise HardwareError(_unopened(self.plan, reason))
             if time.monotonic() > until:
                 raise HardwareError(
                     f"the link was not open after {_START_S:.0f} s; check the robot and the cable."
                 )
+
+
+def _unopened(plan: RunPlan, reason: str) -> str:
+    """Return that a link was not opened, and why."""
+    return f"the link {plan.link.robot} was not opened: {reason}"
 
 
 def run_plan(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -24,7 +25,12 @@ from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import DRIVEN, Mode
 from pronk.deploy.runtime.plan import STANDBY_PRIORITY, RunPlan
 from pronk.deploy.runtime.records import STANDBY
+from pronk.errors import PronkError
 
+HAS_STANDBY = b"standby"
+"""First message of a standby process that can damp."""
+NO_STANDBY = b"no standby"
+"""First message of one whose link cannot have a standby."""
 _POLL_S = 0.004
 """Time between two looks at the servo [s]."""
 _REPEAT_S = 0.01
@@ -39,7 +45,8 @@ def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
     Args:
         plan: Plan of the run.
         name: Name of the shared memory.
-        end: Pipe to the operator's process; gets one byte: whether the link can have a standby.
+        end: Pipe to the operator's process; gets `HAS_STANDBY`, `NO_STANDBY`, or why the link
+            cannot be opened, as a sentence.
     """
     leave()
     stopping = False
@@ -49,9 +56,13 @@ def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
         stopping = True
 
     signal.signal(signal.SIGTERM, stop)
-    machine = plan.link()
-    damp = machine.open_damper() if isinstance(machine, NetworkLink) else None
-    end.send_bytes(b"\1" if damp is not None else b"\0")
+    try:
+        machine = plan.link()
+        damp = machine.open_damper() if isinstance(machine, NetworkLink) else None
+    except PronkError as error:
+        end.send_bytes(str(error).encode())
+        return
+    end.send_bytes(NO_STANDBY if damp is None else HAS_STANDBY)
     if damp is None:
         return
     if plan.real_time:
@@ -79,7 +90,9 @@ def serve_standby(plan: RunPlan, name: str, end: Connection) -> None:
         elif now - damping_since > _LEAST_S and (stopping or orphaned or mode is Mode.ENDED):
             break
         if damping_since is not None and now >= next_message:
-            damp()
+            # Whatever fails, as a cable that is out for a moment: the next message may get through.
+            with suppress(Exception):
+                damp()
             next_message = now + _REPEAT_S
         sleep_until(now + _POLL_S)
     shared.close()
