@@ -46,7 +46,7 @@ def record_passively(
     Args:
         listener: A listener that is not open yet; it is closed at the end.
         path: The file, which is made when the first state and the first command have come.
-        seconds: Time to record [s]; None until `stop`.
+        seconds: Time to record, from when a state and a command have come [s]; None until `stop`.
         wait_s: Longest time to the first state and the first command [s].
         stop: Says whether to end.
         metadata: Named remarks for the file.
@@ -57,6 +57,7 @@ def record_passively(
 
     Raises:
         HardwareError: No state or no command came; the message names the topic.
+        KeyboardInterrupt: `stop` said to end before both had come; nothing was written.
     """
     listener.open()
     try:
@@ -74,8 +75,9 @@ def record_passively(
             },
         )
         writer = RecordingWriter(path, header)
-        begun = heard[0].arrived
-        last = begun
+        begun = time.monotonic()
+        first = heard[0].arrived
+        last = first
         last_state: float | None = None
         longest_gap_s = 0.0
         states = 0
@@ -105,7 +107,7 @@ def record_passively(
     finally:
         listener.close()
     return RecordingSummary(
-        seconds=last - begun, states=states, commands=commands, longest_gap_s=longest_gap_s
+        seconds=last - first, states=states, commands=commands, longest_gap_s=longest_gap_s
     )
 
 
@@ -132,10 +134,13 @@ def _first_messages(
 
     Raises:
         HardwareError: One of them did not come.
+        KeyboardInterrupt: `stop` said to end before.
     """
     heard: list[HeardMessage] = []
     until = time.monotonic() + wait_s
-    while time.monotonic() < until and not stop():
+    while time.monotonic() < until:
+        if stop():
+            raise KeyboardInterrupt
         heard += listener.receive(_PAUSE_S)
         if listener.counts["states"] and listener.counts["commands"]:
             return heard
