@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -269,11 +271,47 @@ def test_addresses_are_read_and_written() -> None:
         ("lcm://?port=many", None, "many"),
         ("dds://eth0", "eth1", "eth0"),
         ("sim://no_base", None, "no_base"),
+        # What is passed over would choose another robot or another layout.
+        ("dds://eth0/5", None, "/5"),
+        ("dds://eth0#5", None, "5"),
+        ("dds:///eth0", None, "/eth0"),
+        ("lcm://eth0/layout=wtw", None, "layout=wtw"),
+        ("dds://eth0?domain", None, "domain"),
+        ("dds://eth0?domain=", None, "domain"),
+        ("dds://?domain=3&domain=5", None, "3 and 5"),
+        ("lcm://[", None, "lcm:"),
     ],
 )
 def test_addresses_that_are_refused(text: str, interface: str | None, words: str) -> None:
     with pytest.raises(HardwareError, match=words):
         Address.parse(text, interface).machine(ROBOT)
+
+
+def test_an_option_that_contradicts_the_address_is_refused() -> None:
+    assert Address.parse("dds://?domain=5", domain=5).options == {"domain": 5}
+    with pytest.raises(HardwareError, match="5 and 6"):
+        Address.parse("dds://?domain=5", domain=6)
+
+
+@pytest.mark.parametrize(("scheme", "package"), [("dds", "cyclonedds"), ("lcm", "lcm")])
+def test_a_library_that_is_missing_is_named(scheme: str, package: str) -> None:
+    program = (
+        f"import sys; sys.modules[{package!r}] = None\n"
+        "from pronk.deploy.links.address import Address\n"
+        "from pronk.errors import HardwareError\n"
+        "from pronk.robots import load_robot\n"
+        "try:\n"
+        f"    machine = Address.parse({scheme!r}).machine(load_robot('mini_cheetah'))\n"
+        "    machine.connect()\n"
+        "except HardwareError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert package in done.stdout
+    assert "pronk[hardware]" in done.stdout
 
 
 # --- A link of another package --------------------------------------------------------------------

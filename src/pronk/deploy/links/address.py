@@ -39,7 +39,13 @@ def find_link(name: str) -> Callable[..., Machine]:
     """Import a link; HardwareError for an unknown name or a library that is not installed."""
     if name in BUILT_IN:
         entry_point = EntryPoint(name, BUILT_IN[name], ENTRY_POINT_GROUP)
-        return entry_point.load()  # type: ignore[no-any-return]
+        try:
+            return entry_point.load()  # type: ignore[no-any-return]
+        except ImportError as error:
+            raise HardwareError(
+                f"the link {name} cannot be loaded ({error}); install what it needs with "
+                "`pip install 'pronk[hardware]'`."
+            ) from None
     installed = entry_points(group=ENTRY_POINT_GROUP)
     if name not in installed.names:
         names = ", ".join((*BUILT_IN, *sorted(installed.names)))
@@ -70,25 +76,28 @@ class Address:
                 out.
 
         Raises:
-            HardwareError: The link or an option is unknown, or an option has another type.
+            HardwareError: The text is no URI, the link or an option is unknown, or an option has
+                another type or is given twice.
         """
         scheme = text
         named_interface = ""
         query = ""
         if "://" in text:
-            parts = urlsplit(text)
-            scheme = parts.scheme
-            named_interface = parts.netloc
-            query = parts.query
+            scheme, named_interface, query = _split(text)
         if named_interface and interface not in (None, named_interface):
             raise HardwareError(
                 f"{text} names the interface {named_interface}; leave out {interface}."
             )
         types = _option_types(find_link(scheme))
-        texts: dict[str, str | int] = dict(parse_qsl(query))
-        for name, value in options.items():
-            if value is not None:
-                texts[name] = value
+        texts: dict[str, str | int] = {}
+        for name, value in [*parse_qsl(query, keep_blank_values=True), *options.items()]:
+            if value is None:
+                continue
+            if str(texts.get(name, value)) != str(value):
+                raise HardwareError(
+                    f"{name} of {text} is both {texts[name]} and {value}; give one of them."
+                )
+            texts[name] = value
         converted = {}
         for name, value in texts.items():
             if name not in types:
@@ -120,6 +129,24 @@ class Address:
         """Make the machine, not yet connected, with the usual settings if there are none."""
         link = find_link(self.scheme)
         return link(robot, interface=self.interface, settings=settings, **self.options)
+
+
+def _split(uri: str) -> tuple[str, str, str]:
+    """Return scheme, interface and query of a URI; HardwareError for one with other parts.
+
+    A part that was passed over, as the number in `dds://eth0/5`, would choose another robot.
+    """
+    example = "expected one such as dds://eth0 or lcm://eth0?layout=wtw&port=7668"
+    try:
+        parts = urlsplit(uri)
+    except ValueError as error:
+        raise HardwareError(f"{uri!r} is no address of a robot ({error}); {example}.") from None
+    if parts.path.strip("/") or parts.fragment:
+        raise HardwareError(
+            f"{uri!r} has {(parts.path + parts.fragment)!r} behind the interface, which an address "
+            f"does not have; {example}."
+        )
+    return parts.scheme, parts.netloc, parts.query
 
 
 def _option_types(link: Callable[..., Machine]) -> dict[str, Any]:
