@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 import pronk.robots
 from pronk.errors import RobotError
 from pronk.identify.logs.sage_reader import SAGE_JOINTS
-from pronk.robots import ROBOT_NAMES, load_robot
+from pronk.robots import ROBOT_NAMES, load_robot, robot_file_path
 from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
 from pronk.robots.motor import torque_limits
@@ -251,6 +252,7 @@ def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
         ("model: mini_cheetah.xml", "model: other.xml", "other.xml"),
         ("policy_rate_hz: 50.0", "policy_rate_hz: 100.0", "policy_rate_hz"),
         ("decimation: 4 ", "decimation: 7 ", "decimation"),
+        (r"band_hz: \[0.1, 15.0\]", "band_hz: [15.0, 0.1]", "band_hz"),
     ],
 )
 def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_path: Path) -> None:
@@ -259,6 +261,21 @@ def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_p
     (tmp_path / "robot.yaml").write_text(re.sub(old, new, (folder / "robot.yaml").read_text()))
     with pytest.raises(RobotError, match=named):
         load_robot(tmp_path)
+
+
+def test_a_robot_is_read_again_when_its_model_has_changed(tmp_path: Path) -> None:
+    source = Path(str(robot_file_path("go2"))).parent
+    file = tmp_path / "robot.yaml"
+    file.write_text((source / "robot.yaml").read_text())
+    model = tmp_path / "go2.xml"
+    model.write_text((source / "go2.xml").read_text())
+    assert load_robot(file).joint("FR_hip_roll").range == pytest.approx((-1.0472, 1.0472))
+    model.write_text(model.read_text().replace('range="-1.0472 1.0472"', 'range="-0.5 0.4"'))
+    os.utime(model, ns=(1, 1))
+    assert load_robot(file).joint("FR_hip_roll").range == pytest.approx((-0.5, 0.4))
+    model.unlink()
+    with pytest.raises(RobotError, match="go2.xml: no such file"):
+        load_robot(file)
 
 
 def test_a_robot_is_shown_in_one_line() -> None:

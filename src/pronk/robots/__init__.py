@@ -5,6 +5,7 @@ A robot is a folder with `robot.yaml` and the MJCF or URDF that it names.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
@@ -45,11 +46,16 @@ def load_robot(name: str | Path) -> RobotSpec:
     """
     path = robot_file_path(name)
     try:
-        robot = _read(path.resolve(), path.stat().st_mtime_ns)
+        modified_ns = path.stat().st_mtime_ns
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
+    whole = path.resolve()
+    model_modified_ns = 0
+    with suppress(OSError):  # a model that is missing is named as the robot is read
+        model_modified_ns = _model_file(whole, modified_ns).stat().st_mtime_ns
+    robot = _read(whole, modified_ns, model_modified_ns)
     named = str(name) in ROBOT_NAMES or str(name).startswith(MENAGERIE)
-    return replace(robot, source=str(name) if named else str(path.resolve()))
+    return replace(robot, source=str(name) if named else str(whole))
 
 
 def robot_file_path(name: str | Path) -> Path:
@@ -76,8 +82,18 @@ def robot_file_path(name: str | Path) -> Path:
 
 
 @lru_cache
-def _read(path: Path, _modified_ns: int) -> RobotSpec:
-    """Read a robot file or a model once for each time of its last modification."""
+def _model_file(path: Path, _modified_ns: int) -> Path:
+    """Return the model that a robot file names; a model itself."""
+    from pronk.robots.load import read_robot_file
+
+    if path.suffix in MODEL_SUFFIXES:
+        return path
+    return path.parent / read_robot_file(path).model
+
+
+@lru_cache
+def _read(path: Path, _modified_ns: int, _model_modified_ns: int) -> RobotSpec:
+    """Read a robot once for each time of the last modification of its file and of its model."""
     from pronk.robots.bare import file_of_model
     from pronk.robots.load import make_robot, read_robot
     from pronk.robots.source_model import read_source

@@ -303,6 +303,7 @@ def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> Robot
             f"{source}: timestep_s * decimation * policy_rate_hz is {ticks:.6g}; expected 1, one "
             "command for `decimation` steps of the simulator."
         )
+    _check_order(file, source)
     held_joints = _held_positions(file, source_model, source)
     build = _model_without(source_model, held_joints)
     try:
@@ -344,6 +345,22 @@ def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> Robot
     )
     _verify_mirrors(robot, model, source)
     return robot
+
+
+def _check_order(file: RobotFile, source: str) -> None:
+    """Refuse a range whose first number is not the smaller one: it would hold nothing."""
+    ranges = {
+        "grid_stiffness": file.grid_stiffness,
+        "grid_damping": file.grid_damping,
+        "defaults.band_hz": file.defaults.band_hz,
+    }
+    for name, group in file.groups.items():
+        ranges[f"groups.{name}.band_hz"] = group.band_hz
+    for place, numbers in ranges.items():
+        if numbers is not None and not numbers[0] < numbers[1]:
+            raise RobotError(
+                f"{source}: {place} is {list(numbers)}; expected the smaller number first."
+            )
 
 
 def _grid(gains: Iterable[float]) -> tuple[float, float]:
