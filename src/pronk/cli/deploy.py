@@ -75,7 +75,8 @@ class TakeoverOptions:
     blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = RunTiming.blend_s
     """Time in which the policy takes over, in s; 0 as in training."""
     tilt: float | None = None
-    """Largest tilt of the trunk, in rad; that of the robot's file if left out."""
+    """Largest tilt of the trunk, in rad; that of the robot's file if left out, inf for a robot that
+    hangs."""
     ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False
     """Start the policy even if the measured latency exceeds its training range."""
 
@@ -160,6 +161,11 @@ def deploy_command(
     if deploy is not None:
         for problem in deploy_problems(read_deploy_yaml(deploy), robot_spec):
             console.warn(problem)
+    if not plan.limits().trunk_is_free:
+        console.warn(
+            "without a limit of its tilt the robot counts as hung: its inertial unit, the height "
+            "of its trunk and joints that do not follow are not judged"
+        )
     if not (address.local or machine.yes):
         console.confirm(robot_spec.name, str(address))
     operator: Operator
