@@ -14,7 +14,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from command_line import refused
+import pronk
+from command_line import invoke, refused
 from pronk.errors import LogError, PronkError
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log, read_logs
@@ -56,8 +57,14 @@ COMMANDS = [
     (f"{SWEEP} --link lcm --sim-params t", "simulate"),
     (f"{SWEEP} --link serial", "lcm"),
     (f"{SWEEP} --link sim://ground", "bench"),
+    (f"{SWEEP} --joints ,", "no joint"),
+    (f"{SWEEP} --seed -1", "0 or more"),
+    (f"{SWEEP} --link dds --seed 3", "simulate"),
+    (f"{SWEEP} --link dds://lo/5", "/5"),
+    (f"sweep {300 * 'a'} --out x", "too long"),
     ("response nowhere.mcap --out x", "nowhere.mcap"),
     ("response a.csv --out x", "unit"),
+    ("response a.csv copy/a.csv --unit rad --out x", "copy/a.csv"),
     ("response a.csv --unit rad --joint-order x", "by --joint"),
     ("response a.csv --command-topic /x", "command_topic"),
     ("match a.csv --robot cheetah --unit rad", "mini_cheetah"),
@@ -81,6 +88,7 @@ COMMANDS = [
     ("trial --out x", "no policy"),
     ("trial no.onnx --out x --commands fast", "fast"),
     ("deploy no.onnx", "no.onnx"),
+    ("record go2 --link lcm://[ --out x.mcap", "lcm://["),
     ("simulate cheetah", "mini_cheetah"),
     ("simulate --faults gremlins=1", "gremlins"),
     ("simulate --domain 3", "port"),
@@ -89,6 +97,8 @@ COMMANDS = [
     ("simulate --link dds --port 9000", "port"),
     ("simulate --port 7667", "7667"),
     ("simulate --mode dance", "dance"),
+    ("simulate --seed -1", "0 or more"),
+    ("simulate so101", "12"),
     ("robot new no.xml", "no.xml"),
     ("robot check none.yaml", "none.yaml"),
     ("robot check broken.xml", "broken.xml"),
@@ -106,6 +116,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Files that are no good input, in the working directory."""
     monkeypatch.chdir(tmp_path)
     csv(tmp_path / "a.csv", *GOOD)
+    (tmp_path / "copy").mkdir()
+    csv(tmp_path / "copy" / "a.csv", *GOOD)
     csv(tmp_path / "b.csv", *GOOD, header="time,position.FR_elbow,command.FR_elbow")
     (tmp_path / "broken.yaml").write_text("schema: pronk/sim_params/1\nrobot: mini_cheetah\n")
     (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
@@ -122,6 +134,15 @@ def test_a_command_refuses_in_one_sentence_and_writes_nothing(
     before = set(folder.rglob("*"))
     assert named in refused(*words.split())
     assert set(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("tilt", "warned"), [("inf", True), ("3", False)])
+def test_a_robot_without_a_limit_of_its_tilt_counts_as_hung(tilt: str, warned: bool) -> None:
+    policy = Path(pronk.__file__).parent / "policies" / "matched" / "policy.onnx"
+    command = invoke(["deploy", policy, "--link", "lcm://lo", "--tilt", tilt], typed="no")
+    assert command.exit_code == 2, command.output
+    assert "nothing was moved" in command.stderr
+    assert ("counts as hung" in command.stderr) is warned
 
 
 # --- Random files -------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pronk.cli import console
 from pronk.cli.match import summary
+from pronk.cli.options import check_seed
 from pronk.cli.predict import prediction_rows
 from pronk.cli.sweep import AMPLITUDES
 from pronk.errors import PronkError
@@ -72,6 +73,7 @@ def demo(
 
     if jumps < 1:
         raise PronkError(f"--jumps {jumps}; expected 1 or more.")
+    check_seed(seed)
     require_place(out / "gains.yaml")
     console.say(
         "All results below are of pronk's virtual robot, a simulated stand-in for the Mini "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from pronk.cli.options import check_seed
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
@@ -63,11 +64,18 @@ class LinkOptions:
         }
         scheme = self.link.partition(":")[0]
         if scheme == SIM:
+            check_seed(self.seed)
             options["seed"] = self.seed or None
             options["params"] = None if self.sim_params is None else str(self.sim_params)
             return Address.parse(self.link, base or self.interface, **options)
-        if self.sim_params is not None:
-            raise HardwareError(
-                "--sim-params is of --link sim; give it to `pronk simulate` instead."
-            )
+        of_simulation = {
+            "--base": base is not None,
+            "--sim-params": self.sim_params is not None,
+            "--seed": self.seed != 0,
+        }
+        for option, is_given in of_simulation.items():
+            if is_given:
+                raise HardwareError(
+                    f"{option} is of --link sim; give it to `pronk simulate` instead."
+                )
         return Address.parse(self.link, self.interface, **options)

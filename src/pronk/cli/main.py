@@ -82,9 +82,12 @@ MACHINE_ERRORS = (
     errno.ENFILE,
     errno.ENOMEM,
     errno.EIO,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
 )
 """Errors of the operating system that say what the machine or its user cannot do, whatever pronk
-does: a full disk or quota, a folder without permission, too many open files, a bad disk."""
+does: a full disk or quota, a folder without permission, too many open files, a bad disk, a name
+that is too long."""
 _JSON_PARAMETER = "json_file"
 """Parameter of the option `--json`, which commands with an `Outcome` get."""
 

@@ -111,6 +111,34 @@ class Reading:
         return read_logs(paths, robot=robot, options=self.options(), processes=processes)
 
 
+def check_seed(seed: int) -> None:
+    """Refuse a seed that no generator of random numbers takes: PronkError."""
+    if seed < 0:
+        raise PronkError(f"--seed {seed}; expected 0 or more.")
+
+
+def require_distinct_names(logs: Sequence[JointLog], folder: Path | None) -> None:
+    """Refuse logs of which the results of one would replace those of another.
+
+    Args:
+        logs: The logs; the files of their results have their names without the ending.
+        folder: Folder of the results; that of each log if None.
+
+    Raises:
+        PronkError: Two logs have the same name in the same folder of results.
+    """
+    sources: dict[Path, str] = {}
+    for log in logs:
+        source = Path(log.source or "log")
+        begin = (source.parent if folder is None else folder) / source.stem
+        other = sources.setdefault(begin, log.source)
+        if other != log.source:
+            raise PronkError(
+                f"the results of {other} and {log.source} would both be written to {begin}.*; "
+                "rename one of them, or give them one at a time, each with its own --out."
+            )
+
+
 def _columns(entries: Sequence[str]) -> Mapping[str, str] | Sequence[str]:
     """Return the names of CSV columns by those of pronk, or names that stand alone."""
     text = ",".join(entries)

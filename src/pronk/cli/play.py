@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from pronk.cli import console
+from pronk.cli.options import check_seed
 from pronk.errors import PronkError
 
 
@@ -43,6 +44,7 @@ def play(
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
 
+    check_seed(seed)
     require_viser()
     loaded_policy = load_policy(policy)
     contract = loaded_policy.contract

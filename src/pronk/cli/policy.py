@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from pronk.cli import console
+from pronk.cli.options import check_seed
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.tables import Column, Table
@@ -78,6 +79,7 @@ def policy(
     from pronk.policy.script import parse_velocity
     from pronk.robots import load_robot
 
+    check_seed(seed)
     velocity = parse_velocity(command)
     if not 2.0 <= seconds <= _LONGEST_S:
         raise PronkError(f"--seconds {seconds:g}; expected 2 to {_LONGEST_S:g} s.")

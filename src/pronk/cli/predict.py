@@ -60,6 +60,7 @@ def predict_logs(
     stated_gains = options.drive_gains(drive_gains)
     logs = reading.read(paths, robot_spec)
     folder = out if out is not None else gains.parent
+    options.require_distinct_names(logs, folder)
     rows: list[dict[str, Any]] = []
     fitted_logs: list[str] = []
     wrote: list[Path] = []

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from pronk.cli import console
-from pronk.cli.options import Reading
+from pronk.cli.options import Reading, require_distinct_names
 from pronk.errors import LogError
 from pronk.names import file_name
 from pronk.tables import Column, Table
@@ -56,6 +56,7 @@ def response(
     from pronk.robots import ROBOT_NAMES, load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)
+    require_distinct_names(logs, out)
     estimator = Estimator(segment_s=segment_s)
     rows: list[dict[str, Any]] = []
     notes: list[str] = []

@@ -13,6 +13,7 @@ import tyro
 
 from pronk.cli import console
 from pronk.cli.link_options import Base, Layout
+from pronk.cli.options import check_seed
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
@@ -120,6 +121,7 @@ def simulate(
     from pronk.jump.virtual.sim_params import load_sim_params
     from pronk.robots import load_robot
 
+    check_seed(stand_in.seed)
     link = wire_options.link
     base = stand_in.base
     seed = stand_in.seed

@@ -85,6 +85,11 @@ def sweep(
     names: list[str] = []
     for entry in excitation.joints:
         names += [name for name in entry.split(",") if name]
+    if excitation.joints and not names:
+        raise PronkError(
+            f"--joints {','.join(excitation.joints)!r} names no joint; name one or more, or "
+            "leave it out for all."
+        )
     with console.progress() as report:
         report("forecast", 0.0)
         plan = make_plan(
