@@ -164,6 +164,15 @@ def test_without_a_robot_there_is_no_log(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
+def test_a_wire_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    address = Address.parse("lcm://no_such_interface")
+    with pytest.raises(HardwareError, match="not opened.*expected no_such_interface"):
+        record_wire(
+            plan_of("FR_hip_roll"), tmp_path / "x", Link(robot="mini_cheetah", address=address)
+        )
+    assert not (tmp_path / "x").exists()
+
+
 def owner(out: Path, port: int) -> None:
     """A `pronk sweep` of its own."""
     swept(plan_of("FR_hip_roll"), out, port)
