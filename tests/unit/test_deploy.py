@@ -640,6 +640,27 @@ def test_after_its_time_a_run_still_ends_at_a_fault_and_damps_on_request() -> No
     assert command.request is OperatorRequest.DAMP
 
 
+class Idle(Operator):
+    """An operator who does nothing."""
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        return OperatorCommand()
+
+
+def test_a_robot_that_stands_after_its_time_sits_down() -> None:
+    operator = TimeLimit(Idle(), 5.0)
+    for t, mode, request in (
+        (0.0, Mode.POLICY, OperatorRequest.NONE),
+        (4.0, Mode.FAULT, OperatorRequest.NONE),
+        (4.9, Mode.STAND, OperatorRequest.NONE),
+        (5.1, Mode.STAND, OperatorRequest.SIT),
+        (5.2, Mode.STAND, OperatorRequest.NONE),
+        (5.3, Mode.SIT, OperatorRequest.NONE),
+        (7.0, Mode.DAMP, OperatorRequest.QUIT),
+    ):
+        assert operator.command(t, mode).request is request
+
+
 def test_keys_of_a_terminal() -> None:
     master, slave = pty.openpty()
     keyboard = Keyboard(RANGES, slave)
@@ -717,6 +738,10 @@ def test_a_gamepad(tmp_path: Path) -> None:
 def test_devices_that_are_not_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(HardwareError, match="js9"):
         Gamepad(tmp_path / "js9", RANGES)
+    (tmp_path / "file").write_text("no device")
+    for path in (tmp_path, tmp_path / "file"):
+        with pytest.raises(HardwareError, match="no device"):
+            Gamepad(path, RANGES)
     with (tmp_path / "no terminal").open("w") as file, pytest.raises(HardwareError, match="--scri"):
         Keyboard(RANGES, file.fileno())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -85,7 +86,7 @@ class GamepadReader:
             ranges: Smallest and largest command, by the names in `COMMANDS`.
 
         Raises:
-            HardwareError: The device cannot be opened.
+            HardwareError: The device cannot be opened, or is a file or a folder.
         """
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -94,6 +95,12 @@ class GamepadReader:
                 f"gamepad {path}: {error.strerror}; plug it in, or name another "
                 "one (ls /dev/input/js*)."
             ) from None
+        kind = os.fstat(self._fd).st_mode
+        if stat.S_ISREG(kind) or stat.S_ISDIR(kind):
+            os.close(self._fd)
+            raise HardwareError(
+                f"gamepad {path} is no device; name one such as /dev/input/js0 (ls /dev/input/js*)."
+            )
         self._ranges = ranges
         self._connected = True
         self._axes: dict[int, float] = {}

@@ -150,14 +150,18 @@ class BenchOperator(Operator):
 
 
 class TimeLimit(Operator):
-    """Another operator for a time with the policy running; then it sits down and ends."""
+    """Another operator for a time from the first start of the policy; then it sits down and ends.
+
+    A robot that stands when the time is over, as after a fault, sits down too.
+    """
 
     def __init__(self, operator: Operator, seconds: float) -> None:
         """Count from the start of the policy [s]."""
         self._operator = operator
         self._seconds = seconds
         self._began: float | None = None
-        self._sat = False
+        self._sat_from: Mode | None = None
+        """Mode in which it was told to sit down last."""
 
     def notified(self, event_kind: str, text: str) -> None:
         """Pass an event of the servo on."""
@@ -185,9 +189,9 @@ class TimeLimit(Operator):
             return command
         if mode is Mode.DAMP:
             return OperatorCommand(request=OperatorRequest.QUIT)
-        if mode is not Mode.POLICY or self._sat:
+        if mode not in (Mode.POLICY, Mode.STAND) or self._sat_from is mode:
             return OperatorCommand(dead_man=command.dead_man)
-        self._sat = True
+        self._sat_from = mode
         return OperatorCommand(dead_man=command.dead_man, request=OperatorRequest.SIT)
 
 
