@@ -48,6 +48,15 @@ def test_match_and_predict_keep_the_options_of_reading(tmp_path: Path) -> None:
     assert "FR_knee" in accepted(*predict_words)
 
 
+def test_a_sweep_names_its_folder_in_one_word(tmp_path: Path) -> None:
+    logs = tmp_path / "my logs"
+    words = ("--joints", "FR_hip_roll", "--amplitude", "0.1", "--repeats", "1")
+    said = accepted("sweep", "mini_cheetah", *words, "--out", logs)
+    assert following(said, "response") == ["response", str(logs), "--robot", "mini_cheetah"]
+    match_words = following(said, "match")
+    assert match_words[-2:] == ["--out", str(logs / "gains.yaml")]
+
+
 @pytest.mark.parametrize("framework", ["isaaclab-implicit", "drake"])
 def test_a_match_for_a_framework_goes_on_with_its_gains(framework: str, tmp_path: Path) -> None:
     robot = load_robot("mini_cheetah")

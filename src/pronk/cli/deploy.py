@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -198,11 +199,11 @@ def deploy_command(
         wrote.append(log)
     if capture is not None and not capture_lost:
         wrote.append(capture)
-    next_command = f"pronk report {log}"
     if log is None:
-        next_command = (
-            f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
-        )
+        words = ["pronk", "deploy", str(policy), "--link", machine.link, "--log", "run.mcap"]
+        next_command = f"{shlex.join(words)}   # keeps everything"
+    else:
+        next_command = shlex.join(["pronk", "report", str(log)])
     status = ExitStatus.DONE
     if summary.faults or summary.refusals or capture_lost or summary.log_error:
         status = ExitStatus.RUN_FAULT

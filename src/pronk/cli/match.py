@@ -224,7 +224,7 @@ def next_commands(result: MatchResult, out: Path, options: str = "") -> list[str
     if result.gains.unmatched:
         return unmatched_commands(result)
     if by_torque_alone(result):
-        robot = result.robot_path or result.robot
+        robot = shlex.quote(str(result.robot_path or result.robot))
         return [f"pronk sweep {robot} --out LOGS, for torque tells no gains: match that sweep"]
     gains_file = shlex.quote(str(out))
     commands = [f"pronk predict FRESH_LOG --gains {gains_file}{options}"]

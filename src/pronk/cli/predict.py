@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -98,7 +99,9 @@ def predict_logs(
         console.say(f"left out: {reason}")
     following = []
     if (folder / "match.npz").exists():
-        following.append(f"pronk report {folder}   # puts these replays on the page")
+        following.append(
+            f"pronk report {shlex.quote(str(folder))}   # puts these replays on the page"
+        )
     return console.Outcome(
         figures={"predictions": rows, "fitted_on": fitted_logs, "excluded": excluded},
         wrote=wrote,

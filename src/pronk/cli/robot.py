@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Literal
 
@@ -72,7 +73,7 @@ def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
     if assumed:
         console.say(f"without a position servo, gains assumed: {', '.join(assumed)}")
     console.say(f"wrote {target}; {text.count('# CHECK')} of its lines are marked CHECK")
-    console.following(f"pronk robot check {target}")
+    console.following(f"pronk robot check {shlex.quote(str(target))}")
 
 
 def _held_sentence(names: tuple[str, ...]) -> str:

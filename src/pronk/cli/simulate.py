@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,7 +181,10 @@ def simulate(
     return console.Outcome(
         figures=figures,
         wrote=[capture] if capture else [],
-        following=[f"pronk sweep {robot} --link '{address}' --out DIR   # while it runs"],
+        following=[
+            f"pronk sweep {shlex.quote(robot)} --link {shlex.quote(str(address))} --out DIR   "
+            "# while it runs"
+        ],
     )
 
 

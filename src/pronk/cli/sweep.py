@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -157,8 +158,10 @@ def sweep(
     return console.Outcome(
         figures=figures,
         following=[
-            f"pronk response {out} --robot {robot}",
-            f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
+            shlex.join(["pronk", "response", str(out), "--robot", robot]),
+            shlex.join(
+                ["pronk", "match", str(out), "--robot", robot, "--out", str(out / "gains.yaml")]
+            ),
         ],
     )
 

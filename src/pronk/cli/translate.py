@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -121,7 +122,7 @@ def translate_gains(
     return console.Outcome(
         figures={"translated": figures},
         wrote=wrote,
-        following=[f"pronk export {wrote[0]} --to mjcf --out robot.xml"],
+        following=[f"pronk export {shlex.quote(str(wrote[0]))} --to mjcf --out robot.xml"],
     )
 
 

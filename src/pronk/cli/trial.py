@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,7 +215,7 @@ def _trial_of_jumps(
             "videos": films,
         },
         wrote=wrote,
-        following=[f"open {page} in a browser", f"pronk play {policies[0]}"],
+        following=[f"open {page} in a browser", f"pronk play {shlex.quote(str(policies[0]))}"],
     )
 
 
