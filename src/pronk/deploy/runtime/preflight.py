@@ -181,8 +181,9 @@ def _joints(state: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
         high = limits.joints.high[i]
         if not low - overrun <= position <= high + overrun:
             yield (
-                f"{joint.name} is at {position:.2f} rad, outside {low:.2f} to {high:.2f} rad; zero "
-                "its encoder."
+                f"{joint.name} is at {position:.2f} rad, outside {low:.2f} to {high:.2f} rad; "
+                "check that the robot and the layout of its messages are the ones that are named, "
+                "then zero its encoder."
             )
         if not abs(velocity) <= REST_SPEED:
             yield f"{joint.name} turns at {velocity:.1f} rad/s; let the robot come to rest first."
