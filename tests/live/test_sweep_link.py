@@ -166,7 +166,7 @@ def test_without_a_robot_there_is_no_log(tmp_path: Path) -> None:
 
 def test_a_wire_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
     address = Address.parse("lcm://no_such_interface")
-    with pytest.raises(HardwareError, match="not opened.*expected no_such_interface"):
+    with pytest.raises(HardwareError, match=r"not opened.*expected no_such_interface"):
         record_wire(
             plan_of("FR_hip_roll"), tmp_path / "x", Link(robot="mini_cheetah", address=address)
         )
