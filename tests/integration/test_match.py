@@ -15,7 +15,7 @@ from pronk.identify.excitation.signals import Multisine
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match import gains as gains_file
 from pronk.identify.match.gains import JointGains
-from pronk.identify.match.match import match
+from pronk.identify.match.match import hashes_by_name, match
 from pronk.identify.match.result import MatchResult, load_match, save_match
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.response import Estimator
@@ -123,6 +123,20 @@ def test_the_gains_name_their_simulator_logs_and_groups(matched: MatchResult) ->
     assert (gains.simulator.timestep_s, gains.simulator.decimation) == (0.005, 4)
     assert gains.logs["FR_knee.mcap"] == f"{2:064x}"
     assert set(gains.groups) == {"hip_roll", "knee"}
+
+
+def test_logs_of_one_file_name_keep_a_hash_each() -> None:
+    """Two sweeps of a robot into two folders have files of the same names."""
+    log = chirp_log(ROBOT, "FR_knee", (21.0, 0.5), (0.25,), length_s=2.0)
+    logs = []
+    for source in ("/a/monday/knee.mcap", "/a/tuesday/knee.mcap", "/a/tuesday/hip.mcap"):
+        origin = replace(log.origin, source=source, sha256=source)
+        logs.append(replace(log, origin=origin))
+    assert hashes_by_name(logs) == {
+        "monday/knee.mcap": "/a/monday/knee.mcap",
+        "tuesday/knee.mcap": "/a/tuesday/knee.mcap",
+        "hip.mcap": "/a/tuesday/hip.mcap",
+    }
 
 
 def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path) -> None:

@@ -801,22 +801,39 @@ def match_result(
     """
     gains = {name: joint.gains for name, joint in joints.items()}
     simulation.require_stable({name: joint for name, joint in gains.items() if joint.matched})
-    hashes = {}
     virtual = False
     for log in logs:
-        hashes[Path(log.source or "log").name] = log.origin.sha256
         virtual = virtual or log.virtual
     return MatchResult(
         robot=simulation.robot.name,
         simulator=simulator,
         joints=joints,
         groups=group_gains(simulation.robot, gains, method),
-        logs=hashes,
+        logs=hashes_by_name(logs),
         virtual=virtual,
         excluded=excluded or {},
         robot_path=file_of_robot(simulation.robot),
         notes=match_notes(logs, joints),
     )
+
+
+def hashes_by_name(logs: Sequence[JointLog]) -> dict[str, str]:
+    """Return the SHA-256 of each log by the name of its file.
+
+    Files of one name in several folders, as two sweeps of a robot have, are named with as many of
+    their folders as tell them apart.
+    """
+    paths = [Path(log.source or "log") for log in logs]
+    hashes = {}
+    for path, log in zip(paths, logs, strict=True):
+        others = [other for other in paths if other != path]
+        count = 1
+        while count < len(path.parts) and any(
+            other.parts[-count:] == path.parts[-count:] for other in others
+        ):
+            count += 1
+        hashes[Path(*path.parts[-count:]).as_posix()] = log.origin.sha256
+    return hashes
 
 
 def file_of_robot(robot: RobotSpec) -> str:
