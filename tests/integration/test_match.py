@@ -206,6 +206,16 @@ def test_nominal_gains_are_those_of_the_log() -> None:
     assert matched_knee(stated).quality.nominal_error_db < 0.1
 
 
+def test_logs_of_different_drive_gains_are_refused() -> None:
+    """One pair of simulated gains cannot stand for two drives."""
+    soft = knee_log((17.0, 0.4))
+    stiff = knee_log((30.0, 0.6))
+    stiff = replace(stiff, stiffness=np.array([30.0]), damping=np.array([0.6]))
+    for mode in ("gains", "drive"):
+        with pytest.raises(LogError, match=r"FR_knee.*30.*17.*one at a time"):
+            match([soft, stiff], ROBOT, mode=mode)  # type: ignore[arg-type]
+
+
 def test_bad_logs_are_refused() -> None:
     good = knee_log((21.0, 0.5))
     elbow = tuple(replace(segment, joints=("elbow",)) for segment in good.segments)

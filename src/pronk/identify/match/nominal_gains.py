@@ -124,7 +124,8 @@ def with_drive_gains(
         The logs with their excitations marked and with gains for every column.
 
     Raises:
-        LogError: Gains of an excited joint are neither in the log nor given, or the two differ.
+        LogError: Gains of an excited joint are neither in the log nor given, or the two differ, or
+            logs excite a joint with different gains on its drive.
         PronkError: A name of `drive_gains` is neither a joint nor a joint group.
     """
     stated: dict[str, Pair] = {}
@@ -150,7 +151,36 @@ def with_drive_gains(
                 stiffness[column] = pair[0]
                 damping[column] = pair[1]
         completed.append(replace(log, stiffness=stiffness, damping=damping))
+    _require_same_gains(completed)
     return completed
+
+
+def _require_same_gains(logs: Sequence[JointLog]) -> None:
+    """Refuse logs that excite a joint with different gains on its drive.
+
+    A match finds one pair of simulated gains for each joint, which cannot stand for two drives.
+
+    Args:
+        logs: Logs with their excitations marked and with gains for every column.
+
+    Raises:
+        LogError: Gains differ; the message names the joint, the logs and the way out.
+    """
+    first: dict[str, tuple[JointLog, Pair]] = {}
+    for log in logs:
+        assert log.stiffness is not None
+        assert log.damping is not None
+        for name in log.excited_joints:
+            column = log.column(name)
+            pair = (float(log.stiffness[column]), float(log.damping[column]))
+            first_log, first_pair = first.setdefault(name, (log, pair))
+            if not np.allclose(pair, first_pair, rtol=_SAME_GAINS):
+                raise LogError(
+                    f"{log.source or 'log'}: {name} was excited at {pair[0]:g} N m/rad and "
+                    f"{pair[1]:g} N m s/rad, and at {first_pair[0]:g} and {first_pair[1]:g} in "
+                    f"{first_log.source or 'another log'}; simulated gains stand for one pair on "
+                    "the drive, so match logs of different gains one at a time."
+                )
 
 
 def _column_gains(log: JointLog, column: int, stated: Pair | None) -> Pair | None:
