@@ -16,6 +16,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.match import gains as gains_file
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import hashes_by_name, match
+from pronk.identify.match.predict import predict
 from pronk.identify.match.result import MatchResult, load_match, save_match
 from pronk.identify.match.settings import MatchSettings
 from pronk.identify.response.response import Estimator
@@ -214,6 +215,62 @@ def test_logs_of_different_drive_gains_are_refused() -> None:
     for mode in ("gains", "drive"):
         with pytest.raises(LogError, match=r"FR_knee.*30.*17.*one at a time"):
             match([soft, stiff], ROBOT, mode=mode)  # type: ignore[arg-type]
+
+
+SOFT = (5.0, 0.1)
+"""Gains on the drives of a leg's other joints, far below those of the robot's file."""
+
+
+def log_with_soft_neighbours(joint: str, neighbour_gains: tuple[float, float] = SOFT) -> JointLog:
+    """Sweep a joint whose neighbours have other gains than in the robot's file, as the log says."""
+    chain = ROBOT.joint(joint).chain
+    joints = []
+    # A leg is simulated as the one that it mirrors.
+    simulated_neighbours = [ROBOT.joint(name).original[0] for name in chain if name != joint]
+    for robot_joint in ROBOT.joints:
+        if robot_joint.original[0] in simulated_neighbours:
+            robot_joint = replace(robot_joint, stiffness=SOFT[0], damping=SOFT[1])
+        joints.append(robot_joint)
+    log = chirp_log(replace(ROBOT, joints=tuple(joints)), joint, (17.0, 0.4))
+    pose = np.array([ROBOT.joint(name).default_position for name in chain])
+    still = np.tile(pose, (len(log.time), 1))
+    column = chain.index(joint)
+    command = still.copy()
+    command[:, column] = log.command[:, 0]
+    position = still.copy()
+    position[:, column] = log.position[:, 0]
+    stiffness = np.full(len(chain), neighbour_gains[0])
+    stiffness[column] = 17.0
+    damping = np.full(len(chain), neighbour_gains[1])
+    damping[column] = 0.4
+    return replace(
+        log,
+        joints=chain,
+        command=command,
+        position=position,
+        stiffness=stiffness,
+        damping=damping,
+        pose=pose,
+    )
+
+
+@pytest.mark.parametrize("joint", ["FR_hip_pitch", "HL_hip_pitch"])
+def test_neighbours_are_held_with_the_gains_of_the_log(joint: str) -> None:
+    log = log_with_soft_neighbours(joint)
+    result = match([log], ROBOT)
+    gains = result.gains.joints[joint]
+    assert gains.stiffness.value == pytest.approx(17.0, rel=1e-3)
+    assert gains.damping.value == pytest.approx(0.4, rel=1e-3)
+    assert gains.flags == ()
+    (replayed,) = predict(log, ROBOT, result.gains).joints
+    assert replayed.rmse_matched < 2e-5
+
+
+def test_logs_that_contradict_each_other_of_a_neighbour_are_flagged() -> None:
+    joint = "FR_hip_pitch"
+    logs = [log_with_soft_neighbours(joint), log_with_soft_neighbours(joint, (30.0, 0.5))]
+    flags = match(logs, ROBOT).gains.joints[joint].flags
+    assert any("FR_knee" in flag and "different gains" in flag for flag in flags)
 
 
 def test_bad_logs_are_refused() -> None:

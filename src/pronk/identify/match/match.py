@@ -171,7 +171,7 @@ def match(
         >>> result.gains.joints["FR_knee"].stiffness
     """
     settings = settings or MatchSettings()
-    robot = robot_as_recorded(robot, drive_gains)
+    robot = robot_as_recorded(robot, drive_gains, logs)
     simulation = find_simulation(simulator, robot)
     check_choices(method, mode, settings, simulation)
     parameters = fitted_parameters(mode, settings, simulation)

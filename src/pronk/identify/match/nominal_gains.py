@@ -51,7 +51,35 @@ def gains_by_joint(robot: RobotSpec, drive_gains: DriveGains) -> dict[str, Pair]
     return by_joint
 
 
-def robot_as_recorded(robot: RobotSpec, drive_gains: DriveGains | None) -> RobotSpec:
+def held_pairs(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[Pair]]:
+    """Return the gains that logs state of joints that they do not excite.
+
+    Args:
+        logs: The logs as they were read.
+        robot: The robot.
+
+    Returns:
+        Different gains by the original of the joint (`Joint.original`), which is simulated in its
+        place.
+    """
+    pairs: dict[str, list[Pair]] = {}
+    for log in logs:
+        if log.stiffness is None or log.damping is None:
+            continue
+        excited_joints = log.excited_joints
+        for column, name in enumerate(log.joints):
+            pair = (float(log.stiffness[column]), float(log.damping[column]))
+            if name in excited_joints or name not in robot.joint_names or not pair[0] > 0.0:
+                continue
+            known_pairs = pairs.setdefault(robot.joint(name).original[0], [])
+            if not any(np.allclose(pair, known, rtol=_SAME_GAINS) for known in known_pairs):
+                known_pairs.append(pair)
+    return pairs
+
+
+def robot_as_recorded(
+    robot: RobotSpec, drive_gains: DriveGains | None, logs: Sequence[JointLog]
+) -> RobotSpec:
     """Give the joints of a robot the gains that were on their drives during the recordings.
 
     The joints that hold their place while another one is excited are simulated with them.
@@ -59,10 +87,19 @@ def robot_as_recorded(robot: RobotSpec, drive_gains: DriveGains | None) -> Robot
     Args:
         robot: The robot, whose file has the gains of the other joints.
         drive_gains: Gains that are stated for the recordings.
+        logs: The recordings, which may have the gains of joints that they do not excite. Where they
+            state different ones, those of the robot's file stay.
     """
-    if drive_gains is None or drive_gains == "default":
+    stated: dict[str, Pair] = {}
+    pairs = held_pairs(logs, robot)
+    for joint in robot.joints:
+        joint_pairs = pairs.get(joint.original[0], [])
+        if len(joint_pairs) == 1:
+            stated[joint.name] = joint_pairs[0]
+    if drive_gains is not None and drive_gains != "default":
+        stated |= gains_by_joint(robot, drive_gains)
+    if not stated:
         return robot
-    stated = gains_by_joint(robot, drive_gains)
     joints = []
     for joint in robot.joints:
         if joint.name in stated:
@@ -76,7 +113,7 @@ def robot_as_recorded(robot: RobotSpec, drive_gains: DriveGains | None) -> Robot
 def assumed_held_gains(
     robot: RobotSpec, joint_name: str, logs: Sequence[JointLog]
 ) -> tuple[str, ...]:
-    """Warn of joints that hold their place with assumed gains while another one is excited.
+    """Warn of joints whose gains are not known and that hold their place for another one.
 
     `pronk robot new` assumes gains where a model has no position servo, and says so by `servo` in
     the robot's file. A soft neighbour moves along and changes the matched gains.
@@ -99,6 +136,17 @@ def assumed_held_gains(
         is_held = name != joint_name and name not in joint.clamped
         if is_held and name not in logged and robot.joint(name).servo != "position":
             assumed.append(name)
+    pairs = held_pairs(logs, robot)
+    contradictory = []
+    for name in joint.chain:
+        if name != joint_name and len(pairs.get(robot.joint(name).original[0], [])) > 1:
+            contradictory.append(name)
+    if contradictory:
+        return (
+            f"held joints: the logs state different gains of {', '.join(contradictory)}, which "
+            f"hold their place while {joint_name} is excited, and those of the robot's file were "
+            "simulated; match logs of different gains one at a time",
+        )
     if not assumed:
         return ()
     names = ", ".join(assumed)

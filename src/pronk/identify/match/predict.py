@@ -24,7 +24,12 @@ from pronk.frames import data_frame
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.match.measured import rms
-from pronk.identify.match.nominal_gains import DriveGains, gains_on_drive, with_drive_gains
+from pronk.identify.match.nominal_gains import (
+    DriveGains,
+    gains_on_drive,
+    robot_as_recorded,
+    with_drive_gains,
+)
 from pronk.identify.response.grid import held_mean
 from pronk.identify.simulators.chain import (
     ChainSimulation,
@@ -220,6 +225,7 @@ def predict(
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
     require_matched(gains, allow_unmatched)
+    robot = robot_as_recorded(robot, drive_gains, [log])
     if simulator == "mujoco" and gains.simulator.profile:
         robot = profile_of(gains.simulator).robot(robot)
     (log,) = with_drive_gains([log], robot, drive_gains)
