@@ -25,7 +25,8 @@ from joint_mechanisms import (
     with_fault,
 )
 from pronk.arrays import Array
-from pronk.identify.match.checks import unwrapped, wrong_unit
+from pronk.identify.logs.checks import unwrapped
+from pronk.identify.match.checks import wrong_unit
 from pronk.identify.match.gains import JointGains
 from pronk.identify.match.match import match
 from pronk.identify.match.tables import dead_band_notes

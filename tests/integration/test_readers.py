@@ -307,6 +307,17 @@ def test_saturation_is_noted(tmp_path: Path, limits: tuple[float, float]) -> Non
     assert any("FR_knee is saturated" in note for note in read_log(tmp_path / "a.mcap").notes)
 
 
+def test_angles_that_wrap_are_excitations_of_their_own_size(tmp_path: Path) -> None:
+    turned = np.angle(np.exp(1j * (SWING + np.pi)))
+    assert np.ptp(turned) > 6.0
+    write_csv(tmp_path / "a.csv", moved(turned, turned))
+    log = read_log(tmp_path / "a.csv", options=ReadOptions(unit="rad"))
+    (excitation,) = log.excitations("FR_knee")
+    assert excitation.amplitude == pytest.approx(0.25, rel=0.01)
+    assert np.ptp(excitation.position) == pytest.approx(0.5, rel=0.01)
+    assert any("wraps" in note for note in log.notes)
+
+
 @pytest.mark.parametrize(
     ("position", "command", "words"),
     [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -58,6 +58,12 @@ CORRELATION_LIMIT = 0.1
 """Highest absolute correlation of two simultaneous commands that passes without a warning."""
 _LONGEST_LAG_S = 0.5
 """Largest lag at which commands are correlated [s]: longer than a joint's impulse response."""
+
+WRAPPED_TURN = 0.9
+"""Share of a turn from which on a change between two samples is a reading that wraps: no joint
+turns so far within a sample, and no other error of an encoder is as large."""
+_ROUNDING_RAD = 1e-3
+"""Rounding of a reading within a turn [rad]: that of three decimals, or of pi as 3.14."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,6 +271,35 @@ def check_radians(log: JointLog, joint: str) -> None:
         f"{log.source or 'log'}: {joint} is read in radians and {excess}, more than a joint "
         "turns; the file is probably in degrees (--unit deg, or convert it)."
     )
+
+
+def unwrapped(log: JointLog) -> JointLog:
+    """Return a log whose angles do not wrap at pi, with a note where they did.
+
+    Args:
+        log: A log; its columns in radians are unwrapped, command and position alike, and a position
+            that is whole turns away from its command is brought to it.
+    """
+    turn = 2.0 * np.pi
+    command = log.command.copy()
+    position = log.position.copy()
+    notes = []
+    for column, name in enumerate(log.joints):
+        if log.unit(name) != "rad":
+            continue
+        changes = np.abs(np.diff(log.position[:, column]))
+        wraps = int(np.sum(np.abs(changes - turn) < (1.0 - WRAPPED_TURN) * turn))
+        # A reading that wraps never leaves one turn.
+        if wraps == 0 or np.ptp(log.position[:, column]) > turn + _ROUNDING_RAD:
+            continue
+        for angles in (command, position):
+            angles[:, column] = np.unwrap(angles[:, column], discont=WRAPPED_TURN * turn)
+        away = float(np.median(position[:, column] - command[:, column]))
+        position[:, column] -= turn * round(away / turn)
+        notes.append(f"{name}: the position wraps at a turn {wraps} times; it was unwrapped")
+    if not notes:
+        return log
+    return replace(log, command=command, position=position, notes=(*log.notes, *notes))
 
 
 def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:

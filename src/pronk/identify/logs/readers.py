@@ -21,6 +21,7 @@ from pronk.identify.logs.checks import (
     check_unit,
     examine_time,
     saturation_note,
+    unwrapped,
 )
 from pronk.identify.logs.csv_npz_reader import read_csv, read_npz
 from pronk.identify.logs.description import (
@@ -184,7 +185,8 @@ def read_log(
         raise LogError(f"{path}: not readable as {format_name} ({reason}).") from error
     if description is not None:
         notes.append(f"read as {description_path(path).name} says")
-    return replace(log, notes=(*log.notes, *notes)).segmented()
+    # Angles that wrap would pass for excitations of half a turn.
+    return unwrapped(replace(log, notes=(*log.notes, *notes))).segmented()
 
 
 def _without_held_joints(path: Path, log: JointLog, robot: RobotSpec) -> JointLog:

@@ -15,14 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import Excitation, JointLog
+from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.match.measured import DB
 from pronk.identify.match.result import NO_MATCH
 from pronk.identify.response.response import FrequencyResponse
@@ -137,41 +136,6 @@ def _is_repeated(flag: str, flags: Sequence[str]) -> bool:
     """Return whether flags hold one of the same check, which begins with the same word."""
     check = flag.split(":")[0]
     return any(other.split(":")[0] == check for other in flags)
-
-
-# ---- readings that wrap ----
-
-WRAPPED_TURN = 0.9
-"""Share of a turn from which on a change between two samples is a reading that wraps: no joint
-turns so far within a sample, and no other error of an encoder is as large."""
-
-
-def unwrapped(log: JointLog) -> JointLog:
-    """Return a log whose angles do not wrap at pi, with a note where they did.
-
-    Args:
-        log: A log; its columns in radians are unwrapped, command and position alike, and a position
-            that is whole turns away from its command is brought to it.
-    """
-    turn = 2.0 * math.pi
-    command = log.command.copy()
-    position = log.position.copy()
-    notes = []
-    for column, name in enumerate(log.joints):
-        if log.unit(name) != "rad":
-            continue
-        changes = np.abs(np.diff(log.position[:, column]))
-        wraps = int(np.sum(np.abs(changes - turn) < (1.0 - WRAPPED_TURN) * turn))
-        if wraps == 0:
-            continue
-        for angles in (command, position):
-            angles[:, column] = np.unwrap(angles[:, column], discont=WRAPPED_TURN * turn)
-        away = float(np.median(position[:, column] - command[:, column]))
-        position[:, column] -= turn * round(away / turn)
-        notes.append(f"{name}: the position wraps at a turn {wraps} times; it was unwrapped")
-    if not notes:
-        return log
-    return replace(log, command=command, position=position, notes=(*log.notes, *notes))
 
 
 # ---- errors: what makes every number meaningless ----

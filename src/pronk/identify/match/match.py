@@ -11,6 +11,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
+from pronk.identify.logs.checks import unwrapped
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.logs.velocity import velocity_note
 from pronk.identify.match.checks import (
@@ -21,7 +22,6 @@ from pronk.identify.match.checks import (
     check_mean_position,
     check_response,
     unexplained_motion,
-    unwrapped,
 )
 from pronk.identify.match.compared import (
     COHERENCE_MIN,

@@ -21,6 +21,7 @@ from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.frames import data_frame
+from pronk.identify.logs.checks import unwrapped
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.match.measured import rms
@@ -228,7 +229,7 @@ def predict(
     robot = robot_as_recorded(robot, drive_gains, [log])
     if simulator == "mujoco" and gains.simulator.profile:
         robot = profile_of(gains.simulator).robot(robot)
-    (log,) = with_drive_gains([log], robot, drive_gains)
+    (log,) = with_drive_gains([unwrapped(log)], robot, drive_gains)
     if moves_together(log):
         if simulator != "mujoco":
             raise PronkError(
