@@ -307,6 +307,15 @@ def test_saturation_is_noted(tmp_path: Path, limits: tuple[float, float]) -> Non
     assert any("FR_knee is saturated" in note for note in read_log(tmp_path / "a.mcap").notes)
 
 
+def test_saturation_is_noted_of_a_joint_that_moves_for_a_small_part_of_the_log() -> None:
+    """In the log of a sweep of many joints each of them rests most of the time."""
+    rest = np.zeros(11 * len(SWING))
+    command = np.concatenate([rest, SWING])
+    position = np.concatenate([rest, np.clip(SWING, -0.05, 1.0)])
+    assert "is saturated" in saturation_note(moved(position, command), "FR_knee")
+    assert not saturation_note(moved(0.8 * command, command), "FR_knee")
+
+
 def test_angles_that_wrap_are_excitations_of_their_own_size(tmp_path: Path) -> None:
     turned = np.angle(np.exp(1j * (SWING + np.pi)))
     assert np.ptp(turned) > 6.0

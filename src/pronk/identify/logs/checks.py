@@ -41,7 +41,8 @@ it moves on."""
 _LONGEST_TURN_S = 0.1
 """Longest time at an end that is the turning point of an oscillation [s]."""
 _SATURATED = 0.05
-"""Share of the time at an end that makes a joint saturated."""
+"""Share of the time from the first to the last change of a joint's command, at an end, that makes
+the joint saturated."""
 
 _LAGS_S = (0.0, 0.02, 0.04, 0.08, 0.15, 0.3)
 """Delays of a position behind its command that are tried where a command is guessed [s]."""
@@ -242,12 +243,15 @@ def saturation_note(log: JointLog, joint: str) -> str:
             moves_on = stretch.max() - stretch[0] > _MOVES_ON * commanded
             if length_s >= _LONGEST_TURN_S and moves_on:
                 saturated_s += length_s
-    share = saturated_s / float(log.time[-1] - log.time[0])
+    # Of a sweep of many joints each moves for a small part of the log.
+    changes = np.flatnonzero(np.diff(command))
+    excited_s = float(log.time[changes[-1] + 1] - log.time[changes[0]])
+    share = min(saturated_s / excited_s, 1.0)
     if share <= _SATURATED:
         return ""
     return (
-        f"{joint} is saturated: for {100.0 * share:.0f} % of the time it stays at an end of its "
-        "travel while its command moves on; excite it with a smaller amplitude or farther from "
+        f"{joint} is saturated: for {100.0 * share:.0f} % of its excitation it stays at an end of "
+        "its travel while its command moves on; excite it with a smaller amplitude or farther from "
         "its stops"
     )
 
