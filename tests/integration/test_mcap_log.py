@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
+from chirp_logs import chirp_log
 from log_files import example, write_mcap
 from pronk.errors import LogError
 from pronk.identify.logs import sweep_writer
@@ -23,8 +25,11 @@ from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.sweep_writer import LogHeader, McapLogWriter
+from pronk.identify.response.estimate import estimate_response
+from pronk.robots import load_robot
 
 LOG = example()
+ROBOT = load_robot("mini_cheetah")
 NAMES = ("robot", "joints", "segments", "units")
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 
@@ -126,9 +131,48 @@ def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(
     # At most one chunk of half a second is lost.
     assert count >= share * len(LOG.time) - 2 * 256
     begun = [segment for segment in LOG.segments if segment.start < short.time[-1]]
+    if len(short.segments) < len(begun):
+        # A repeat that was cut is left out where whole ones came before it.
+        assert begun.pop().stop > short.time[-1]
+        assert any("left out" in note for note in short.notes)
+        assert begun
     for segment, begun_segment in zip(short.segments, begun, strict=True):
         assert segment.stop <= short.time[-1]
         assert segment.repeat == begun_segment.repeat
+
+
+def stopped(log: JointLog, count: int) -> JointLog:
+    """Return a log that ends after some rows, in the middle of an excitation."""
+    return replace(
+        log,
+        time=log.time[:count],
+        command=log.command[:count],
+        position=log.position[:count],
+    )
+
+
+def test_a_repeat_that_was_cut_does_not_spoil_the_whole_ones(tmp_path: Path) -> None:
+    """A sweep that a person stops ends in a repeat that stands still yet, or is short."""
+    log = chirp_log(ROBOT, "FR_knee", (21.0, 0.5), (0.25,), repeats=2)
+    assert len(log.segments) == 2
+    for seconds in (0.2, 2.0):
+        count = int(np.searchsorted(log.time, log.segments[1].start + seconds))
+        path = tmp_path / f"{seconds}.mcap"
+        write_mcap(path, stopped(log, count))
+        short = read_log(path)
+        assert short.segments == log.segments[:1]
+        assert any("left out" in note for note in short.notes)
+        (response,) = estimate_response(short, "FR_knee")
+        (expected,) = estimate_response(replace(log, segments=log.segments[:1]), "FR_knee")
+        np.testing.assert_allclose(response.response, expected.response, rtol=1e-9)
+
+
+def test_the_only_excitation_is_read_though_it_was_cut(tmp_path: Path) -> None:
+    log = chirp_log(ROBOT, "FR_knee", (21.0, 0.5), (0.25,))
+    count = int(0.7 * len(log.time))
+    write_mcap(tmp_path / "a.mcap", stopped(log, count))
+    (segment,) = read_log(tmp_path / "a.mcap").segments
+    assert segment.stop == log.time[count - 1]
 
 
 @settings(max_examples=150, deadline=None)

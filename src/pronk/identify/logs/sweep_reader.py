@@ -33,6 +33,8 @@ from pronk.identify.logs.sweep_writer import (
 _BLOCK = 128
 """Samples that are parsed together; their lists are too few to start Python's garbage collector,
 which would take as long as the parsing."""
+_WHOLE = 0.95
+"""Share of an excitation from which on it counts as whole: what is missing is its rest."""
 
 
 def read_sweep(path: Path, messages: Iterable[Record], damage: str) -> JointLog:
@@ -89,11 +91,22 @@ def _joint_log(path: Path, data: Mapping[str, Sequence[bytes]], damage: str) -> 
     segments = [_read_segment(message) for message in data[SEGMENT]]
     if len(set(segments)) < len(segments):
         raise LogError(f"{path}: damaged: it has the same segment twice; record again.")
-    recorded = []
+    recorded: list[Segment] = []
     for segment in segments:
-        if segment.start < end_time:
-            # A segment that was cut ends with the last sample.
-            recorded.append(replace(segment, stop=min(segment.stop, end_time)))
+        if segment.start >= end_time:
+            continue
+        # A segment that was cut ends with the last sample.
+        shortened = replace(segment, stop=min(segment.stop, end_time))
+        recorded_s = shortened.stop - shortened.start
+        is_cut = recorded_s < _WHOLE * (segment.stop - segment.start)
+        if is_cut and any(segment.joints == earlier.joints for earlier in recorded):
+            # The others would be read as coarsely as it is, and one that stands still yet not.
+            notes.append(
+                f"the excitation of {', '.join(segment.joints)} that was cut after "
+                f"{recorded_s:.1f} s is left out, as whole ones were recorded before"
+            )
+            continue
+        recorded.append(shortened)
     return JointLog(
         robot=header.robot,
         joints=header.joints,
