@@ -11,9 +11,11 @@ import numpy as np
 
 from pronk.errors import ArtefactError, PronkError, RobotError
 from pronk.identify.match import tables
+from pronk.identify.match.export.targets import accepts
 from pronk.identify.match.gains import MatchedGains, load_gains
 from pronk.identify.match.predict import Prediction, load_prediction
 from pronk.identify.match.result import HELD_OUT, JointResult, MatchResult, load_match
+from pronk.identify.simulators.profiles import profile_of
 from pronk.report import figures
 from pronk.report.charts import bode_chart
 from pronk.report.page import Part
@@ -157,6 +159,7 @@ def _content(
     for joint in compared.values():
         first = figures.compared_responses(joint).measured[0]
         estimators.add(f"{first.estimator}, {first.window}")
+    exports = _exports(result)
     predictions = []
     for prediction_path in sorted(gains_path.parent.glob("*.prediction.npz")):
         prediction = load_prediction(prediction_path)
@@ -190,8 +193,8 @@ def _content(
         "excitation": _excitation_table(compared),
         "amplitudes": _amplitude_table(compared),
         "logs": _logs_table(result),
-        "exports": _exports(result),
-        "translated": result.simulator.profile != ISAAC_LAB,
+        "exports": exports,
+        "translated": bool(exports) and result.simulator.profile != ISAAC_LAB,
     }
 
 
@@ -216,12 +219,21 @@ def _gains_table(result: MatchResult) -> Table:
 
 
 def _exports(result: MatchResult) -> list[tuple[str, str]]:
-    """Return the exports that take these gains as they are, each with the name of its file."""
-    if result.simulator.profile == ISAAC_LAB:
+    """Return the exports that take these gains as they are, each with the name of its file.
+
+    There are none for a simulator whose drive law pronk does not know.
+    """
+    try:
+        held_profile = profile_of(result.simulator)
+    except PronkError:
+        return []
+    if held_profile.name == ISAAC_LAB:
         return [(ISAAC_LAB, "actuators.py")]
-    if result.simulator.law == "explicit":
-        return [("mjlab", "actuators.py"), ("mjcf", "robot.xml")]
-    return [("mjcf", "robot.xml")]
+    exports = []
+    for target, file in (("mjlab", "actuators.py"), ("mjcf", "robot.xml")):
+        if accepts(target, held_profile):
+            exports.append((target, file))
+    return exports
 
 
 def _robot_joints(result: MatchResult) -> dict[str, Joint]:

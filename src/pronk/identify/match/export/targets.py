@@ -294,15 +294,22 @@ def export(
     return f"{header}\n\n{body}"
 
 
-def _check_profile(target: str, gains_profile: Profile) -> None:
-    """Refuse gains that hold for another drive law or step than the target's."""
+def accepts(target: str, gains_profile: Profile) -> bool:
+    """Return whether gains that hold for a profile have the drive law and the step of a target."""
     name = TARGETS[target].profile
     if not name or name == gains_profile.name:
-        return
+        return True
     target_profile = profile(name)
     same_law = target_profile.drive_law == gains_profile.drive_law
-    if same_law and target_profile.timestep_s == gains_profile.timestep_s:
+    return same_law and target_profile.timestep_s == gains_profile.timestep_s
+
+
+def _check_profile(target: str, gains_profile: Profile) -> None:
+    """Refuse gains that hold for another drive law or step than the target's."""
+    if accepts(target, gains_profile):
         return
+    name = TARGETS[target].profile
+    target_profile = profile(name)
     raise PronkError(
         f"the gains hold for {gains_profile.name} ({_law_text(gains_profile)}), and {target} has "
         f"{_law_text(target_profile)}, with which they are another joint; give `pronk match LOGS "
