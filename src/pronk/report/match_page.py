@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pronk.errors import ArtefactError, PronkError, RobotError
+from pronk.errors import ArtefactError, PronkError
 from pronk.identify.match import tables
+from pronk.identify.match.export.actuators import robot_of
 from pronk.identify.match.export.targets import accepts
 from pronk.identify.match.gains import MatchedGains, load_gains
 from pronk.identify.match.predict import Prediction, load_prediction
@@ -21,7 +22,6 @@ from pronk.report.charts import bode_chart
 from pronk.report.page import Part
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import joint_words, picture
-from pronk.robots import load_robot
 from pronk.robots.robot import Joint
 from pronk.tables import Cell, Column, Table, counted
 
@@ -144,6 +144,9 @@ def _content(
     robot_joints = _robot_joints(result)
     members = _members(result, robot_joints)
     drive_gains = {name: (joint.stiffness, joint.damping) for name, joint in robot_joints.items()}
+    for name, joint_result in result.joints.items():
+        if joint_result.drive_gains is not None:
+            drive_gains[name] = joint_result.drive_gains
     order = figures.knees_first(list(compared))
     charts = {}
     chart_notes = {}
@@ -239,8 +242,8 @@ def _exports(result: MatchResult) -> list[tuple[str, str]]:
 def _robot_joints(result: MatchResult) -> dict[str, Joint]:
     """Return the robot's description of each matched joint; empty for an unknown robot."""
     try:
-        robot = load_robot(result.robot)
-    except RobotError:
+        robot = robot_of(result.gains)
+    except PronkError:
         return {}
     return {joint.name: joint for joint in robot.joints if joint.name in result.joints}
 

@@ -48,6 +48,7 @@ from pronk.identify.match.measured import (
 )
 from pronk.identify.match.nominal_gains import (
     DriveGains,
+    Pair,
     assumed_held_gains,
     robot_as_recorded,
     with_drive_gains,
@@ -280,7 +281,9 @@ def match(
                     flags = (*check_explained_motion(recorded, simulated), *flags)
                 gains = joint_gains(fit, robot, flags=flags)
                 gains = replace(gains, physical=physical.get(name, {}))
-                joints[name] = JointResult(joint=name, gains=gains, fit=fit)
+                joints[name] = JointResult(
+                    joint=name, gains=gains, fit=fit, drive_gains=pair_of(nominal.get(name))
+                )
                 continue
             target = measured[name][0]
             compared = compare(
@@ -308,6 +311,7 @@ def match(
                 joint=name,
                 gains=replace(gains, physical=physical.get(name, {})),
                 fit=fit,
+                drive_gains=pair_of(nominal[name]),
                 responses=compared,
                 grid=grids.get(name),
                 zero_armature=zero_armature,
@@ -560,6 +564,7 @@ def match_chains(
             *check_excitations(excitations, robot),
         )
     fits: dict[str, DriveFit] = {}
+    all_nominal: dict[str, dict[str, float]] = {}
     physical: dict[str, dict[str, FittedValue]] = {}
     responses: dict[str, ComparedResponses] = {}
     motion_flags: dict[str, tuple[str, ...]] = {}
@@ -575,6 +580,7 @@ def match_chains(
         ) as chain:
             replay = ChainReplay(chain)
             nominal = nominal_drives(chain.logs, chain.joints, robot)
+            all_nominal |= nominal
             chain_fits = fit_drives(
                 replay,
                 parameters=parameters,
@@ -625,10 +631,23 @@ def match_chains(
         flags = (*motion_flags.get(name, ()), *excitation_flags.get(name, ()))
         gains = joint_gains(fit, robot, responses.get(name), flags)
         gains = replace(gains, physical=physical.get(name, {}))
-        joints[name] = JointResult(joint=name, gains=gains, fit=fit, responses=responses.get(name))
+        joints[name] = JointResult(
+            joint=name,
+            gains=gains,
+            fit=fit,
+            drive_gains=pair_of(all_nominal.get(name)),
+            responses=responses.get(name),
+        )
     excluded = left_out_by_torque(torque_fits, joints) | excluded
     result = match_result(simulation, simulation.info(), joints, logs, excluded)
     return replace(result, gain_uncertainty=settings.gain_uncertainty)
+
+
+def pair_of(nominal: Mapping[str, float] | None) -> Pair | None:
+    """Return the stiffness and damping of a nominal drive; None without one."""
+    if nominal is None:
+        return None
+    return nominal["stiffness"], nominal["damping"]
 
 
 def compared_flags(compared: ComparedResponses) -> tuple[str, ...]:

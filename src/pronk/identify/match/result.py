@@ -184,6 +184,9 @@ class JointResult:
     """Gains that training needs, with their errors and flags."""
     fit: DriveFit
     """Fit of the drive that the gains are from."""
+    drive_gains: tuple[float, float] | None = None
+    """Stiffness [N m/rad] and damping [N m s/rad] that were on the real drive, as the logs or the
+    options state them; None where torque alone was fitted."""
     responses: ComparedResponses | None = None
     """Measured and simulated responses; None where no response could be estimated."""
     grid: GridSearch | None = None
