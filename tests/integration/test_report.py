@@ -13,13 +13,28 @@ import numpy as np
 import pytest
 
 from command_line import accepted
+from fine_joint import JOINT, FineJoint
 from pronk.errors import ArtefactError
 from pronk.identify.match import gains as gains_file
+from pronk.identify.match.export.targets import export
+from pronk.identify.match.predict import Prediction, save_prediction
+from pronk.identify.match.result import MatchResult
+from pronk.identify.simulators.info import SimulatorInfo
+from pronk.identify.simulators.profiles import load_profiles
 from pronk.jump.trial import tables
 from pronk.jump.trial.jumps import JumpFigures
 from pronk.jump.trial.results import load_results, save_results
 from pronk.report import build, charts, match_page
-from report_cases import CASES, match, write_match, write_tree, write_trial
+from pronk.robots import load_robot
+from report_cases import (
+    CASES,
+    joint_prediction,
+    joint_result,
+    match,
+    write_match,
+    write_tree,
+    write_trial,
+)
 
 NASTY = "<img src=x onerror=alert(1)>"
 
@@ -158,6 +173,72 @@ def test_the_page_of_a_match(tmp_path: Path) -> None:
     (tmp_path / "fresh.prediction.npz").unlink()
     ids = match_report(write_match(tmp_path, replace(result, joints=bare))).ids
     assert not optional & set(ids)
+
+
+def test_replays_of_other_gains_and_of_logs_that_were_used_are_no_predictions(
+    tmp_path: Path,
+) -> None:
+    result = match(legs=1)
+    write_match(tmp_path, result)
+    knee = result.gains.joints["FR_knee"]
+    used_gains = {"FR_knee": (knee.stiffness.value, knee.damping.value)}
+    replay = Prediction(
+        joints=(joint_prediction(),), virtual=True, source="fresh.mcap", gains=used_gains
+    )
+    prediction_id = "match-prediction-of-logs-that-the-match-did-not-use"
+    replay_id = "match-replay-of-logs-that-the-match-used"
+    path = tmp_path / "a.prediction.npz"
+    save_prediction(path, replay)
+    ids = match_report(tmp_path).ids
+    assert prediction_id in ids
+    assert replay_id not in ids
+    save_prediction(path, replace(replay, fitted=True))
+    ids = match_report(tmp_path).ids
+    assert replay_id in ids
+    assert prediction_id not in ids
+    other_gains = {"FR_knee": (1.01 * knee.stiffness.value, knee.damping.value)}
+    save_prediction(path, replace(replay, gains=other_gains))
+    page = match_report(tmp_path)
+    assert not {prediction_id, replay_id} & set(page.ids)
+    assert path.name in page.text
+
+
+@pytest.mark.parametrize("name", load_profiles())
+def test_the_page_names_exports_that_take_the_gains(tmp_path: Path, name: str) -> None:
+    result = replace(match(legs=1), simulator=load_profiles()[name].info)
+    write_match(tmp_path, result)
+    exports = match_page.match_part(tmp_path / "match.npz").content["exports"]
+    assert exports
+    for target, _ in exports:
+        assert export(result.gains, target)
+
+
+def test_no_export_is_named_for_a_simulator_of_an_unknown_law(tmp_path: Path) -> None:
+    result = replace(match(legs=1), simulator=SimulatorInfo(engine="my engine"))
+    page = match_report(write_match(tmp_path, result))
+    assert "pronk export" not in page.text
+    assert "pronk translate" not in page.text
+
+
+def test_a_robot_of_its_own_is_read_from_its_file(tmp_path: Path) -> None:
+    """Groups are those of the robot's file, which has the gains of the drives too."""
+    robot = load_robot(FineJoint().write_robot(tmp_path / "robot"))
+    joint = joint_result("knee")
+    gains = MatchResult(
+        robot="fine",
+        simulator=SimulatorInfo(),
+        joints={JOINT: replace(joint, joint=JOINT)},
+        groups={JOINT: match(legs=1).groups["knee"]},
+        robot_path=robot.source,
+    )
+    write_match(tmp_path, gains)
+    content = match_page.match_part(tmp_path / "match.npz").content
+    stiffness = robot.joint(JOINT).stiffness
+    assert content["scale"].rows[0][1] == pytest.approx(joint.gains.stiffness.value / stiffness)
+    stated_joint = replace(joint, joint=JOINT, drive_gains=(30.0, 0.6))
+    write_match(tmp_path, replace(gains, joints={JOINT: stated_joint}))
+    content = match_page.match_part(tmp_path / "match.npz").content
+    assert content["scale"].rows[0][1] == pytest.approx(joint.gains.stiffness.value / 30.0)
 
 
 def test_the_curves_of_a_chart_are_those_of_the_responses(tmp_path: Path) -> None:

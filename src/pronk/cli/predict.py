@@ -85,7 +85,7 @@ def predict_logs(
             wrote.extend(_save_figures(prediction, log, folder))
             for row in prediction_rows(prediction.joints):
                 rows.append({**row, "log": log.source})
-            if log.origin.sha256 and log.origin.sha256 in matched_gains.logs.values():
+            if prediction.fitted:
                 fitted_logs.append(log.source)
             done((index + 1) / len(logs))
 

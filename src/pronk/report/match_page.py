@@ -32,6 +32,8 @@ HEADER_CHARACTERS = 4000
 ISAAC_LAB = "isaaclab-implicit"
 """Profile of Isaac Lab's default actuator, and its export."""
 JOINT = Column(heading="joint")
+WRITTEN_DIGITS = 1e-5
+"""Relative difference of gains up to which they are the same, for a file has six digits."""
 
 
 def match_part(path: Path) -> Part:
@@ -164,9 +166,17 @@ def _content(
         estimators.add(f"{first.estimator}, {first.window}")
     exports = _exports(result)
     predictions = []
+    checks = []
+    of_other_gains = []
     for prediction_path in sorted(gains_path.parent.glob("*.prediction.npz")):
         prediction = load_prediction(prediction_path)
-        if prediction.joints:
+        if not prediction.joints:
+            continue
+        if not _is_of(prediction, gains):
+            of_other_gains.append(prediction_path.name)
+        elif prediction.fitted:
+            checks.append(_prediction_section(prediction))
+        else:
             predictions.append(_prediction_section(prediction))
     return {
         "result": result,
@@ -191,6 +201,8 @@ def _content(
         else None,
         "bare_table": _zero_armature_table(compared),
         "predictions": predictions,
+        "checks": checks,
+        "of_other_gains": of_other_gains,
         "scale": None if fitted_together else _scale_table(result, members, drive_gains),
         "estimators": sorted(estimators),
         "excitation": _excitation_table(compared),
@@ -366,6 +378,19 @@ def _zero_armature_table(compared: Mapping[str, JointResult]) -> Table:
         Column(heading="without rotor inertia"),
     )
     return Table(title="", columns=columns, rows=tuple(rows))
+
+
+def _is_of(prediction: Prediction, gains: MatchedGains) -> bool:
+    """Return whether a log was replayed with these gains; files of earlier versions do not say."""
+    for name, (stiffness, damping) in prediction.gains.items():
+        if name not in gains.joints:
+            return False
+        joint = gains.joints[name]
+        same_stiffness = math.isclose(stiffness, joint.stiffness.value, rel_tol=WRITTEN_DIGITS)
+        same_damping = math.isclose(damping, joint.damping.value, rel_tol=WRITTEN_DIGITS)
+        if not (same_stiffness and same_damping):
+            return False
+    return True
 
 
 def _prediction_section(prediction: Prediction) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from pronk.identify.match.gains import MatchedGains, require_matched
 from pronk.identify.match.measured import rms
 from pronk.identify.match.nominal_gains import (
     DriveGains,
+    Pair,
     gains_on_drive,
     robot_as_recorded,
     with_drive_gains,
@@ -120,6 +121,10 @@ class Prediction:
     """Joints that moved and were not predicted, with the reason for each."""
     unmatched: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Joints whose gains are no match, with the reasons."""
+    fitted: bool = False
+    """True if the gains were matched with this very log, so that this is a check of the fit."""
+    gains: Mapping[str, Pair] = field(default_factory=dict)
+    """Matched stiffness [N m/rad] and damping [N m s/rad] by predicted joint."""
 
     def __repr__(self) -> str:
         """Name the log and the errors of its joints."""
@@ -243,12 +248,19 @@ def predict(
     if not joints:
         reasons = " ".join(excluded.values()) or "no joint is excited in it."
         raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
+    replayed_gains = {}
+    for prediction in joints:
+        joint_gains = gains.joints[prediction.joint]
+        replayed_gains[prediction.joint] = (joint_gains.stiffness.value, joint_gains.damping.value)
+    sha256 = log.origin.sha256
     return Prediction(
         joints=tuple(joints),
         source=log.source,
         virtual=log.virtual,
         excluded=excluded,
         unmatched=gains.unmatched,
+        fitted=bool(sha256) and sha256 in gains.logs.values(),
+        gains=replayed_gains,
     )
 
 
