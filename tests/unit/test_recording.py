@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +16,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.readers import read_log
 from pronk.identify.logs.recording import RecordingHeader, RecordingWriter
 from pronk.identify.match.match import match
+from pronk.report.motion import read_motion
 from pronk.robots import load_robot
 
 PENDULUM = load_robot(Path(__file__).resolve().parents[2] / "examples" / "pendulum")
@@ -79,6 +83,18 @@ def write_recording(
         report(last + (tick + 1) * period, -0.3)
     if end:
         writer.end()
+
+
+def test_the_motion_of_a_recording_is_on_the_wall_clock(tmp_path: Path) -> None:
+    log = chirps()
+    path = tmp_path / "recording.mcap"
+    # Messages arrive now, as they do while a robot is recorded.
+    began_s = time.monotonic()
+    write_recording(path, replace(log, time=log.time + began_s), is_stamped=False)
+    os.utime(path, (0.0, 0.0))
+    motion = read_motion(path, PENDULUM, lambda: read_log(path, robot=PENDULUM))
+    assert motion.notes == ()
+    assert motion.time_ns[0] / 1e9 == pytest.approx(time.time(), abs=60.0)
 
 
 @pytest.mark.parametrize("is_stamped", [True, False])

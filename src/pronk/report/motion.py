@@ -16,13 +16,14 @@ from pronk.deploy.runtime.log import TICK_TOPIC
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.mcap import DamagedError, Record, records
+from pronk.identify.logs.recording import STATE
 from pronk.identify.logs.sweep_writer import SAMPLE
 from pronk.robots.robot import RobotSpec
 
 WALL_CLOCK_NS = 1_000_000_000 * 10**9
 """Log times above this are of a wall clock and not of a clock that started with the recording: the
 year 2001 [ns]."""
-CLOCKS = {SAMPLE: "t", TICK_TOPIC: "begun"}
+CLOCKS = {SAMPLE: "t", TICK_TOPIC: "begun", STATE: "t"}
 """Topic of pronk's own logs to the field of its messages with the time on the clock of the log."""
 
 
@@ -82,7 +83,7 @@ def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> RobotMotion:
     if log.time[0] * 1e9 > WALL_CLOCK_NS:
         offset_ns = 0
     elif offset_ns is None:
-        notes.append("the log has no wall clock; its end is put at the file's last change")
+        notes.append("no wall clock was read of the log; its end is put at the file's last change")
         offset_ns = path.stat().st_mtime_ns - round(log.time[-1] * 1e9)
     remarks = []
     for segment in log.segments:

@@ -44,7 +44,7 @@ from pronk.identify.logs.mcap import (
 RECORDING_SCHEMA = "pronk/record/1"
 RECORDING_PREFIX = "/record/"
 _HEADER = "/record/header"
-_STATE = "/record/state"
+STATE = "/record/state"
 _COMMAND = "/record/command"
 _END = "/record/end"
 RECORDING_TOPICS: dict[str, dict[str, Any]] = {
@@ -56,7 +56,7 @@ RECORDING_TOPICS: dict[str, dict[str, Any]] = {
         "has_torque": BOOLEAN,
         "metadata": {"type": "object"},
     },
-    _STATE: {
+    STATE: {
         "t": NUMBER,
         "sent": NUMBER,
         "position": NUMBERS,
@@ -150,7 +150,7 @@ class RecordingWriter:
         body: dict[str, Any] = {"t": arrived, "sent": sent, "position": position}
         body["velocity"] = velocity
         body["torque"] = torque
-        self._put(_STATE, arrived, body)
+        self._put(STATE, arrived, body)
 
     def command(
         self, arrived: float, sent: float | None, targets: tuple[Array, Array], drive: WireDrive
@@ -251,7 +251,7 @@ def read_recording(path: Path, messages: Sequence[Record], damage: str) -> Joint
         if schema != RECORDING_SCHEMA:
             raise LogError(f"{path}: schema {schema!r}; this pronk reads {RECORDING_SCHEMA!r}.")
         header = msgspec.json.decode(data[_HEADER][0], type=RecordingHeader)
-        states = [msgspec.json.decode(body, type=_StateMessage) for body in data[_STATE]]
+        states = [msgspec.json.decode(body, type=_StateMessage) for body in data[STATE]]
         sent = [msgspec.json.decode(body, type=_CommandMessage) for body in data[_COMMAND]]
         end: dict[str, Any] = {}
         if data[_END]:
