@@ -186,6 +186,36 @@ def test_a_unit_is_right_or_asked(
         assert any("--time-unit" in question for question in found.questions)
 
 
+def test_one_joint_in_degrees_beside_one_in_radians_is_asked_with_the_option(
+    tmp_path: Path,
+) -> None:
+    """The option that is named reads both joints as they moved; one unit for all is not asked."""
+    columns = {
+        "time": TIME,
+        "hip_cmd": COMMAND,
+        "hip_pos": POSITION,
+        "knee_cmd": DEGREES * COMMAND,
+        "knee_pos": DEGREES * POSITION,
+    }
+    path = table(tmp_path / "mixed.csv", columns)
+    (question,) = guess(path).questions
+    scale = question.split("--scale knee=")[1].split(",")[0]
+    log = guess(path, unit="rad", scale={"knee": float(scale)}).log
+    assert_example(log, "hip")
+    assert log is not None
+    knee_position = log.position[:, log.column("knee")]
+    np.testing.assert_allclose(knee_position, POSITION, rtol=1e-4, atol=1e-6)
+
+    for unit, factor in (("rad", 1.0), ("deg", DEGREES)):
+        alike = {"time": TIME}
+        for name in ("hip", "knee"):
+            alike[f"{name}_cmd"] = factor * COMMAND
+            alike[f"{name}_pos"] = factor * POSITION
+        alike_guess = guess(table(tmp_path / f"{unit}.csv", alike))
+        assert not alike_guess.questions
+        assert alike_guess.options.unit == unit
+
+
 def test_joints_are_those_of_the_robot_or_asked(tmp_path: Path) -> None:
     path = table(
         tmp_path / "a.csv", {"t": TIME, "FL_calf_cmd": COMMAND - 1.8, "FL_calf": POSITION - 1.8}

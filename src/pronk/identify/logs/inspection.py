@@ -26,7 +26,7 @@ from pronk.identify.logs.csv_npz_reader import QUANTITIES
 from pronk.identify.logs.csv_table import CsvTable, read_table
 from pronk.identify.logs.description import read_description, with_description
 from pronk.identify.logs.joint_log import JointLog
-from pronk.identify.logs.options import TIME_UNITS, NeedsOptionsError, ReadOptions
+from pronk.identify.logs.options import ANGLE_UNITS, TIME_UNITS, NeedsOptionsError, ReadOptions
 from pronk.identify.logs.readers import format_of, read_log
 from pronk.robots.robot import RobotSpec
 
@@ -36,6 +36,8 @@ _USUAL_HZ = (20.0, 5_000.0)
 """Rates that logs usually have [Hz], by which the unit of time is told where no name says it."""
 _LEAST_DEGREES = 1.0
 """Travel below which a command is not in degrees: gears have more backlash [deg]."""
+_LEAST_RADIANS = 0.02
+"""Travel above which a command in radians excites a joint: as the smallest chirps do [rad]."""
 _SOME_RADIANS = np.pi
 """Angle up to which a small motion is in radians for sure; most joints turn less far [rad]."""
 _RANGE_SLACK = 0.1
@@ -254,7 +256,8 @@ def _inspect_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> L
             if not position_follows(log.time, command, log.position[:, column], closely=closely):
                 questions.append(
                     f"{name or 'the command'} may be no commanded position "
-                    f"of {joint}, as the position does not follow it; say what the columns are "
+                    f"of {joint}, as the position does not follow it, which is also so where the "
+                    "drive was at its torque limit or the joint held; say what the columns are "
                     f"with --columns command.{joint}=NAME,position.{joint}=NAME (or torque.{joint})"
                 )
     return LogGuess(
@@ -538,6 +541,37 @@ def _may_be_radians(values: Mapping[str, Array], robot: RobotSpec | None) -> boo
     return True
 
 
+def _joints_of_two_units(values: Mapping[str, Array], robot: RobotSpec | None) -> tuple[str, str]:
+    """Find two joints of one file that cannot have the same unit.
+
+    Args:
+        values: Angles in the file's unit by `command.JOINT` and `position.JOINT`, shape (n,).
+        robot: The robot, whose ranges rule radians out.
+
+    Returns:
+        A joint that cannot be in radians, and a commanded joint that cannot be in degrees; two
+        empty names where there is no such pair.
+    """
+    by_joint: dict[str, dict[str, Array]] = {}
+    for reading, angles in values.items():
+        _, _, joint = reading.partition(".")
+        by_joint.setdefault(joint, {})[reading] = angles
+    in_degrees = ""
+    in_radians = ""
+    for joint, joint_values in by_joint.items():
+        command = joint_values.get(f"command.{joint}")
+        if command is None:
+            continue
+        travel = float(np.ptp(command))
+        if not _may_be_radians(joint_values, robot):
+            in_degrees = in_degrees or joint
+        elif _LEAST_RADIANS < travel < _LEAST_DEGREES:
+            in_radians = in_radians or joint
+    if in_degrees and in_radians:
+        return in_degrees, in_radians
+    return "", ""
+
+
 def unit_by_values(
     values: Mapping[str, Array],
     robot: RobotSpec | None,
@@ -561,6 +595,15 @@ def unit_by_values(
         farthest = max(farthest, float(np.abs(angles).max()))
         if reading.startswith("command.") or travel == 0.0:
             travel = max(travel, float(np.ptp(angles)))
+    joint_in_degrees, joint_in_radians = _joints_of_two_units(values, robot)
+    if joint_in_degrees:
+        questions.append(
+            f"{joint_in_degrees} turns too far for radians and {joint_in_radians} would hardly "
+            "move in degrees, so the file may have both units; give --unit rad --scale "
+            f"{joint_in_degrees}={ANGLE_UNITS['deg']:.6f}, for each joint that is in degrees, or "
+            "--unit deg if all are"
+        )
+        return ""
     may_be_radians = _may_be_radians(values, robot)
     may_be_degrees = travel >= _LEAST_DEGREES or farthest > _SOME_RADIANS
     sizes = f"travel {travel:.3g}, farthest {farthest:.3g}"
