@@ -240,6 +240,22 @@ def test_a_torque_column_tells_an_inertia_that_the_file_does_not_have(
         assert said == pytest.approx(factor, rel=0.15)
 
 
+def test_a_torque_column_of_the_opposite_sign_is_said(tmp_path: Path) -> None:
+    """The sign of a torque says nothing about the gains, so that they stay what they are."""
+    joint = FineJoint()
+    robot = load_robot(str(joint.write_robot(tmp_path)))
+    sent = np.arange(27 * 50) / 50.0
+    log = joint.log(sent, two_chirps_at(sent, length_s=12.0), 500.0)
+    late = np.interp(log.time - joint.delay_s, log.time, log.command[:, 0])
+    speed = np.gradient(log.position[:, 0], log.time)
+    torque = joint.stiffness * (late - log.position[:, 0]) - joint.damping * speed
+    opposite = replace(log, torque=-torque[:, None], origin=LogOrigin())
+    result = match([opposite], robot, drive_gains={JOINT: (17.0, 0.4)})
+    (flag,) = flags_of(result, JOINT, "torque column")
+    assert "opposite sign" in flag
+    assert result.gains.joints[JOINT].stiffness.value == pytest.approx(joint.stiffness, rel=0.15)
+
+
 # ---- a stiffness that is stated wrongly ----
 
 

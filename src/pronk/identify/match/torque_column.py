@@ -21,6 +21,9 @@ constants of drives are off by up to 20 %, and inertias of models by a few per c
 CORRELATED = 0.9
 """Least correlation of the two torques. Below it the column is that of something else, or is so
 noisy that its scale is not known."""
+OPPOSED = -0.5
+"""Correlation of the two torques up to which the column has the opposite sign. Noise makes a
+correlation smaller and does not turn it, so that less is asked than for a scale."""
 EXPLAINED = 0.05
 """Error in time of a match, as a share of the amplitude, up to which its gains tell a torque."""
 
@@ -72,13 +75,19 @@ def check_torque_scale(excitations: Sequence[Excitation], fit: DriveFit) -> tupl
         fit: The fit of the joint.
 
     Returns:
-        A flag with the factor and what would look so; none where the torques agree within
-        `OTHER_TORQUE`, where none was measured, and where the match does not explain the motion.
+        A flag with the factor or the sign and what would look so; none where the torques agree
+        within `OTHER_TORQUE`, where none was measured, and where the match does not explain the
+        motion.
     """
     amplitude = max(excitation.amplitude for excitation in excitations)
     if not fit.rmse <= EXPLAINED * amplitude or "stiffness" not in fit.sd:
         return ()
     scale, correlation = torque_scale(excitations, fit)
+    if correlation <= OPPOSED:
+        return (
+            "torque column: it has the opposite sign of the torque that the matched gains ask for "
+            f"(correlation {correlation:.2f}); negate it before you match with --mode drive",
+        )
     if not correlation >= CORRELATED or 1.0 / OTHER_TORQUE < scale < OTHER_TORQUE:
         return ()
     return (
