@@ -256,6 +256,27 @@ def test_a_torque_column_of_the_opposite_sign_is_said(tmp_path: Path) -> None:
     assert result.gains.joints[JOINT].stiffness.value == pytest.approx(joint.stiffness, rel=0.15)
 
 
+# ---- a pose that is another than that of the file ----
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+def test_a_joint_that_stands_elsewhere_than_in_the_file_is_said(
+    tmp_path: Path, offset: float
+) -> None:
+    """Exchanged columns and encoders with another zero may show in nothing else."""
+    joint = FineJoint()
+    robot = load_robot(str(joint.write_robot(tmp_path)))
+    sent = np.arange(27 * 50) / 50.0
+    log = joint.log(sent, two_chirps_at(sent, length_s=12.0), 500.0)
+    moved = replace(log, command=log.command + offset, position=log.position + offset)
+    result = match([moved], robot, drive_gains={JOINT: (17.0, 0.4)})
+    notes = [note for note in result.notes if "another pose" in note]
+    assert len(notes) == (offset != 0.0)
+    for note in notes:
+        default = robot.joint(JOINT).default_position
+        assert f"{JOINT} {default + offset:.3g} rad" in note
+
+
 # ---- a stiffness that is stated wrongly ----
 
 

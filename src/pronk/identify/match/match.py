@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -832,7 +832,7 @@ def match_result(
         virtual=virtual,
         excluded=excluded or {},
         robot_path=file_of_robot(simulation.robot),
-        notes=match_notes(logs, joints),
+        notes=match_notes(logs, joints, simulation.robot),
     )
 
 
@@ -867,8 +867,51 @@ def file_of_robot(robot: RobotSpec) -> str:
     return robot.source
 
 
-def match_notes(logs: Sequence[JointLog], joints: Mapping[str, JointResult]) -> tuple[str, ...]:
-    """Return what the readers remarked of the logs, wrong velocities, and coarse responses."""
+OTHER_POSE = 0.3
+"""Distance of a joint from its pose in the robot's file from which on it is said [rad]."""
+
+
+def pose_note(log: JointLog, joints: Iterable[str], robot: RobotSpec, source: str) -> str:
+    """Say which joints of a log stand elsewhere than in the pose of the robot's file.
+
+    A log may well be of another pose, and is simulated there. Columns that are exchanged, an
+    encoder with another zero, a wrong sign and a wrong unit show in the same way, and often in
+    nothing else.
+
+    Args:
+        log: The log.
+        joints: The joints that were matched.
+        robot: The robot, with the pose of its file.
+        source: Name of the log for the note.
+
+    Returns:
+        The note; empty where every joint is within `OTHER_POSE` of the file's pose.
+    """
+    positions: dict[str, float] = {}
+    for joint in joints:
+        for excitation in excitations_of([log], joint):
+            for name in robot.joint_names:
+                if name in log.joints and log.unit(name) == "rad":
+                    position = float(excitation.pose[log.column(name)])
+                    positions.setdefault(name, position)
+    differences = []
+    for name, position in positions.items():
+        default = robot.joint(name).default_position
+        if abs(position - default) > OTHER_POSE:
+            differences.append(f"{name} {position:.3g} rad (file: {default:.3g})")
+    if not differences:
+        return ""
+    return (
+        f"{source}: the log was recorded in another pose than that of the robot's file: "
+        f"{', '.join(differences)}. It is simulated in the pose of the log; if the robot did not "
+        "stand there, columns are exchanged, or a unit, a sign or the zero of an encoder is wrong"
+    )
+
+
+def match_notes(
+    logs: Sequence[JointLog], joints: Mapping[str, JointResult], robot: RobotSpec
+) -> tuple[str, ...]:
+    """Return remarks of the readers, other poses, wrong velocities, and coarse responses."""
     notes = []
     for log in logs:
         source = Path(log.source or "log").name
@@ -877,6 +920,7 @@ def match_notes(logs: Sequence[JointLog], joints: Mapping[str, JointResult]) -> 
         for name in joints:
             if name in log.excited_joints:
                 notes.append(velocity_note(log, name, source))
+        notes.append(pose_note(log, joints, robot, source))
     for joint in joints.values():
         if joint.responses is not None:
             notes.append(resolution_note(joint.responses.measured[0]))
