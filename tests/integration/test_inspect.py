@@ -216,6 +216,15 @@ def test_one_joint_in_degrees_beside_one_in_radians_is_asked_with_the_option(
         assert alike_guess.options.unit == unit
 
 
+def test_spikes_of_an_encoder_are_not_taken_for_degrees(tmp_path: Path) -> None:
+    """Two samples in a thousand that are beyond the range of the joint leave the unit open."""
+    spiked = POSITION - 1.7
+    spiked[[300, 700, 1100]] += 5.0
+    columns = {"time": TIME, "FL_knee_cmd": COMMAND - 1.7, "FL_knee_pos": spiked}
+    log_guess = guess(table(tmp_path / "spikes.csv", columns), GO2)
+    assert log_guess.options.unit != "deg"
+
+
 def test_joints_are_those_of_the_robot_or_asked(tmp_path: Path) -> None:
     path = table(
         tmp_path / "a.csv", {"t": TIME, "FL_calf_cmd": COMMAND - 1.8, "FL_calf": POSITION - 1.8}

@@ -40,6 +40,8 @@ _LEAST_RADIANS = 0.02
 """Travel above which a command in radians excites a joint: as the smallest chirps do [rad]."""
 _SOME_RADIANS = np.pi
 """Angle up to which a small motion is in radians for sure; most joints turn less far [rad]."""
+_OUTLIERS = 0.005
+"""Share of the samples at either end that does not tell the unit: encoders skip now and then."""
 _RANGE_SLACK = 0.1
 """Share of a joint's range by which a log may leave it."""
 
@@ -256,8 +258,9 @@ def _inspect_csv(path: Path, robot: RobotSpec | None, options: ReadOptions) -> L
             if not position_follows(log.time, command, log.position[:, column], closely=closely):
                 questions.append(
                     f"{name or 'the command'} may be no commanded position "
-                    f"of {joint}, as the position does not follow it, which is also so where the "
-                    "drive was at its torque limit or the joint held; say what the columns are "
+                    f"of {joint}, as the position does not follow it. So would look a drive at its "
+                    "torque limit, and a joint that friction or a stop holds; say what the columns "
+                    "are "
                     f"with --columns command.{joint}=NAME,position.{joint}=NAME (or torque.{joint})"
                 )
     return LogGuess(
@@ -527,8 +530,11 @@ def _angle_unit(
 
 def _may_be_radians(values: Mapping[str, Array], robot: RobotSpec | None) -> bool:
     """Return True if angles are such as joints reach, and those of the robot where it is known."""
-    for reading, angles in values.items():
+    for reading, all_angles in values.items():
         quantity, _, joint = reading.partition(".")
+        # A few wrong samples of an encoder are no degrees.
+        low_end, high_end = np.quantile(all_angles, (_OUTLIERS, 1.0 - _OUTLIERS))
+        angles = all_angles[(all_angles >= low_end) & (all_angles <= high_end)]
         if np.abs(angles).max() > LARGEST_POSITION:
             return False
         if quantity == "command" and 0.5 * np.ptp(angles) > LARGEST_COMMAND:
