@@ -289,3 +289,11 @@ def test_damaged_files_are_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "study.yaml"
     path.write_text(content)
     assert "study.yaml" in refused("study", path, "--plan")
+
+
+def test_a_file_of_another_kind_is_named_by_its_schema(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text("schema: pronk/robot/1\nname: arm\n")
+    text = refused("study", path, "--plan")
+    assert "pronk/robot/1" in text
+    assert "pronk/study/1" in text

@@ -374,6 +374,12 @@ def load_study(path: Path) -> StudyConfig:
     body = read_yaml(path, ArtefactError, "docs/study.md has an example")
     if not isinstance(body, Mapping):
         raise ArtefactError(f"{path}: no study; expected schema, title, arms and so on.")
+    schema = body.get("schema")
+    if schema is not None and schema != SCHEMA:
+        raise ArtefactError(
+            f"{path}: no study, its schema is {schema!r}; expected {SCHEMA!r} (docs/study.md has "
+            "an example)."
+        )
     _check_parts(path, body)
     try:
         return converted(body, StudyConfig, path)
