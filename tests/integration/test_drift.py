@@ -187,6 +187,9 @@ def test_gains_that_are_not_of_one_joint_are_refused(tmp_path: Path) -> None:
     assert "--matters" in refused(*words, "--matters", "0")
     assert "--robot" in refused(*words, "--robot", "go2")
     assert "no such file" in refused("drift", tmp_path / "none.yaml", tmp_path / "old.yaml")
+    alone = refused("drift", tmp_path / "old.yaml")
+    assert "old.yaml" in alone
+    assert "later match" in alone
 
 
 def test_simulated_pairs_of_sweeps(tmp_path: Path) -> None:

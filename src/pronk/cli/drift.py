@@ -63,6 +63,11 @@ def drift(
     from pronk.identify.match.drift import compare_gains
     from pronk.identify.match.gains import load_gains, save_gains
 
+    if not new:
+        raise PronkError(
+            f"nothing to compare {old} with; give the gains file of a later match, or fresh logs, "
+            "after it."
+        )
     earlier = load_gains(old)
     wrote: list[Path] = []
     if len(new) == 1 and new[0].suffix in (".yaml", ".yml"):
