@@ -615,8 +615,6 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
     inertia = np.maximum(inertia + applied * runs.armature_change, 1e-3 * runs.inertia)
     command = np.tile(runs.command, (len(theta), 1, 1))
     command = delayed(command, np.broadcast_to(delay, kp.shape)).transpose(1, 0, 2)
-    cosine = gravity * runs.gravity[0]
-    sine = gravity * runs.gravity[1]
     iterations = law.drive.iterations
     h = runs.timestep / iterations
     explicit = law.beside_explicit or law.drive.kind == "explicit"
@@ -630,33 +628,60 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
         implicit_damping = np.zeros(kp.shape)
     total_damping = implicit_damping + viscous
     effective_inertia = inertia + h * total_damping
+    # The part that acts as it is at the start of a step: of the position, and of the speed.
+    step_spring = np.zeros(kp.shape)
+    step_damping = np.zeros(kp.shape)
+    if explicit:
+        step_spring = kp
+        step_damping = kd
+    elif law.stale_position:
+        step_spring = kp
+    is_fresh = not (law.stale_position or law.stale_speed)
+    holds_torque = (explicit or law.stale_position > 0) and not (is_fresh and iterations == 1)
+    if explicit and not holds_torque:
+        # With one iteration a step the start of the step is that of the iteration.
+        spring = spring + step_spring
+        total_damping = total_damping + step_damping
+        step_spring = np.zeros(kp.shape)
+    # All of it as changes of the speed in an iteration.
     gain = h / effective_inertia
-    friction_speed = h * friction / effective_inertia
-    q = np.broadcast_to(runs.position[0], kp.shape).copy()
-    v = np.zeros(kp.shape)
-    positions = np.empty((len(command), *kp.shape))
-    speeds = np.empty((len(command), *kp.shape))
-    for step, target in enumerate(command):
-        positions[step] = q
-        speeds[step] = v
-        explicit_torque = np.zeros(kp.shape)
-        read_position = positions[max(step - law.stale_position, 0)]
-        if explicit:
+    target_change = gain * (spring + step_spring) * command
+    spring = gain * spring
+    kept_speed = 1.0 - gain * total_damping
+    step_spring = gain * step_spring
+    step_damping = gain * step_damping
+    has_gravity = bool(np.any(runs.gravity))
+    cosine = gain * gravity * runs.gravity[0]
+    sine = gain * gravity * runs.gravity[1]
+    friction_change = gain * friction
+    # Of MuJoCo's dry friction, what it takes of the speed beside what it takes of the torque.
+    taken_speed = _FRICTION_RATE * gain * inertia - 1.0
+    positions = np.empty((len(command) + 1, *kp.shape))
+    speeds = np.zeros((len(command) + 1, *kp.shape))
+    positions[0] = runs.position[0]
+    for step in range(len(command)):
+        q = positions[step]
+        v = speeds[step]
+        step_change = target_change[step]
+        if holds_torque:
+            read_position = positions[max(step - law.stale_position, 0)]
             read_speed = speeds[max(step - law.stale_speed, 0)]
-            explicit_torque = kp * (target - read_position) - kd * read_speed
-        elif law.stale_position:
-            explicit_torque = kp * (target - read_position)
+            step_change = step_change - step_spring * read_position - step_damping * read_speed
         for _ in range(iterations):
-            torque = explicit_torque + spring * (target - q) - total_damping * v
-            torque += cosine * np.cos(q) + sine * np.sin(q)
+            free_speed = kept_speed * v
+            free_speed += step_change
+            free_speed -= spring * q
+            if has_gravity:
+                free_speed += cosine * np.cos(q)
+                free_speed += sine * np.sin(q)
+            stop = free_speed
             if law.soft_friction:
-                stop = _IMPEDANCE * (torque + _FRICTION_RATE * inertia * v)
-                v = v + gain * (torque - np.minimum(np.maximum(stop, -friction), friction))
-            else:
-                v = v + gain * torque
-                v = v - np.minimum(np.maximum(v, -friction_speed), friction_speed)
+                stop = _IMPEDANCE * (free_speed + taken_speed * v)
+            v = free_speed - np.minimum(np.maximum(stop, -friction_change), friction_change)
             q = q + h * v
-    return positions.transpose(1, 0, 2)
+        positions[step + 1] = q
+        speeds[step + 1] = v
+    return positions[:-1].transpose(1, 0, 2)
 
 
 class _FitEndError(Exception):
