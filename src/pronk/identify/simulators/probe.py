@@ -77,7 +77,7 @@ _EXACT_RESIDUAL = 1e-6
 """Residual of a law that is certainly right: no other is tried."""
 _STALE_STEPS = (1, 2, 3, 4)
 """Ages of the position in the torque that are tried [steps]."""
-_MOST_SECONDS = 12.0
+MOST_SECONDS = 12.0
 """Time of the processor after which no further law is tried [s]."""
 _SHARE_OF_TIME = 0.4
 """Share of the time that is left in which laws are tried with one share of the gains."""
@@ -259,13 +259,20 @@ class _Answer:
     runs: _Runs
 
 
-def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
+def probe_joint(
+    simulator: Simulator,
+    robot: RobotSpec,
+    joint: str | None = None,
+    *,
+    most_seconds: float = MOST_SECONDS,
+) -> Probe:
     """Name the drive law and the parameters that act at one joint, whose gains are the robot's.
 
     Args:
         simulator: The simulator.
         robot: The robot whose joint it is.
         joint: The joint; the first one that moves no other if None.
+        most_seconds: Time of the processor after which no further law is tried [s].
 
     Raises:
         PronkError: There is no such joint, it does not move, or the simulator diverges even with
@@ -283,7 +290,7 @@ def probe_joint(simulator: Simulator, robot: RobotSpec, joint: str | None = None
     clip = bench.clip(stable_share)
     if clip is not None:
         bench.lower_amplitude(_CLEAR_OF_CLIP * clip.acting * clip.height)
-    deadline = time.process_time() + _MOST_SECONDS
+    deadline = time.process_time() + most_seconds
     answers: list[_Answer] = []
     shares = [stable_share]
     while shares:
