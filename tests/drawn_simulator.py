@@ -145,6 +145,9 @@ class DrawnSimulator:
         arm = np.cross(links.axis[0], links.centre[0])
         inertia = links.axis[0] @ links.inertia[0] @ links.axis[0] + links.mass[0] * arm @ arm
         inertia = inertia + armature
+        # Of one hinge it is a sinusoid of the angle.
+        gravity_at_zero = links.gravity_torque(np.zeros(1))[0]
+        gravity_at_quarter = links.gravity_torque(np.full(1, 0.5 * np.pi))[0]
         law = truth.law
         h = truth.robot.timestep_s / law.iterations
         explicit = law.kind == "explicit" or truth.fault == "beside"
@@ -159,7 +162,7 @@ class DrawnSimulator:
             if explicit:
                 torque_before = kp * (target - q) - kd * v
             for _ in range(law.iterations):
-                gravity = np.array([links.gravity_torque(np.array([angle]))[0] for angle in q])
+                gravity = gravity_at_zero * np.cos(q) + gravity_at_quarter * np.sin(q)
                 force = torque_before + gravity - viscous * v
                 mass = inertia + h * viscous
                 if law.kind != "explicit":
