@@ -68,7 +68,9 @@ def sentence_of(said: str) -> str:
     return lines[-1] if lines else " ".join(said.split())[-300:]
 
 
-def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row:
+def walk(
+    packages: Path, candidate: Candidate, joint: str, scratch: Path, *, repeats: int = 3
+) -> Row:
     """Take one robot from its model to its exports; return how far it went, and its numbers.
 
     Args:
@@ -76,6 +78,7 @@ def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row
         candidate: The robot.
         joint: Hinge that is excited.
         scratch: Folder to work in; it is emptied first.
+        repeats: Times each amplitude of the sweep is repeated.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     model = copy_model(packages, candidate.path, scratch)
@@ -110,7 +113,7 @@ def walk(packages: Path, candidate: Candidate, joint: str, scratch: Path) -> Row
     if not step("check", "robot", "check", "robot.yaml"):
         return row
     sweep = ["sweep", "robot.yaml", "--out", "logs", "--joints", joint, "--link", "sim"]
-    sweep += ["--json", "sweep.json", "--overwrite"]
+    sweep += ["--repeats", str(repeats), "--json", "sweep.json", "--overwrite"]
     if not step("sweep", *sweep):
         fitting = FITTING.search(row["refusal"])
         if fitting is None:
