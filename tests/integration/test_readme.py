@@ -28,10 +28,9 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.chdir(tmp_path)
     shutil.copytree(ROOT / "policies", "policies")
     # Two repeats give intervals, and a replay needs one excitation.
-    sweep = ("sweep", "mini_cheetah", "--joints", "FR_knee", "--out")
+    sweep = ("sweep", "mini_cheetah", "--joints", "FR_knee", "--amplitude", ".25", "--out")
     accepted(*sweep, "logs", "--repeats", "2")
-    once = ("--repeats", "1", "--amplitude", ".25")
-    accepted(*sweep, "fresh", "--signal", "log-chirp", "--seed", "1", *once)
+    accepted(*sweep, "fresh", "--signal", "log-chirp", "--seed", "1", "--repeats", "1")
     names: dict[str, Any] = {}
     exec(compile(code, "python.md", "exec"), names)
     knee = names["result"].gains.joints["FR_knee"]
