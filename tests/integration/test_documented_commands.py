@@ -108,10 +108,12 @@ class Workspace:
 
     def folder_of(self, command: DocumentedCommand) -> Path:
         """Return where a command is run."""
+        if command.folder == "examples/csv_to_isaaclab":
+            return self.root / "leg"  # which has the files of that folder
         is_own = command.place in LEG_PLACES or command.place.endswith("--help")
         if "chirp.csv" in command.words and not command.folder:
             is_own = True
-        if "demo" in command.words or "mini_cheetah" in command.words:
+        if {"demo", "trial", "mini_cheetah"} & set(command.words):
             is_own = False
         return self.root / ("leg" if is_own else "quadruped") / command.folder
 
@@ -195,14 +197,17 @@ def bounded(words: Sequence[str], folder: Path) -> list[str]:
             bounded_words[words.index("--jumps") + 1] = "1"
         else:
             bounded_words += ["--jumps", "1"]
-        if not any(word.startswith("--commands") for word in words):
+        if "paper" in words:  # five commands
+            bounded_words[words.index("paper")] = "1,0"
+        elif not any(word.startswith("--commands") for word in words):
             bounded_words += ["--commands", "1,0"]
         bounded_words += ["--no-video", "--overwrite"]
     elif name == "sweep":
         if "--joints" not in words:
             bounded_words += ["--joints", "FR_knee"]
         if "--repeats" not in words:
-            bounded_words += ["--repeats", "2"]
+            # Mode drive needs two.
+            bounded_words += ["--repeats", "2" if "mini_cheetah" in words else "1"]
         if "--amplitude" not in words:
             bounded_words += ["--amplitude", "0.2"]
         if "--plan-only" not in words:
@@ -219,8 +224,10 @@ def bounded(words: Sequence[str], folder: Path) -> list[str]:
             if knee.exists():
                 bounded_words[2] = str(knee.relative_to(folder))
                 break
-    elif name == "demo" and "--quick" not in words:
-        bounded_words.append("--quick")
+    elif name == "demo":
+        if "--quick" not in words:
+            bounded_words.append("--quick")
+        bounded_words += ["--repeats", "1"]
     return bounded_words
 
 
@@ -268,10 +275,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
         accepted("match", "logs", "--robot", "mini_cheetah", "--out", "gains.yaml")
         for run in ("runs/matched", "runs/m1"):
             shutil.copytree("policies/matched", run)
-        for folder in (leg, quadruped / "examples" / "csv_to_isaaclab"):
-            patch.chdir(folder)
-            accepted("log", "inspect", "chirp.csv", "--robot", "robot.yaml", "--yes")
-            accepted("log", "inspect", "fresh.csv", "--robot", "robot.yaml", "--yes")
+        patch.chdir(leg)
+        accepted("log", "inspect", "chirp.csv", "--robot", "robot.yaml", "--yes")
+        accepted("log", "inspect", "fresh.csv", "--robot", "robot.yaml", "--yes")
     return Workspace(root)
 
 
