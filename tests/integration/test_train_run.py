@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 import statistics
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,6 +28,7 @@ from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import PronkRunner
 from pronk.policy.runtime import load_policy
+from termination import terminated
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 of_one_run = pytest.mark.xdist_group("run")
@@ -57,29 +53,6 @@ def one_thread() -> Any:
 def train(*arguments: str | Path) -> int:
     """Run `pronk train`; returns its exit status."""
     return cli.run(["train", *[str(argument) for argument in arguments]])
-
-
-@contextmanager
-def terminated(folder: RunFolder) -> Iterator[None]:
-    """Send this process SIGTERM as soon as a run has a checkpoint, if the block still runs then."""
-    over = threading.Event()
-
-    def terminate() -> None:
-        while not over.wait(0.05):
-            if checkpoint.numbered_checkpoints(folder.path):
-                os.kill(os.getpid(), signal.SIGTERM)
-                return
-
-    # After the training, which has a handler of its own, the signal would end the tests.
-    handler = signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    thread = threading.Thread(target=terminate)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-        signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture(scope="module")
@@ -166,20 +139,20 @@ def test_a_finished_run_is_not_trained_again(finished_run: RunFolder, tmp_path: 
 
 def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
-    words = ("walk", "--gains", "naive", *SMALL, "--phase", "walk=4", "--out", folder.path)
-    with terminated(folder):
+    words = ("walk", "--gains", "naive", *SMALL, "--phase", "walk=3", "--out", folder.path)
+    with terminated(lambda: bool(checkpoint.numbered_checkpoints(folder.path))):
         assert train(*words) == 130
     stopped = folder.read()
     assert not stopped["finished"]
     assert stopped["sessions"][0]["stopped"] == "SIGTERM"
-    assert 1 <= checkpoint.read_checkpoint(folder.checkpoint())["iter"] + 1 < 4
+    assert 1 <= checkpoint.read_checkpoint(folder.checkpoint())["iter"] + 1 < 3
     assert train("walk", "--resume", "--out", folder.path) == 0
     record = folder.read()
     assert record["finished"]
-    assert record["phases"]["walk"]["iterations"] == 4
+    assert record["phases"]["walk"]["iterations"] == 3
     state = checkpoint.read_checkpoint(folder.path / "walk.pt")
-    assert state["iter"] == 3
-    assert state["infos"]["env_state"]["common_step_counter"] == 4 * 24
+    assert state["iter"] == 2
+    assert state["infos"]["env_state"]["common_step_counter"] == 3 * 24
     assert not load_policy(folder.path / "policy.onnx").contract.jump
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,13 +23,13 @@ from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.tasks import load_task
+from termination import terminated
 
 pytestmark = [pytest.mark.train, pytest.mark.xdist_group("hosts")]
 
 HOSTS = ("198.51.100.1", "198.51.100.2")
 """Addresses that documentation may use (RFC 5737), which no machine has; ~/.ssh/config leads both
 to the server of this test."""
-CODE = "import sys; from pronk.cli.main import main; main()"
 ITERATIONS = 2
 WORDS = ("train", "walk", "--device", "cpu")
 NEW = ("--gains", "naive", "--envs", "8", "--save-interval", "1", "--phase", f"walk={ITERATIONS}")
@@ -101,16 +99,6 @@ def trained(*arguments: str | Path) -> FinishedCommand:
     return invoke([*WORDS, *arguments])
 
 
-def started(*arguments: str | Path) -> subprocess.Popen[str]:
-    """Start `pronk train` of a small walking policy in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-c", CODE, *WORDS, *[str(argument) for argument in arguments]],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
 def weights(path: Path) -> dict[str, torch.Tensor]:
     """Return the tensors of the actor and the critic in a checkpoint, by name."""
     state = checkpoint.read_checkpoint(path)
@@ -178,13 +166,10 @@ def test_a_terminated_training_on_hosts_leaves_a_checkpoint(tmp_path: Path) -> N
     """The names are one machine, which a CPU may do; a GPU may not."""
     folder = RunFolder(tmp_path / "run")
     long = ("--gains", "naive", "--envs", "8", "--save-interval", "1", "--phase", "walk=100000")
-    process = started(*long, "--hosts", "localhost,127.0.0.1", "--out", folder.path)
-    while process.poll() is None and checkpoint.latest_checkpoint(folder.path) is None:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate()
-    assert process.returncode == 130, output
-    assert "--hosts localhost,127.0.0.1" in output
+    with terminated(lambda: checkpoint.latest_checkpoint(folder.path) is not None):
+        stopped = trained(*long, "--hosts", "localhost,127.0.0.1", "--out", folder.path)
+    assert stopped.exit_code == 130, stopped.output
+    assert "--hosts localhost,127.0.0.1" in stopped.output
     # Also on a busy machine, where the last iteration may take longer than it is waited for.
     assert folder.read()["sessions"][0]["stopped"] == "SIGTERM"
     assert checkpoint.read_checkpoint(folder.checkpoint())["infos"]["processes"] == 2

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +13,8 @@ from command_line import invoke
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
 from pronk.policy.runtime import load_policy
+from pronk.signals import interrupt
+from termination import terminated
 
 pytestmark = pytest.mark.train
 
@@ -26,18 +23,6 @@ WORDS = (
     *("--envs", "4", "--save-interval", "1"),
     *("--phase", "walk=2", "--phase", "jump_a=1", "--phase", "jump_b=1"),
 )
-CODE = "import sys; from pronk.cli.main import main; main()"
-
-
-def started(out: Path) -> subprocess.Popen[str]:
-    """Start `pronk train` of two seeds side by side."""
-    return subprocess.Popen(
-        [sys.executable, "-c", CODE, *WORDS, "--out", str(out)],
-        env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
 
 
 def test_interrupted_trainings_go_on_and_a_broken_one_is_named(
@@ -46,22 +31,22 @@ def test_interrupted_trainings_go_on_and_a_broken_one_is_named(
     out = tmp_path / "runs"
     first = RunFolder(out / "trainings" / "naive" / "seed-1")
     second = RunFolder(out / "trainings" / "naive" / "seed-2")
-    process = started(out)
-    while process.poll() is None:
-        if checkpoint.latest_checkpoint(first.path) and checkpoint.latest_checkpoint(second.path):
-            break
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate()
-    assert process.returncode == 130, output
-    assert "next:" in output
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+    def both_have_checkpoints() -> bool:
+        latest = checkpoint.latest_checkpoint
+        return latest(first.path) is not None and latest(second.path) is not None
+
+    with terminated(both_have_checkpoints, interrupt):
+        stopped = invoke([*WORDS, "--out", out])
+    assert stopped.exit_code == 130, stopped.output
+    assert "next:" in stopped.output
     for folder in (first, second):
         assert folder.read()["sessions"][-1]["stopped"] == "SIGTERM"
 
     # The second one cannot go on; the first one can.
     second.checkpoint().write_bytes(b"no checkpoint")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     again = invoke([*WORDS, "--out", out])
     assert again.exit_code == 2, again.output
     assert "naive, seed 2: failed" in again.output
