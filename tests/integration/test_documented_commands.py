@@ -205,6 +205,9 @@ def bounded(words: Sequence[str], folder: Path) -> list[str]:
     elif name == "sweep":
         if "--joints" not in words:
             bounded_words += ["--joints", "FR_knee"]
+        elif "mini_cheetah" in words:
+            # One knee stands for another, so that no later match has two of them.
+            bounded_words[words.index("--joints") + 1] = "FR_knee"
         if "--repeats" not in words:
             # Mode drive needs two.
             bounded_words += ["--repeats", "2" if "mini_cheetah" in words else "1"]
