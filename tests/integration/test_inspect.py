@@ -216,6 +216,16 @@ def test_one_joint_in_degrees_beside_one_in_radians_is_asked_with_the_option(
         assert alike_guess.options.unit == unit
 
 
+def test_a_joint_out_of_its_range_in_either_unit_is_named_with_the_range(tmp_path: Path) -> None:
+    """A knee with the other sign is out of its range in rad, and would hardly move in degrees."""
+    columns = {"time": TIME, "FL_knee_cmd": 1.7 - COMMAND, "FL_knee_pos": 1.7 - POSITION}
+    log_guess = guess(table(tmp_path / "sign.csv", columns), GO2)
+    (question,) = log_guess.questions
+    low, high = GO2.joint("FL_knee").range
+    for word in ("FL_knee", f"{low:.3g}", f"{high:.3g}", "--unit"):
+        assert word in question
+
+
 def test_spikes_of_an_encoder_are_not_taken_for_degrees(tmp_path: Path) -> None:
     """Two samples in a thousand that are beyond the range of the joint leave the unit open."""
     spiked = POSITION - 1.7

@@ -547,6 +547,20 @@ def _may_be_radians(values: Mapping[str, Array], robot: RobotSpec | None) -> boo
     return True
 
 
+def _too_far(values: Mapping[str, Array], robot: RobotSpec | None) -> str:
+    """Say which joint cannot be in radians, with its range where the robot is known."""
+    for reading, angles in values.items():
+        if _may_be_radians({reading: angles}, robot):
+            continue
+        quantity, _, joint = reading.partition(".")
+        text = f"the {quantity} of {joint} goes from {angles.min():.3g} to {angles.max():.3g}"
+        if robot is not None and joint in robot.joint_names:
+            low, high = robot.joint(joint).range
+            text += f", where {robot.name} has a range of {low:.3g} to {high:.3g}"
+        return text
+    return "they would turn too far"
+
+
 def _joints_of_two_units(values: Mapping[str, Array], robot: RobotSpec | None) -> tuple[str, str]:
     """Find two joints of one file that cannot have the same unit.
 
@@ -619,8 +633,15 @@ def unit_by_values(
     if may_be_degrees and not may_be_radians:
         reasons.append(f"angles in deg: in radians they would turn too far ({sizes})")
         return "deg"
+    if may_be_radians:
+        questions.append(
+            f"angles in rad or in deg are both plausible ({sizes}); give --unit rad or --unit deg"
+        )
+        return ""
     questions.append(
-        f"angles in rad or in deg are both plausible ({sizes}); give --unit rad or --unit deg"
+        f"neither unit fits: in degrees the joints would hardly move ({sizes}), and in radians "
+        f"{_too_far(values, robot)}; check its column, its sign and its zero, or give --unit rad "
+        "or --unit deg"
     )
     return ""
 
