@@ -164,7 +164,7 @@ class SweepPlan:
                     "resolves, so choose other joints, another pose or other gains"
                 )
             elif fitting_rad > 0.0:
-                way_out = f"an amplitude of {fitting_rad:.3g} rad fits"
+                way_out = f"an amplitude of {fitting_rad:.3g} rad fits (--amplitude)"
             else:
                 way_out = "no amplitude fits, so choose other joints or another pose"
             if swing > SWINGING:
