@@ -111,6 +111,13 @@ def to_degrees(case: Case, rng: np.random.Generator) -> Case:
     return with_columns(case, choices[int(rng.integers(3))], np.rad2deg)
 
 
+def double_motion(case: Case, _rng: np.random.Generator) -> Case:
+    """Write the motion about its mean as that of a motor behind a gear of 2."""
+    return with_columns(
+        case, ("position", "velocity"), lambda values: 2.0 * values - values.mean(axis=0)
+    )
+
+
 def scale_time(case: Case, rng: np.random.Generator) -> Case:
     """Let the clock run fast or slow by 3 %."""
     factor = float(rng.choice([1.03, 1.0 / 1.03]))
@@ -195,6 +202,7 @@ CORRUPTIONS: Mapping[str, Corruption] = {
     "sides swapped": Corruption(change=swap_sides, check=REFUSED, in_bare_logs=False),
     "sign flipped": Corruption(change=flip_sign, check=REFUSED),
     "degrees": Corruption(change=to_degrees, check=REFUSED),
+    "motor side": Corruption(change=double_motion, check="slow gain"),
     "time x 1.03": Corruption(change=scale_time, check="clock"),
     "50 Hz": Corruption(change=thin_samples, check="sample rate"),
     "command filtered": Corruption(change=filter_command, check="command column"),

@@ -25,6 +25,7 @@ from pronk.identify.logs.joint_log import Excitation
 from pronk.identify.match.measured import DB
 from pronk.identify.match.result import NO_MATCH
 from pronk.identify.response.response import FrequencyResponse
+from pronk.robots.model import bench_inertia
 from pronk.robots.robot import Joint, RobotSpec
 
 DEGREES = 180.0 / math.pi
@@ -81,6 +82,12 @@ LIMITED_SHARE = 0.01
 linear only as long as the torque is; at 1 % of the time its first harmonic changes by less than
 0.1 dB."""
 
+AMPLIFIED = 1.5
+"""Slow response over what the drive and gravity explain from which on a joint moves too far. The
+slow response of a hip of the virtual Mini Cheetah is within 0.3 of 1."""
+SLOW_GAIN = "slow gain: "
+"""Beginning of the flag on a joint that moves farther than it is told to."""
+
 EXPLAINED_MIN = 0.8
 """Least share of a joint's motion that a match explains. An error of `match.NO_MATCH_DB` at every
 frequency, 12 % of the amplitude, with a phase error of 0.4 rad leaves 0.8."""
@@ -101,8 +108,9 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
         robot: The robot.
 
     Returns:
-        Flags, one sentence each: too few samples, another clock, a joint that stands still, a
-        measured torque at the effort limit. Empty for a joint whose unit is not radians.
+        Flags, one sentence each: too few samples, another clock, a joint that stands still or moves
+        farther than it is told to, a measured torque at the effort limit. Empty for a joint whose
+        unit is not radians.
 
     Raises:
         LogError: Another joint moved, a sign is flipped, or angles are in degrees.
@@ -123,6 +131,7 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
         for flag in (
             position_jump(excitation, joint),
             standstill(excitation, joint),
+            slow_gain(excitation, robot),
             too_few_samples(excitation, joint),
             wrong_clock(excitation, robot.policy_rate_hz),
             effort_limit_measured(excitation, joint),
@@ -307,6 +316,41 @@ JUMP_SPEED = 3.0
 no drive turns so fast, and three times leave room for a wrong no-load speed in the robot's file."""
 JUMP_RAD = 0.1
 """Least jump of a position that counts [rad]: far above the noise of an encoder at any rate."""
+
+
+def slow_gain(excitation: Excitation, robot: RobotSpec) -> str:
+    """Say when a joint moves farther than it is told to: by `AMPLIFIED` or more, also in all.
+
+    Against a stiffness `k` and a pull `g` of gravity a drive follows slow commands with a gain of
+    `k / (k + g)`, which is above 1 where gravity pulls the joint over. Neither friction nor a limit
+    of the torque makes it larger.
+
+    Args:
+        excitation: Excitation of a joint.
+        robot: The robot.
+
+    Returns:
+        What was seen and the way out; empty if the gain is explained.
+    """
+    joint = robot.joint(excitation.joint)
+    gain = abs(slow_response(excitation, joint))
+    # Of a small command the little that is slow may be less than what else moves the joint.
+    is_larger = np.ptp(excitation.position) >= AMPLIFIED * np.ptp(excitation.command)
+    if not (gain >= AMPLIFIED and is_larger):
+        return ""
+    stiffness = joint.stiffness
+    if excitation.log.stiffness is not None:
+        stated = float(excitation.log.stiffness[excitation.log.column(excitation.joint)])
+        stiffness = stated if math.isfinite(stated) else stiffness
+    _, pull = bench_inertia(robot, joint.original[0])
+    if stiffness + pull <= 0.0 or gain < AMPLIFIED * stiffness / (stiffness + pull):
+        return ""
+    return (
+        f"{SLOW_GAIN}at low frequency {excitation.joint} moves {gain:.2g} times as far as its "
+        "command, which no stiffness explains; columns of two scales look so (one of them at the "
+        "motor and the other at the joint, or in another unit), and a command that is not the one "
+        "the drive got: name the right columns, or give --scale"
+    )
 
 
 def position_jump(excitation: Excitation, joint: Joint) -> str:

@@ -16,6 +16,7 @@ from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.logs.velocity import velocity_note
 from pronk.identify.match.checks import (
     EFFORT_LIMIT,
+    SLOW_GAIN,
     check_armature,
     check_excitations,
     check_explained_motion,
@@ -240,8 +241,10 @@ def match(
                 is_stable = not simulation.uses_mujoco or (
                     joint_stability_share(rigs.robot, name, nominal[name]) < 1.0
                 )
-                # A limit holds an unstable simulation back, and would be taken for a cause.
-                if rigs.sets_effort_limit and is_stable:
+                is_amplified = any(flag.startswith(SLOW_GAIN) for flag in excitation_flags[name])
+                # A limit holds an unstable simulation back, and would be taken for a cause. It does
+                # not let a joint move farther than it is told to either.
+                if rigs.sets_effort_limit and is_stable and not is_amplified:
                     fit = fit_torque_limit(
                         replay, excitations, rigs.robot, fit, parameters, nominal[name]
                     )
