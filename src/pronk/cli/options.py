@@ -154,7 +154,10 @@ def _columns(entries: Sequence[str]) -> Mapping[str, str] | Sequence[str]:
 
 
 def named_values(
-    option: str, entries: Sequence[str], convert: Callable[[str], Value]
+    option: str,
+    entries: Sequence[str],
+    convert: Callable[[str], Value],
+    form: str = "NAME=VALUE",
 ) -> dict[str, Value]:
     """Return the values of an option NAME=VALUE by name.
 
@@ -165,6 +168,7 @@ def named_values(
         option: The option, for the message.
         entries: Its words.
         convert: Makes a value of its text; a ValueError says what was expected.
+        form: Form of an entry, for the message.
 
     Raises:
         PronkError: An entry is not NAME=VALUE, or its value is impossible.
@@ -180,7 +184,7 @@ def named_values(
     for entry in pieces:
         name, _, text = entry.partition("=")
         if not name or not text:
-            raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")
+            raise PronkError(f"{option} {entry!r}: expected {form}.")
         try:
             values[name] = convert(text)
         except ValueError as error:
@@ -188,21 +192,25 @@ def named_values(
     return values
 
 
+_DRIVE_GAINS_FORM = "JOINT=STIFFNESS,DAMPING, the stiffness above 0, as in knee=25,.5"
+"""Form of the gains of a drive on the command line."""
+
+
 def drive_gains(
     entries: Sequence[str], option: str = "--drive-gains"
 ) -> dict[str, tuple[float, float]] | Literal["default"] | None:
-    """Return stiffness [N m/rad] and damping [N m s/rad] by joint of NAME=STIFFNESS,DAMPING.
+    """Return stiffness [N m/rad] and damping [N m s/rad] by joint of JOINT=STIFFNESS,DAMPING.
 
     The single word `default` is returned as it is; None stands for no entry.
     """
     if tuple(entries) == ("default",):
         return "default"
-    return named_values(option, entries, _stiffness_and_damping) or None
+    return named_values(option, entries, _stiffness_and_damping, _DRIVE_GAINS_FORM) or None
 
 
 def _stiffness_and_damping(text: str) -> tuple[float, float]:
     """Return the two numbers of STIFFNESS,DAMPING; ValueError if they are impossible."""
-    expected = "expected NAME=STIFFNESS,DAMPING, the stiffness above 0, as in knee=25,.5"
+    expected = f"expected {_DRIVE_GAINS_FORM}"
     words = text.split(",")
     if len(words) != 2:
         raise ValueError(expected)

@@ -139,7 +139,7 @@ def _stated_gains(
     if not (robot and begin and pairs):
         raise PronkError(
             "there are no gains to translate; give a gains.yaml, or --robot, --from and "
-            "--drive-gains NAME=STIFFNESS,DAMPING."
+            "--drive-gains JOINT=STIFFNESS,DAMPING."
         )
     robot_spec = load_robot(robot)
     by_joint = gains_by_joint(robot_spec, pairs)
