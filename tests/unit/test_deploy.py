@@ -6,6 +6,8 @@ import math
 import os
 import pty
 import struct
+import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -43,6 +45,7 @@ from pronk.deploy.runtime.run import RunSummary
 from pronk.deploy.runtime.safety import SafetyFilter
 from pronk.deploy.runtime.state_machine import FIRST_ACTION_S, StateMachine
 from pronk.deploy.runtime.teleop import (
+    BenchOperator,
     Gamepad,
     Keyboard,
     Operator,
@@ -621,6 +624,34 @@ def test_a_script_ends_at_the_first_fault(event_kind: str) -> None:
     assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
     operator.notified(event_kind, "no.")
     assert operator.command(0.1, Mode.STAND).request is OperatorRequest.QUIT
+
+
+def test_no_clamping_is_lost_that_ends_while_a_request_is_read() -> None:
+    operator = BenchOperator(lambda joints: None)
+    clamped = 0
+
+    def clamp_a_joint(frame: Any, event: str, argument: Any) -> Any:
+        """Have a joint clamped before each line of the reading."""
+        nonlocal clamped
+        if frame.f_code is not BenchOperator.command.__code__:
+            return None
+        if event == "line":
+            threads = set(threading.enumerate())
+            operator.notified("clamp", "FR_knee")
+            for thread in set(threading.enumerate()) - threads:
+                thread.join()
+            clamped += 1
+        return clamp_a_joint
+
+    traced = sys.gettrace()
+    sys.settrace(clamp_a_joint)
+    try:
+        requests = [operator.command(0.0, Mode.SWEEP).request]
+    finally:
+        sys.settrace(traced)
+    requests += [operator.command(0.0, Mode.SWEEP).request for _ in range(clamped)]
+    assert clamped > 1
+    assert requests.count(OperatorRequest.CLAMPED) == clamped
 
 
 class Damping(Operator):

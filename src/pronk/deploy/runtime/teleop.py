@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import queue
 import select
 import sys
 import termios
@@ -121,8 +122,8 @@ class BenchOperator(Operator):
     def __init__(self, clamp_operator: ClampOperator) -> None:
         """`clamp_operator` clamps joints; it is called in a thread of its own."""
         self._clamp_operator = clamp_operator
-        self._request = OperatorRequest.NONE
-        """Request to send next."""
+        self._requests: queue.SimpleQueue[OperatorRequest] = queue.SimpleQueue()
+        """Requests to send next, oldest first."""
         self.error: PronkError | None = None
         """Error for which joints could not be clamped; None if there was none."""
 
@@ -134,8 +135,9 @@ class BenchOperator(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """Return a held dead-man button; a request once joints are clamped, or cannot be."""
-        request = self._request
-        self._request = OperatorRequest.NONE
+        request = OperatorRequest.NONE
+        with suppress(queue.Empty):
+            request = self._requests.get_nowait()
         return OperatorCommand(dead_man=True, request=request)
 
     def _clamp(self, joints: tuple[str, ...]) -> None:
@@ -146,7 +148,7 @@ class BenchOperator(Operator):
             self.error = error
         except Exception as error:
             self.error = HardwareError(f"{type(error).__name__}: {error}")
-        self._request = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
+        self._requests.put(OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT)
 
 
 class TimeLimit(Operator):
