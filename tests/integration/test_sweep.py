@@ -18,6 +18,7 @@ from pronk.identify.excitation.plan import SweepPlan, make_plan
 from pronk.identify.excitation.signals import Chirp
 from pronk.identify.logs.mcap_reader import read_mcap
 from pronk.identify.logs.options import ReadOptions
+from pronk.identify.simulators.command_trace import command_clock
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import load_sim_params
 from pronk.robots import load_robot
@@ -281,3 +282,50 @@ def test_the_speed_limit_of_excitations_begins_at_the_pose() -> None:
     no_load = np.array([joint.drive.no_load_speed for joint in plan.robot.joints])
     np.testing.assert_allclose(strict.joints.speed, no_load)
     np.testing.assert_allclose(controller.limits.joints.speed, SPEED_SHARE * no_load)
+
+
+def test_after_a_pause_a_sweep_goes_on_at_its_own_rate() -> None:
+    plan = plan_of("FR_knee", amplitudes=(0.2,))
+    tick_s = 1.0 / plan.rate_hz
+    task = SweepTask(plan=plan, out_dir=Path("unused"))
+    machine = VirtualRobot(plan.robot, SIM_PARAMS, legs=("FR",))
+    machine.connect()
+    state = machine.wait(0.01)[-1]
+    records: list[Any] = []
+    controller = SweepController(
+        task,
+        machine,
+        task.limits("measured"),
+        records.append,
+        state=state,
+        start=0.01,
+        real_time=True,
+    )
+    t = 0.01
+    has_paused = False
+    command = controller.command(t, [state], slack=0.001)
+    while command is not None:
+        machine.send(command)
+        controller.sent(t, command.position)
+        t += 0.002
+        if not has_paused and records and records[-1]["frequency"] > 5.0:
+            has_paused = True
+            t += 0.084
+        states = machine.wait(t)
+        command = controller.command(t, states, slack=0.001)
+    samples = [record for record in records if record["frequency"] > 0.0]
+    knee = plan.robot.joint_names.index("FR_knee")
+    time = np.array([record["time"] for record in samples])
+    targets = np.array([record["command"][knee] for record in samples])
+    changed = np.flatnonzero(np.diff(targets)) + 1
+    offsets = plan.excitations[0].offsets(plan.rate_hz)
+    # No command is left out, and none comes much sooner after another than planned.
+    sent = targets[np.concatenate([[0], changed])] - plan.pose[knee]
+    planned = offsets[np.concatenate([[0], np.flatnonzero(np.diff(offsets)) + 1])]
+    np.testing.assert_allclose(sent, planned, atol=1e-6)
+    intervals = np.diff(time[changed])
+    assert intervals.min() > 0.5 * tick_s
+    assert intervals.max() > 4.0 * tick_s
+    clock = command_clock(time, changed)
+    assert clock is not None
+    assert clock.period == pytest.approx(tick_s, rel=1e-3)

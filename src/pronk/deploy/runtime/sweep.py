@@ -243,6 +243,10 @@ class SweepController:
                 self._half_spacing = 0.5 * seconds / (len(self._recent) - 1)
             self._recent.clear()
             self._log(t)
+            # After a pause the rest of the sweep comes later, by whole ticks: commands that make up
+            # for the pause would be faster than the worst case of the plan, and show no clock.
+            missed_ticks = math.floor((t - self.now) / self._tick + 0.5)
+            self._start += max(missed_ticks, 0) * self._tick
             step = next(self._steps, None)
             if step is None:
                 return None
