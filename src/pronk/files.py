@@ -250,6 +250,21 @@ def require_place(path: Path) -> None:
         raise PronkError(f"{path}: {folder} cannot be written to; give another folder.")
 
 
+def require_new(
+    path: Path, option: str, *, overwrite: bool, kind: type[PronkError] = PronkError
+) -> None:
+    """Refuse a file that exists and is not to be replaced.
+
+    Args:
+        path: The file.
+        option: The option that names it, for the message.
+        overwrite: Whether it may be replaced.
+        kind: Class of the error.
+    """
+    if path.exists() and not overwrite:
+        raise kind(f"{path} exists; give another {option}, or --overwrite.")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text to a file, whole or not at all."""
     with written_whole(path) as temporary:

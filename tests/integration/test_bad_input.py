@@ -145,6 +145,23 @@ def test_a_robot_without_a_limit_of_its_tilt_counts_as_hung(tilt: str, warned: b
     assert ("counts as hung" in command.stderr) is warned
 
 
+@pytest.mark.parametrize("option", ["--log", "--capture"])
+def test_deploy_replaces_no_file_of_an_earlier_run_unless_told_to(
+    tmp_path: Path, option: str
+) -> None:
+    policy = Path(pronk.__file__).parent / "policies" / "matched" / "policy.onnx"
+    earlier = tmp_path / "earlier"
+    earlier.write_bytes(b"a day's work")
+    # The gamepad is missing: what passes the check of the files is refused for it.
+    words = ["deploy", policy, "--gamepad", tmp_path / "js9", option, earlier]
+    sentence = refused(*words)
+    assert str(earlier) in sentence
+    assert option in sentence
+    assert "--overwrite" in sentence
+    assert "js9" in refused(*words, "--overwrite")
+    assert earlier.read_bytes() == b"a day's work"
+
+
 # --- Random files -------------------------------------------------------------------------------
 
 

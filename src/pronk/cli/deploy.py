@@ -67,6 +67,8 @@ class RecordOptions:
     """Log of everything, .mcap, for `pronk report`; none if left out."""
     capture: Path | None = None
     """What cameras around the virtual robot would measure, .npz (--link sim); none if left out."""
+    overwrite: bool = False
+    """Replace a log or a capture that exists."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +121,7 @@ def deploy_command(
         ScriptedOperator,
         TimeLimit,
     )
-    from pronk.files import require_place
+    from pronk.files import require_new, require_place
     from pronk.policy.deploy_yaml import read_deploy_yaml
     from pronk.policy.deployable import open_policy
     from pronk.policy.foreign import deploy_problems
@@ -142,9 +144,10 @@ def deploy_command(
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     if seconds is not None and not seconds > 0.0:
         raise HardwareError(f"--seconds {seconds:g}; expected a time above 0 s.")
-    for path in (log, capture):
+    for option, path in (("--log", log), ("--capture", capture)):
         if path is not None:
             require_place(path)
+            require_new(path, option, overwrite=record.overwrite)
     plan = RunPlan(
         link=Link(robot=robot_name, address=address, release=machine.release),
         policy=policy,

@@ -99,6 +99,7 @@ def _write_foxglove(
     path: Path, robot: str | None, out: Path | None, reading: Reading, *, overwrite: bool
 ) -> console.Outcome:
     """Write the motion of a robot in a log for Foxglove."""
+    from pronk.files import require_new
     from pronk.report.foxglove import write_foxglove
     from pronk.report.motion import read_motion
     from pronk.robots import load_robot
@@ -111,8 +112,7 @@ def _write_foxglove(
     target = out or path.with_name(f"{path.name.split('.')[0]}.3d.mcap")
     if target.suffix != ".mcap":
         raise LogError(f"--out {target}: expected a name that ends in .mcap.")
-    if target.exists() and not overwrite:
-        raise LogError(f"{target} exists; give another --out, or --overwrite.")
+    require_new(target, "--out", overwrite=overwrite, kind=LogError)
     if target.resolve() == path.resolve():
         raise LogError(f"--out {target} is the log itself; give another name.")
     robot_spec = load_robot(robot)

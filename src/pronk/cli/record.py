@@ -55,15 +55,14 @@ def record(
     from pronk.deploy.links.listener import find_listener
     from pronk.deploy.links.realtime import Interrupts, RealTimeSettings, enter
     from pronk.deploy.runtime.recorder import record_passively
-    from pronk.files import require_place
+    from pronk.files import require_new, require_place
     from pronk.identify.logs.mcap_reader import read_mcap
     from pronk.identify.logs.options import ReadOptions
     from pronk.robots import load_robot
 
     if out.suffix != ".mcap":
         raise PronkError(f"--out {out}: expected a name that ends in .mcap.")
-    if out.exists() and not overwrite:
-        raise PronkError(f"{out} exists; give another --out, or --overwrite.")
+    require_new(out, "--out", overwrite=overwrite)
     for option, time_s in (("--seconds", seconds), ("--wait", wait)):
         if time_s is not None and not 0.0 < time_s < 1e6:
             raise PronkError(f"{option} {time_s:g}; expected a time above 0 s.")

@@ -52,11 +52,10 @@ def robot(
 
 def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
     """Write the robot.yaml of a model, and say what cannot be used or is assumed."""
-    from pronk.files import write_text
+    from pronk.files import require_new, write_text
     from pronk.robots.bare import describe_model, yaml_of_model
 
-    if target.exists() and not overwrite:
-        raise RobotError(f"{target} exists; give another --out, or --overwrite.")
+    require_new(target, "--out", overwrite=overwrite, kind=RobotError)
     if target.parent.resolve() != model.parent.resolve():
         raise RobotError(f"--out {target}: the robot.yaml belongs beside its model {model}.")
     text = yaml_of_model(model)
