@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -126,6 +127,33 @@ def test_a_corner_that_contradicts_the_line_is_refused(
 ) -> None:
     with pytest.raises(RobotError, match=word):
         drive_of(tmp_path, "effort_limit: 12.0", *entries)
+
+
+@pytest.mark.parametrize("number", [".inf", "-.inf", ".nan"])
+@pytest.mark.parametrize("key", ["effort_limit", "no_load_speed", "frictionloss", "gear_ratio"])
+def test_a_drive_with_a_number_that_is_not_finite_is_refused(
+    tmp_path: Path, key: str, number: str
+) -> None:
+    entries = {"effort_limit": "12.0", "stall_torque": "30.0", "no_load_speed": "10.0"}
+    entries[key] = number
+    lines = [f"{name}: {value}" for name, value in entries.items()]
+    with pytest.raises(RobotError) as refusal:
+        drive_of(tmp_path, *lines)
+    sentence = str(refusal.value)
+    assert str(tmp_path / "robot.yaml") in sentence
+    assert f"drives.motor.{key} is {number.replace('.', '')}" in sentence
+    assert "finite" in sentence
+    drive = load_robot("go2").joint("FR_knee").drive
+    with pytest.raises(RobotError, match=key):
+        replace(drive, **{key: float(number.replace(".", ""))})
+
+
+def test_the_tilt_of_a_hung_robot_may_be_infinite(tmp_path: Path) -> None:
+    robot = drive_of(tmp_path, "effort_limit: 12.0", "stall_torque: 30.0", "no_load_speed: 10.0")
+    assert np.isfinite(robot.limits.tilt)
+    with (tmp_path / "robot.yaml").open("a") as file:
+        file.write("\nlimits: {tilt: .inf}\n")
+    assert load_robot(tmp_path / "robot.yaml").limits.tilt == np.inf
 
 
 def drive_of(folder: Path, *entries: str) -> RobotSpec:

@@ -41,6 +41,8 @@ MOTOR_FACTORS = {1: (1.0, 1.0), 3: (1.5, 2.0)}
 """Torque over `kt i` and back-EMF over `kt omega`, by the number of phases. Of a three-phase motor
 with peak currents, as in Cheetah-Software's ActuatorModel.h, torque is 1.5 kt i, and the back-EMF
 that fits under the bus voltage 2 kt omega."""
+_MAY_BE_INFINITE = ("limits.tilt",)
+"""Numbers of a robot file that may be infinite: a hung robot has no limit of its tilt."""
 _Positive = Annotated[float, Meta(gt=0.0)]
 _NotNegative = Annotated[float, Meta(ge=0.0)]
 _Band = tuple[_Positive, _Positive]
@@ -283,7 +285,27 @@ def read_robot_file(path: Path) -> RobotFile:
     body = read_yaml(path, RobotError)
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise RobotError(f"{path}: not a robot file; its schema must be {SCHEMA!r}.")
+    _refuse_infinite(body, "", path)
     return converted(body, RobotFile, path, error=RobotError)
+
+
+def _refuse_infinite(value: object, place: str, path: Path) -> None:
+    """Refuse a number that is not finite where a robot file must not have one.
+
+    Args:
+        value: A mapping, a list, text or a number of the file.
+        place: The keys that lead to it, joined by dots.
+        path: The file, for the message.
+    """
+    entries: Iterable[tuple[object, object]] = ()
+    if isinstance(value, dict):
+        entries = value.items()
+    elif isinstance(value, list):
+        entries = enumerate(value)
+    elif isinstance(value, float) and not math.isfinite(value) and place not in _MAY_BE_INFINITE:
+        raise RobotError(f"{path}: {place} is {value}; expected a finite number.")
+    for key, inner in entries:
+        _refuse_infinite(inner, f"{place}.{key}" if place else str(key), path)
 
 
 def make_robot(file: RobotFile, source_model: SourceModel, source: str) -> RobotSpec:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
@@ -52,17 +53,19 @@ class Drive:
     whole chains fits [rad/s]; 0 if the dry friction F does not depend on speed."""
 
     def __post_init__(self) -> None:
-        """Refuse values that must be positive and are not, and negative friction."""
+        """Refuse values that must be positive and are not, negative friction, and infinities."""
         positive = {
             "gear_ratio": self.gear_ratio,
             "stall_torque": self.stall_torque,
             "no_load_speed": self.no_load_speed,
             "effort_limit": self.effort_limit,
             "bus_voltage": self.bus_voltage,
+            "resistance": self.resistance,
+            "torque_constant": self.torque_constant,
         }
         for name, value in positive.items():
-            if not value > 0.0:
-                raise RobotError(f"Drive.{name} is {value}; expected positive.")
+            if not 0.0 < value < math.inf:
+                raise RobotError(f"Drive.{name} is {value}; expected positive and finite.")
         not_negative = {
             "rotor_inertia": self.rotor_inertia,
             "frictionloss": self.frictionloss,
@@ -70,8 +73,8 @@ class Drive:
             "stribeck_speed": self.stribeck_speed,
         }
         for name, value in not_negative.items():
-            if not value >= 0.0:
-                raise RobotError(f"Drive.{name} is {value}; expected 0 or more.")
+            if not 0.0 <= value < math.inf:
+                raise RobotError(f"Drive.{name} is {value}; expected 0 or more, and finite.")
 
     @property
     def armature(self) -> float:
