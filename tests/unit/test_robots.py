@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -304,6 +305,30 @@ def test_a_robot_is_read_again_when_its_model_has_changed(tmp_path: Path) -> Non
     model.unlink()
     with pytest.raises(RobotError, match="no such file"):
         load_robot(file)
+
+
+def test_dimensions_of_legs_are_read_again_when_a_file_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = robot_file_path("go2").parent
+    file = tmp_path / "robot.yaml"
+    file.write_text((source / "robot.yaml").read_text())
+    model = tmp_path / "go2.xml"
+    model.write_text((source / "go2.xml").read_text())
+    assert legged(file) == legged("go2")
+    file.write_text(file.read_text().replace("hip_pitch: 0.9,", "hip_pitch: 0.85,"))
+    os.utime(file, ns=(1, 1))
+    assert legged(file).default_position["hip_pitch"] == 0.85
+    model.write_text(model.read_text().replace('size="0.022"', 'size="0.03"'))
+    os.utime(model, ns=(1, 1))
+    assert legged(file).foot_radius == 0.03
+    # The same relative path is another robot in another folder.
+    other = tmp_path / "other"
+    shutil.copytree(source, other)
+    monkeypatch.chdir(tmp_path)
+    assert legged("robot.yaml").foot_radius == 0.03
+    monkeypatch.chdir(other)
+    assert legged("robot.yaml").foot_radius == 0.022
 
 
 def test_a_robot_is_shown_in_one_line() -> None:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import NamedTuple
 
 from pronk.errors import RobotError
 from pronk.plugins import load_entry_point
@@ -44,6 +45,24 @@ def load_robot(name: str | Path) -> RobotSpec:
         >>> robot = pronk.load_robot("mini_cheetah")
         >>> robot.joint("FR_knee").drive.effort_limit
     """
+    version = robot_version(name)
+    named = str(name) in ROBOT_NAMES or str(name).startswith(MENAGERIE)
+    return replace(_read(*version), source=str(name) if named else str(version.path))
+
+
+class RobotVersion(NamedTuple):
+    """The file of a robot as it is now: the key of what was read of the robot."""
+
+    path: Path
+    """The whole path of the robot.yaml or the model."""
+    modified_ns: int
+    """Time of its last modification [ns]."""
+    model_modified_ns: int
+    """Time of the last modification of the model [ns]; 0 for one that is missing."""
+
+
+def robot_version(name: str | Path) -> RobotVersion:
+    """Return the file of a robot as it is now; see `load_robot`."""
     path = robot_file_path(name)
     try:
         modified_ns = path.stat().st_mtime_ns
@@ -53,9 +72,7 @@ def load_robot(name: str | Path) -> RobotSpec:
     model_modified_ns = 0
     with suppress(OSError):  # a model that is missing is named as the robot is read
         model_modified_ns = _model_file(whole, modified_ns).stat().st_mtime_ns
-    robot = _read(whole, modified_ns, model_modified_ns)
-    named = str(name) in ROBOT_NAMES or str(name).startswith(MENAGERIE)
-    return replace(robot, source=str(name) if named else str(whole))
+    return RobotVersion(whole, modified_ns, model_modified_ns)
 
 
 def robot_file_path(name: str | Path) -> Path:

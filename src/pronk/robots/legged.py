@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from pronk.errors import RobotError
-from pronk.robots import load_robot
+from pronk.robots import load_robot, robot_version
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,6 @@ class Legged:
     """Mass of the base [kg]."""
 
 
-@lru_cache
 def legged(name: str | Path) -> Legged:
     """Read the dimensions of a robot from its first leg, whose foot is a sphere on the shank.
 
@@ -49,7 +48,13 @@ def legged(name: str | Path) -> Legged:
     Raises:
         RobotError: The robot has no legs, or its first leg has no such foot.
     """
-    robot = load_robot(name)
+    return _read_legged(*robot_version(name))
+
+
+@lru_cache
+def _read_legged(path: Path, _modified_ns: int, _model_modified_ns: int) -> Legged:
+    """Read the dimensions once for each time of the last modification of the robot's files."""
+    robot = load_robot(path)
     if not robot.legs:
         raise RobotError(f"{robot.name} has no legs; name them as `legs` in its robot.yaml.")
     leg = f"{robot.legs[0]}_"
