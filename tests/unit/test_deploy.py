@@ -343,6 +343,52 @@ def test_a_go2_stands_up_and_its_swapped_encoders_are_found(swapped: str) -> Non
         assert robot.snapshot().position[0, 2] > 0.24
 
 
+@pytest.mark.parametrize(
+    ("pause_after", "pause_s", "reason"),
+    [
+        ("fold", 0.2, Reason.INTERRUPTED),  # one half swing but its begin
+        ("fold", 1.3, Reason.INTERRUPTED),  # all swings
+        ("rise", 0.7, Reason.ORIENTATION),  # all small motions
+        ("rise", 0.59, Reason.ORIENTATION),  # all but their end
+    ],
+)
+def test_a_check_without_measurements_is_not_passed(
+    pause_after: str, pause_s: float, reason: Reason
+) -> None:
+    robot = connected(base="ground", capture_rate_hz=None)
+    timing = RunTiming()
+    run = Run(check_s=timing.check_s)
+    swings_s = 2.0 * len(ROBOT.legs) * ROBOT.limits.stand.swing_s
+    pause_at = timing.fold_s
+    if pause_after == "rise":
+        pause_at += swings_s + timing.rise_s
+    run.machine.preflighted((), 0.0)
+    requests = {
+        Mode.DAMP: OperatorRequest.STAND,
+        Mode.STAND: OperatorRequest.WALK,
+        Mode.FAULT: OperatorRequest.RESET,
+    }
+    paused = False
+    reasons = []
+    while run.t < 25.0 and run.mode is not Mode.POLICY:
+        mode = run.mode
+        step_s = 0.002
+        if not paused and run.mode is Mode.STAND and run.t - run.machine.since > pause_at:
+            step_s = pause_s
+            paused = True
+        state = robot.wait(run.t + step_s)[-1]
+        command = run.tick(step_s, requests[mode], q=state.position).command
+        if run.mode is Mode.FAULT and mode is not Mode.FAULT:
+            reasons.append(run.safety.reason)
+        if command is None:
+            robot.damp()
+        else:
+            robot.send(command)
+    # Without a pause the next rise passes.
+    assert reasons == [reason]
+    assert run.mode is Mode.POLICY, run.machine.notice
+
+
 def test_the_trunk_is_still_when_the_policy_may_begin() -> None:
     robot = connected(base="ground", capture_rate_hz=None)
     run = Run(check_s=0.15, damp_s=0.5, fold_s=0.5)

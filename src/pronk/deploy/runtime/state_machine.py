@@ -56,6 +56,10 @@ STRAY = 0.005
 STRAY_SHARE = 1.4
 """Motion of another joint that is a fault, as a share of that of the swung one."""
 
+SWUNG_SHARE = 2.0 / 3.0
+"""Share of the time of a half swing from which a position counts as that at its end: the target has
+moved by 0.79 of the swing."""
+
 
 def mixed(values: Array, others: Array, share: float) -> Array:
     """Return the mean of two arrays, with a share of the second; the first itself at 0."""
@@ -80,7 +84,8 @@ class SwingCheck:
     In the folded pose each leg's last joint swings, one leg after another. The motion of every
     joint is the difference of its position at the largest swing and the mean of those before and
     after. If another joint moves by more than `STRAY` and by more than `STRAY_SHARE` of the swung
-    one, encoders are swapped.
+    one, encoders are swapped. If a half swing has no tick near its end, as in a pause, the check is
+    not passed.
     """
 
     def __init__(self, robot: RobotSpec, timing: RunTiming) -> None:
@@ -97,29 +102,33 @@ class SwingCheck:
         """Forget the positions of an earlier rise."""
         self._positions[:] = np.nan
 
-    def finds_swapped(self, t: float, began: float, position: Array) -> bool:
-        """Note the position while legs swing; after it, whether another joint moved.
+    def fault_found(self, t: float, began: float, position: Array) -> Reason:
+        """Note the position while legs swing; after it, return the fault, or `NONE` if it passed.
 
         Args:
             t: Time [s].
             began: Time at which the robot began to stand up [s].
             position: Measured joint positions [rad], (joints,).
         """
-        half_swings = math.floor((t - began - self._timing.fold_s) / self._swing_s)
+        swung_s = t - began - self._timing.fold_s
+        half_swings = math.floor(swung_s / self._swing_s)
         leg, back = divmod(half_swings, 2)
         if leg < 0:
-            return False
+            return Reason.NONE
         if leg < len(self._swung):
             of_leg = self._positions[:, leg]
             of_leg[0] = np.where(np.isnan(of_leg[0]), position, of_leg[0])
-            of_leg[1 + back] = position
-            return False
+            if swung_s / self._swing_s - half_swings >= SWUNG_SHARE:
+                of_leg[1 + back] = position
+            return Reason.NONE
+        if np.isnan(self._positions).any():
+            return Reason.INTERRUPTED
         before, largest, after = self._positions
         motion = np.abs(largest - 0.5 * (before + after))
         swung_motion = motion[np.arange(len(motion)), self._swung]
         swapped = bool((motion > np.maximum(STRAY, STRAY_SHARE * swung_motion[:, None])).any())
         self.needed = swapped
-        return swapped
+        return Reason.SWAPPED if swapped else Reason.NONE
 
 
 class StateMachine:
@@ -303,11 +312,11 @@ class StateMachine:
         if self.mode in POLICY_MODES:
             return self._follow_policy(t, path.target(t), action, safety)
         if self.mode is Mode.STAND:
-            if self._swing_check.needed and self._swing_check.finds_swapped(
-                t, path.began, position
-            ):
-                safety.fault(Reason.SWAPPED, t)
-                return DesiredCommand()
+            if self._swing_check.needed:
+                reason = self._swing_check.fault_found(t, path.began, position)
+                if reason is not Reason.NONE:
+                    safety.fault(reason, t)
+                    return DesiredCommand()
             if self._nods and self._finds_contradiction(t, path, position, safety):
                 safety.fault(Reason.ORIENTATION, t)
                 return DesiredCommand()
