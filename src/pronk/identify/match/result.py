@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -467,7 +467,7 @@ def joint_gains(
         armature=_fitted_value(fit, "armature"),
         frictionloss=_fitted_value(fit, "frictionloss"),
         stribeck=_fitted_value(fit, "stribeck"),
-        delay_s=replace(_fitted_value(fit, "delay"), value=max(fit.values["delay"], 0.0)),
+        delay_s=_delay_not_negative(_fitted_value(fit, "delay")),
         covariance=(tuple(stiffness_row), tuple(damping_row)),
         quality=quality,
         torque=fit.torque,
@@ -514,6 +514,27 @@ def _fitted_value(fit: DriveFit, name: str) -> FittedValue:
         repeat95=fit.ci95.get(name, UNKNOWN),
         total95=fit.total95.get(name, UNKNOWN),
     )
+
+
+def _delay_not_negative(fitted: FittedValue) -> FittedValue:
+    """Return a delay that a simulator can have, with intervals that hold it.
+
+    A fitted delay below zero becomes zero, and its intervals end there. An interval that is below
+    zero as a whole is dropped: the delay of the gains is then set to zero and not fitted.
+
+    Args:
+        fitted: The delay as it was fitted [s].
+    """
+    intervals = []
+    for low, high in (fitted.repeat95, fitted.total95):
+        if high < 0.0:
+            intervals.append(UNKNOWN)
+        elif low < 0.0:
+            intervals.append((0.0, high))
+        else:
+            intervals.append((low, high))
+    repeat95, total95 = intervals
+    return FittedValue(value=max(fitted.value, 0.0), repeat95=repeat95, total95=total95)
 
 
 def amplitude_spread(gains: Array) -> float:
