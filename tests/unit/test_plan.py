@@ -160,6 +160,7 @@ def test_each_amplitude_may_have_repeats_of_its_own() -> None:
         ([], {}, PlanError, "excites nothing"),
         (["FR_knee"], {"repeats": 0}, PlanError, "excites nothing"),
         (["FR_knee"], {"repeats": (3,)}, PlanError, "one an amplitude"),
+        (["FR_knee"], {"amplitudes": (0.2, 0.1, 0.2)}, PlanError, "0.2 rad"),
         (["FR_elbow"], {}, RobotError, "FR_hip_roll, FR_hip_pitch"),
         (["FR_knee"], {"drive_gains": {"FR_knee": (-1.0, 0.4)}}, PlanError, "stiffness"),
     ],

@@ -373,6 +373,12 @@ def make_plan(
             "excites nothing; expected at least one of each, and one number of repeats for all or "
             "one an amplitude."
         )
+    repeated = [value for value in dict.fromkeys(amplitudes) if list(amplitudes).count(value) > 1]
+    if repeated:
+        raise PlanError(
+            f"the amplitude {repeated[0]:g} rad is given twice; expected each amplitude once, with "
+            "its repeats (--repeats, one number for all or one an amplitude)."
+        )
     if 0.0 < max(amplitudes) < RESOLVED_RAD:
         raise PlanError(
             f"an amplitude of {max(amplitudes):g} rad is less than an encoder resolves; expected "
