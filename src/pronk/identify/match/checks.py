@@ -305,8 +305,8 @@ def standstill(excitation: Excitation, joint: Joint) -> str:
         if travel == 0.0 or slow_standstill:
             return (
                 f"standstill: {excitation.joint} does not move at {time[first]:.1f} s while its "
-                "command does; so look a drive that is off, an encoder that is stuck, and friction "
-                "above the torque of the drive: look there and record again"
+                "command does; a drive that is off, an encoder that is stuck and friction above the "
+                "torque of the drive all show like this: check them and record again"
             )
     return ""
 
