@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pronk.arrays import Array, Mask
 from pronk.errors import LogError
+from pronk.identify.logs.checks import examine_time
 from pronk.identify.logs.joint_log import Excitation, JointLog
 from pronk.identify.match.uncertainty import time_blocks
 from pronk.identify.simulators.chain import ChainSimulation
@@ -48,6 +49,11 @@ COHERENT = 0.95
 """Coherence of a sweep below which its drive no longer follows as a linear joint does."""
 COHERENCE_SEGMENT_S = 5.0
 """Length of the segments that the coherence is averaged over [s]."""
+SHARE_IN_GAPS = 0.01
+"""Largest share of a segment without samples with which it counts for the coherence."""
+KNOWN_POWER = 0.5
+"""Share of the power of the command in the segments that count, from which on they tell the
+coherence at a frequency."""
 EXCITED_POWER = 1e-3
 """Power of the command, over its largest, from which on a frequency counts as excited."""
 COHERENT_BELOW = 8.0
@@ -245,14 +251,11 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
         The frequency; infinity if the coherence does not fall, or if the recording is too narrow to
         show it.
     """
-    from scipy import signal  # slow to import
-
-    rate_hz = (len(time) - 1) / (time[-1] - time[0])
-    width = min(round(COHERENCE_SEGMENT_S * rate_hz), len(time))
-    frequency_hz, power = signal.welch(command, rate_hz, nperseg=width)
-    if power.max() == 0.0 or np.ptp(position) == 0.0:
+    if np.ptp(command) == 0.0 or np.ptp(position) == 0.0:
         return float("inf")
-    _, coherence = signal.coherence(command, position, rate_hz, nperseg=width)
+    frequency_hz, power, coherence = _coherence(time, command, position)
+    if power.max() == 0.0:
+        return float("inf")
     excited = power > EXCITED_POWER * power.max()
     excited[0] = False  # each segment's mean is removed, so 0 Hz is not excited
     coherent = excited & (coherence >= COHERENT)
@@ -266,6 +269,48 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
     if frequency_hz[end - 1] < COHERENT_BELOW * frequency_hz[first]:
         return float("inf")
     return float(frequency_hz[end])
+
+
+def _coherence(time: Array, command: Array, position: Array) -> tuple[Array, Array, Array]:
+    """Return frequencies [Hz], power of the command up to a factor, and coherence of the position.
+
+    Where samples are missing, both columns are interpolated at the typical rate, and segments with
+    more than `SHARE_IN_GAPS` of missing samples are left out: a motion that is cut out of a segment
+    would lower its coherence. The power is zero where most of it is in segments that are left out.
+    """
+    from scipy import signal  # slow to import
+
+    timing = examine_time(time)
+    if not timing.gaps:
+        rate_hz = timing.rate_hz
+        width = min(round(COHERENCE_SEGMENT_S * rate_hz), len(time))
+        frequency_hz, power = signal.welch(command, rate_hz, nperseg=width)
+        _, coherence = signal.coherence(command, position, rate_hz, nperseg=width)
+        return frequency_hz, power, coherence
+
+    grid = np.arange(time[0], time[-1], timing.typical_s)
+    missing = np.zeros(len(grid), dtype=bool)
+    for start, length in timing.gaps:
+        missing |= (grid > start) & (grid < start + length)
+    command = np.interp(grid, time, command)
+    position = np.interp(grid, time, position)
+    width = min(round(COHERENCE_SEGMENT_S / timing.typical_s), len(grid))
+    firsts = np.arange(0, len(grid) - width + 1, max(width // 2, 1))
+    rows = firsts[:, None] + np.arange(width)
+    window = signal.get_window("hann", width)
+    command_spectra = np.fft.rfft(window * signal.detrend(command[rows], type="constant"))
+    position_spectra = np.fft.rfft(window * signal.detrend(position[rows], type="constant"))
+    is_whole = missing[rows].mean(axis=1) <= SHARE_IN_GAPS
+    whole_command = command_spectra[is_whole]
+    whole_position = position_spectra[is_whole]
+    command_power = np.sum(np.abs(whole_command) ** 2, axis=0)
+    position_power = np.sum(np.abs(whole_position) ** 2, axis=0)
+    cross = np.sum(np.conj(whole_command) * whole_position, axis=0)
+    products = np.maximum(command_power * position_power, np.finfo(float).tiny)
+    # What was excited in the segments that are left out cannot be judged by the others.
+    is_known = command_power >= KNOWN_POWER * np.sum(np.abs(command_spectra) ** 2, axis=0)
+    frequency_hz = np.fft.rfftfreq(width, timing.typical_s)
+    return frequency_hz, np.where(is_known, command_power, 0.0), np.abs(cross) ** 2 / products
 
 
 def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
