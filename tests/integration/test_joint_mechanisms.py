@@ -174,6 +174,11 @@ def test_a_joint_at_rest_is_not_taken_for_one_in_degrees(tmp_path: Path) -> None
     (in_degrees,) = replace(log, command=np.rad2deg(log.command)).segmented().excitations("j")
     assert wrong_unit(shaken, robot.joint("j")) == ""
     assert "degrees" in wrong_unit(in_degrees, robot.joint("j"))
+    # A joint that something holds moves as little of a large command in radians.
+    scale = 2.0 * 0.8 / np.ptp(log.command)
+    held_log = replace(log, command=scale * log.command, position=scale * log.position / 55.0)
+    (held,) = held_log.segmented().excitations("j")
+    assert "stuck" in wrong_unit(held, robot.joint("j"))
 
 
 @pytest.mark.parametrize("mechanisms", [BY_MOTOR, BY_LINK], ids=["motor encoder", "link encoder"])

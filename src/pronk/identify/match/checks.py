@@ -192,7 +192,8 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
     or the slow response has a gain of 180 / pi or pi / 180, within a factor of two: drives follow
     slow commands with a gain near 1. A position that is 180 / pi times too small is also that of a
     joint at rest which the excited one shakes; its command is in degrees only if it is large enough
-    for that (`LEAST_DEGREES`).
+    for that (`LEAST_DEGREES`). A larger command may still be one in radians of a joint that
+    something holds; the two look alike, and both are named.
 
     Args:
         excitation: Excitation of a joint.
@@ -216,8 +217,14 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
     gain = abs(slow_response(excitation, joint))
     position_in_degrees = 0.5 < gain / DEGREES < 2.0
     command_in_degrees = 0.5 < gain * DEGREES < 2.0 and 0.5 * (highest - lowest) > LEAST_DEGREES
-    if position_in_degrees or command_in_degrees:
+    if position_in_degrees:
         return f"at low frequency the position is {gain:.3g} times the command; {remedy}"
+    if command_in_degrees:
+        return (
+            f"at low frequency the position is {gain:.3g} times the command; either the command is "
+            "in degrees and the position in radians: convert the command, or the joint is stuck "
+            "or held: free it and record again"
+        )
     return ""
 
 
@@ -305,8 +312,8 @@ def standstill(excitation: Excitation, joint: Joint) -> str:
         if travel == 0.0 or slow_standstill:
             return (
                 f"standstill: {excitation.joint} does not move at {time[first]:.1f} s while its "
-                "command does; a drive that is off, an encoder that is stuck and friction above the "
-                "torque of the drive all show like this: check them and record again"
+                "command does; a drive that is off, an encoder that is stuck and friction above "
+                "the torque of the drive all show like this: check them and record again"
             )
     return ""
 
