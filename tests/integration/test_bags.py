@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import os
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from pronk.identify.logs.joint_log import JointLog
 from pronk.identify.logs.options import ReadOptions
 from pronk.identify.logs.readers import find_logs, read_log
 from pronk.identify.logs.unitree import DEFINITIONS, QUADRUPED_JOINTS
+from pronk.report.motion import read_motion
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from ros_bags import CONTROLLER_STATE, START_NS, Build, Builder, Message, write_bag
@@ -373,6 +375,14 @@ def test_a_go2_bag_is_read_with_its_gains(tmp_path: Path, without_definitions: b
     assert "FL_knee" in accepted(
         "response", path, "--robot", "go2", "--no-plots", "--out", tmp_path / "out"
     )
+
+
+def test_the_motion_of_a_bag_is_on_the_clock_of_its_messages(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", unitree(), "sqlite3", definitions=DEFINITIONS)
+    os.utime(path, (0.0, 0.0))
+    motion = read_motion(path, GO2, lambda: read(path, GO2))
+    assert motion.notes == ()
+    assert abs(int(motion.time_ns[0]) - START_NS) < 10**9
 
 
 def test_motors_without_stiffness_are_left_out(tmp_path: Path) -> None:

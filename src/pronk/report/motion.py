@@ -14,7 +14,7 @@ from pronk.arrays import Array
 from pronk.deploy.runtime.deploy_log import DeployLog, is_deploy_log, read_deploy_log
 from pronk.deploy.runtime.log import TICK_TOPIC
 from pronk.errors import LogError
-from pronk.identify.logs.joint_log import JointLog
+from pronk.identify.logs.joint_log import START_NS, JointLog
 from pronk.identify.logs.mcap import DamagedError, Record, records
 from pronk.identify.logs.recording import STATE
 from pronk.identify.logs.sweep_writer import SAMPLE
@@ -80,6 +80,9 @@ def _of_joint_log(path: Path, log: JointLog, robot: RobotSpec) -> RobotMotion:
             )
     notes = []
     offset_ns = _offset_ns(path)
+    start_ns = int(log.origin.metadata.get(START_NS, 0))
+    if start_ns > WALL_CLOCK_NS:
+        offset_ns = start_ns
     if log.time[0] * 1e9 > WALL_CLOCK_NS:
         offset_ns = 0
     elif offset_ns is None:

@@ -30,7 +30,7 @@ from pronk.identify.logs.columns import (
     ordered_joints,
     robot_names,
 )
-from pronk.identify.logs.joint_log import JointLog, LogOrigin
+from pronk.identify.logs.joint_log import START_NS, JointLog, LogOrigin
 from pronk.identify.logs.mcap import Record, Wanted
 from pronk.identify.logs.options import NeedsOptionsError, ReadOptions
 from pronk.identify.logs.recording import RECORDING_PREFIX
@@ -219,7 +219,11 @@ def join_topics(
         source=str(path),
         sha256=digest,
         complete=not damage,
-        metadata={"measured_topic": topics.measured, "command_topic": topics.command},
+        metadata={
+            **columns.origin.metadata,
+            "measured_topic": topics.measured,
+            "command_topic": topics.command,
+        },
     )
     columns = replace(columns, origin=origin, notes=tuple(notes))
     names = {}
@@ -809,7 +813,7 @@ def _join(
         damping = gains[1, rows[0]]
     kept = np.flatnonzero(chosen)[rows]
     columns = Columns(
-        origin=LogOrigin(source=str(path)),
+        origin=LogOrigin(source=str(path), metadata={START_NS: str(int(time[kept[0]]))}),
         joints=tuple(joints),
         # Before the unit is changed: nanoseconds since 1970 do not fit into one number.
         time=(time[kept] - time[kept[0]]) * 1e-9,

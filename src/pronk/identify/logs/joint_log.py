@@ -18,6 +18,11 @@ _SAME_INSTANT_S = 1e-9
 """Timestamps closer than this are the same instant [s]: far below a tick of any logger."""
 
 
+START_NS = "start_ns"
+"""Metadata of a log whose clock is made to begin at zero: that instant on the clock of the
+recorder [ns]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LogOrigin:
     """Where a log comes from."""
