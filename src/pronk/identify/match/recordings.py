@@ -107,9 +107,11 @@ def joint_recordings(
         during = (time >= trace.time[0]) & (time <= trace.time[-1])
         samples = np.flatnonzero(during)[::stride]
         weight = np.full(len(samples), 1.0 / trace.amplitude)
-        if excitation.frequency is not None:
+        frequency = excitation.frequency
+        # A multisine has no frequency of its own, and may be in one log with a chirp.
+        if frequency is not None and np.isfinite(frequency[samples]).any():
             # Between excitations the joint is at rest, which holds nothing of its dynamics.
-            frequency_hz = np.nan_to_num(excitation.frequency[samples], nan=np.inf)
+            frequency_hz = np.nan_to_num(frequency[samples], nan=np.inf)
             weight = weight / np.sqrt(np.maximum(frequency_hz, LOWEST_HZ))
         part = PARTS * np.arange(len(samples)) // len(samples)
         recordings.append(
@@ -309,8 +311,8 @@ def _coherence(time: Array, command: Array, position: Array) -> tuple[Array, Arr
     products = np.maximum(command_power * position_power, np.finfo(float).tiny)
     # What was excited in the segments that are left out cannot be judged by the others.
     is_known = command_power >= KNOWN_POWER * np.sum(np.abs(command_spectra) ** 2, axis=0)
-    frequency_hz = np.fft.rfftfreq(width, timing.typical_s)
-    return frequency_hz, np.where(is_known, command_power, 0.0), np.abs(cross) ** 2 / products
+    segment_hz = np.asarray(np.fft.rfftfreq(width, timing.typical_s), dtype=np.float64)
+    return segment_hz, np.where(is_known, command_power, 0.0), np.abs(cross) ** 2 / products
 
 
 def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
