@@ -373,7 +373,7 @@ def make_plan(
             "excites nothing; expected at least one of each, and one number of repeats for all or "
             "one an amplitude."
         )
-    repeated = [value for value in dict.fromkeys(amplitudes) if list(amplitudes).count(value) > 1]
+    repeated = [peak for peak in dict.fromkeys(amplitudes) if list(amplitudes).count(peak) > 1]
     if repeated:
         raise PlanError(
             f"the amplitude {repeated[0]:g} rad is given twice; expected each amplitude once, with "
