@@ -68,11 +68,11 @@ def robot_version(name: str | Path) -> RobotVersion:
         modified_ns = path.stat().st_mtime_ns
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
-    whole = path.resolve()
+    whole_path = path.resolve()
     model_modified_ns = 0
     with suppress(OSError):  # a model that is missing is named as the robot is read
-        model_modified_ns = _model_file(whole, modified_ns).stat().st_mtime_ns
-    return RobotVersion(whole, modified_ns, model_modified_ns)
+        model_modified_ns = _model_file(whole_path, modified_ns).stat().st_mtime_ns
+    return RobotVersion(whole_path, modified_ns, model_modified_ns)
 
 
 def robot_file_path(name: str | Path) -> Path:

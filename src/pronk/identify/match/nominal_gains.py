@@ -72,7 +72,9 @@ def held_pairs(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[Pai
             if name in excited_joints or name not in robot.joint_names or not pair[0] > 0.0:
                 continue
             known_pairs = pairs.setdefault(robot.joint(name).original[0], [])
-            if not any(np.allclose(pair, known, rtol=_SAME_GAINS) for known in known_pairs):
+            if not any(
+                np.allclose(pair, known_pair, rtol=_SAME_GAINS) for known_pair in known_pairs
+            ):
                 known_pairs.append(pair)
     return pairs
 
