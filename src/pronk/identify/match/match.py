@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,7 +13,6 @@ from pronk.arrays import Array
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.identify.logs.checks import unwrapped
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.logs.velocity import velocity_note
 from pronk.identify.match.checks import (
     EFFORT_LIMIT,
     SLOW_GAIN,
@@ -54,6 +53,7 @@ from pronk.identify.match.nominal_gains import (
     robot_as_recorded,
     with_drive_gains,
 )
+from pronk.identify.match.notes import match_notes
 from pronk.identify.match.parameters import (
     DRIVE_MODE,
     FREE,
@@ -87,7 +87,6 @@ from pronk.identify.match.torque_limit import (
     with_flat_limits,
 )
 from pronk.identify.match.uncertainty import widen_by_step
-from pronk.identify.response.estimate import resolution_note
 from pronk.identify.response.response import ShortExcitationError
 from pronk.identify.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.identify.simulators.info import SimulatorInfo
@@ -868,63 +867,3 @@ def file_of_robot(robot: RobotSpec) -> str:
     if robot.source in ROBOT_NAMES or not Path(robot.source).is_file():
         return ""
     return robot.source
-
-
-OTHER_POSE = 0.3
-"""Distance of a joint from its pose in the robot's file from which on it is said [rad]."""
-
-
-def pose_note(log: JointLog, joints: Iterable[str], robot: RobotSpec, source: str) -> str:
-    """Say which joints of a log stand elsewhere than in the pose of the robot's file.
-
-    A log may well be of another pose, and is simulated there. Columns that are exchanged, an
-    encoder with another zero, a wrong sign and a wrong unit show in the same way, and often in
-    nothing else.
-
-    Args:
-        log: The log.
-        joints: The joints that were matched.
-        robot: The robot, with the pose of its file.
-        source: Name of the log for the note.
-
-    Returns:
-        The note; empty where every joint is within `OTHER_POSE` of the file's pose.
-    """
-    positions: dict[str, float] = {}
-    for joint in joints:
-        for excitation in excitations_of([log], joint):
-            for name in robot.joint_names:
-                if name in log.joints and log.unit(name) == "rad":
-                    position = float(excitation.pose[log.column(name)])
-                    positions.setdefault(name, position)
-    differences = []
-    for name, position in positions.items():
-        default = robot.joint(name).default_position
-        if abs(position - default) > OTHER_POSE:
-            differences.append(f"{name} {position:.3g} rad (file: {default:.3g})")
-    if not differences:
-        return ""
-    return (
-        f"{source}: the log was recorded in another pose than that of the robot's file: "
-        f"{', '.join(differences)}. It is simulated in the pose of the log; if the robot did not "
-        "stand there, columns are exchanged, or a unit, a sign or the zero of an encoder is wrong"
-    )
-
-
-def match_notes(
-    logs: Sequence[JointLog], joints: Mapping[str, JointResult], robot: RobotSpec
-) -> tuple[str, ...]:
-    """Return remarks of the readers, other poses, wrong velocities, and coarse responses."""
-    notes = []
-    for log in logs:
-        source = Path(log.source or "log").name
-        for note in log.notes:
-            notes.append(f"{source}: {note}")
-        for name in joints:
-            if name in log.excited_joints:
-                notes.append(velocity_note(log, name, source))
-        notes.append(pose_note(log, joints, robot, source))
-    for joint in joints.values():
-        if joint.responses is not None:
-            notes.append(resolution_note(joint.responses.measured[0]))
-    return tuple(dict.fromkeys(note for note in notes if note))
