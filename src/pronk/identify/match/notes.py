@@ -72,6 +72,8 @@ def pose_note(log: JointLog, joints: Iterable[str], robot: RobotSpec, source: st
     """
     positions: dict[str, float] = {}
     for joint in joints:
+        if joint not in log.excited_joints:
+            continue
         for excitation in log.excitations(joint):
             for name in robot.joint_names:
                 if name in log.joints and log.unit(name) == "rad":
