@@ -372,6 +372,20 @@ def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     spec.add_key(name="default", qpos=qpos, ctrl=ctrl)
 
 
+def model_at_zero(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return the model of a robot, and its kinematics with all joints at zero.
+
+    Args:
+        robot: The robot.
+    """
+    model = robot.build_spec().compile()
+    data = mujoco.MjData(model)
+    for joint in robot.joints:
+        data.qpos[model.joint(joint.name).qposadr[0]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
 def bench_inertia(robot: RobotSpec, joint_name: str) -> tuple[float, float]:
     """Measure the inertia and the pull of gravity of a joint in its bench model.
 

@@ -7,11 +7,11 @@ The messages do not name them, so a model with another order would move other le
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import HardwareError
+from pronk.robots.model import model_at_zero
 from pronk.robots.robot import RobotSpec
 
 LEGS = ("front right", "front left", "rear right", "rear left")
@@ -34,11 +34,7 @@ def axis_signs(robot: RobotSpec) -> Array:
         HardwareError: The legs have another order than in the messages, or a joint has another
             axis.
     """
-    model = robot.build_spec().compile()
-    data = mujoco.MjData(model)
-    for joint in robot.joints:
-        data.qpos[model.joint(joint.name).qposadr[0]] = 0.0
-    mujoco.mj_kinematics(model, data)
+    model, data = model_at_zero(robot)
     base = model.body(robot.base_body).id
     to_trunk = data.xmat[base].reshape(3, 3).T
     legs = []

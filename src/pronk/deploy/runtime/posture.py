@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.arrays import Array
+from pronk.robots.model import model_at_zero
 from pronk.robots.robot import RobotSpec
 
 COLLAPSED_SHARE = 0.1
@@ -108,11 +109,7 @@ def leg_kinematics(robot: RobotSpec) -> LegKinematics | None:
     folded = [joint.folded_position for joint in robot.joints]
     if len(lengths) != 1 or lengths == {0} or None in folded:
         return None
-    model = robot.build_spec().compile()
-    data = mujoco.MjData(model)
-    for joint in robot.joints:
-        data.qpos[model.joint(joint.name).qposadr[0]] = 0.0
-    mujoco.mj_kinematics(model, data)
+    model, data = model_at_zero(robot)
     base = model.body(robot.base_body).id
     to_trunk = data.xmat[base].reshape(3, 3).T
     origin = data.xpos[base]

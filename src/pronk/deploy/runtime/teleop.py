@@ -163,7 +163,7 @@ class TimeLimit(Operator):
         self._seconds = seconds
         self._began: float | None = None
         self._sat_from: Mode | None = None
-        """Mode in which it was told to sit down last."""
+        """Mode in which the last request to sit down was sent."""
 
     def notified(self, event_kind: str, text: str) -> None:
         """Pass an event of the servo on."""

@@ -86,7 +86,7 @@ AMPLIFIED = 1.5
 """Slow response over what the drive and gravity explain from which on a joint moves too far. The
 slow response of a hip of the virtual Mini Cheetah is within 0.3 of 1."""
 SLOW_GAIN = "slow gain: "
-"""Beginning of the flag on a joint that moves farther than it is told to."""
+"""Beginning of the flag on a joint that moves farther than it is commanded to."""
 
 EXPLAINED_MIN = 0.8
 """Least share of a joint's motion that a match explains. An error of `match.NO_MATCH_DB` at every
@@ -109,7 +109,7 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
 
     Returns:
         Flags, one sentence each: too few samples, another clock, a joint that stands still or moves
-        farther than it is told to, a measured torque at the effort limit. Empty for a joint whose
+        farther than commanded, a measured torque at the effort limit. Empty for a joint whose
         unit is not radians.
 
     Raises:
@@ -326,7 +326,7 @@ JUMP_RAD = 0.1
 
 
 def slow_gain(excitation: Excitation, robot: RobotSpec) -> str:
-    """Say when a joint moves farther than it is told to: by `AMPLIFIED` or more, also in all.
+    """Say when a joint moves farther than commanded: by `AMPLIFIED` or more, in all too.
 
     Against a stiffness `k` and a pull `g` of gravity a drive follows slow commands with a gain of
     `k / (k + g)`, which is above 1 where gravity pulls the joint over. Neither friction nor a limit

@@ -242,7 +242,7 @@ def match(
                 )
                 is_amplified = any(flag.startswith(SLOW_GAIN) for flag in excitation_flags[name])
                 # A limit holds an unstable simulation back, and would be taken for a cause. It does
-                # not let a joint move farther than it is told to either.
+                # not let a joint move farther than commanded either.
                 if rigs.sets_effort_limit and is_stable and not is_amplified:
                     fit = fit_torque_limit(
                         replay, excitations, rigs.robot, fit, parameters, nominal[name]

@@ -23,7 +23,7 @@ CORRELATED = 0.9
 noisy that its scale is not known."""
 OPPOSED = -0.5
 """Correlation of the two torques up to which the column has the opposite sign. Noise makes a
-correlation smaller and does not turn it, so that less is asked than for a scale."""
+correlation smaller and does not turn it, so that the threshold is lower than for a scale."""
 EXPLAINED = 0.05
 """Error in time of a match, as a share of the amplitude, up to which its gains tell a torque."""
 

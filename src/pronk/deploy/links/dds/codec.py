@@ -46,7 +46,7 @@ VIRTUAL_SERIAL = (0x4E4F5250, 0x4D49534B)
 """`sn` that identifies a virtual robot: `PRONKSIM`."""
 TICKS_PER_S = 1000
 _TICKS = 2**32
-"""Number of ticks after which the robot's clock begins anew: 49.7 days."""
+"""Number of ticks after which the robot's clock begins at zero again: 49.7 days."""
 STATE_RATE_HZ = 500.0
 _JOINTS = 12
 # Plausible targets and gains: no joint turns twice, and these gains are ten times the usual ones.
@@ -215,8 +215,8 @@ class DdsStateDecoder(StateNumbering):
         """Whether the last message was a virtual robot's."""
         self._joints = joints
         self._ticks: int | None = None
-        """The robot's clock, which goes on where that of the messages begins anew; None before a
-        state."""
+        """The robot's clock, which goes on where that of the messages begins at zero again; None
+        before a state."""
 
     def take(self, data: bytes, arrived: float) -> State | None:
         """Decode a message that arrived at a time [s]; temperatures that are all zero are none.
