@@ -4,7 +4,8 @@
     python examples/studies/match_worth/make_robots.py --match    # and gains/*.yaml: 5 minutes each
 
 Every robot is drawn about the parameters of the virtual Mini Cheetah that ships with pronk. The
-same seeds give the same files. `--robot NAME` does it for one robot alone.
+same seeds give the same files. `--robot NAME` does it for one robot alone. A robot that its drives
+do not hold up is refused, since no policy could start on it.
 """
 
 from __future__ import annotations
@@ -20,15 +21,19 @@ from pathlib import Path
 
 import numpy as np
 
+from pronk.errors import HardwareError
 from pronk.jump.trial.condition_trial import save_sim_params
+from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import JointParams, SimParams, load_sim_params
+from pronk.policy.rollout import check_standing
 from pronk.robots import load_robot
 
 FOLDER = Path(__file__).resolve().parent
 ROBOT = "mini_cheetah"
 WEAK_SEED = 4301
 STRONG_SEED = 4302
-RANDOM_SEEDS = (4311, 4312, 4313)
+RANDOM_SEEDS = (4311, 4314, 4315)
+"""The first three seeds from 4311 whose robots their drives hold up in the default pose."""
 
 WEAK_TORQUE = (0.68, 0.85)
 """Torque constants of the weak robot; the shipped one has 0.99 to 1.43 [1]."""
@@ -149,6 +154,22 @@ def random_robot(seed: int) -> SimParams:
     return replace(shipped, joints=joints, machine=machine, trunk=trunk)
 
 
+def stands(sim_params: SimParams) -> bool:
+    """Return whether the drives hold a robot up that is set down in its default pose.
+
+    A trial sets a robot that gives way down again nearer to that pose, and counts a jump as not
+    landed if it gives way there too.
+    """
+    robot = load_robot(ROBOT)
+    machine = VirtualRobot(robot, sim_params, seed=0, base="ground")
+    machine.connect()
+    try:
+        check_standing(robot, machine.latest())
+    except HardwareError:
+        return False
+    return True
+
+
 ROBOTS: dict[str, Callable[[], SimParams]] = {
     "shipped": load_sim_params,
     "weak": weak_robot,
@@ -190,7 +211,10 @@ def main() -> None:
     for name in options.robot or list(ROBOTS):
         path = FOLDER / "robots" / f"{name}.yaml"
         comment = f"Virtual robot {name!r} of the study; written by make_robots.py."
-        save_sim_params(path, ROBOTS[name](), comment=comment)
+        sim_params = ROBOTS[name]()
+        if not stands(sim_params):
+            parser.exit(1, f"{name}: the drives do not hold this robot up in its default pose.\n")
+        save_sim_params(path, sim_params, comment=comment)
         if options.match:
             match_robot(name)
 
