@@ -86,6 +86,7 @@ def test_every_policy_jumps_on_every_robot(study: Path) -> None:
         assert (cell.seeds, cell.jumps, cell.jumps_with_value) == (1, 1, 1)
         height = results.cell(row["arm"], row["robot"], "height")
         assert height.jumps_with_value == int(row["height"] != "")
+        assert cell.jumps_not_standing == int(row["fell"] == "")
     (comparison,) = results.comparisons
     heights = {row["arm"]: row["height"] for row in rows if row["robot"] == "shipped"}
     assert comparison.value == float(heights["matched"]) - float(heights["nominal"])

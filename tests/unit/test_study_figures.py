@@ -238,6 +238,20 @@ def test_a_table_says_where_arms_have_values_of_unequal_shares(results: StudyRes
     assert "of 10" not in notes({"nominal": (8, 10), "matched": (16, 20)})
 
 
+def test_a_table_says_where_the_drives_did_not_hold_the_robot_up(results: StudyResults) -> None:
+    """Such jumps are counted as not landed, but they say nothing about the policies."""
+    cells = []
+    for cell in results.cells:
+        if cell.robot == "shipped":
+            with_value = 10 if cell.outcome == "landed" else 6
+            cell = replace(cell, jumps=10, jumps_with_value=with_value, jumps_not_standing=4)
+        cells.append(cell)
+    landed, height = outcome_tables(replace(results, cells=tuple(cells)))[:2]
+    assert "8 of 20 on shipped" in " ".join(landed.notes)
+    # A jump that did not happen has no height, so that none is counted as one of zero.
+    assert "on shipped" not in " ".join(height.notes)
+
+
 def test_the_page_has_both_figures(results: StudyResults, tmp_path: Path) -> None:
     save_study(tmp_path / "study.json", results)
     assert load_study_results(tmp_path / "study.json").cells[0] == results.cells[0]

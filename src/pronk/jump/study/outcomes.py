@@ -46,11 +46,14 @@ def _jumped(run: TrialRun) -> float:
     return float(run.figures.found)
 
 
+def never_stood(run: TrialRun) -> bool:
+    """Return whether the drives did not hold the robot up, so that no policy started."""
+    return not (run.figures.standing or run.figures.fell)
+
+
 def _fell(run: TrialRun) -> float:
-    figures = run.figures
-    # A robot that its drives cannot hold never stood, so that it did not fall either.
-    never_stood = not (figures.standing or figures.fell)
-    return math.nan if never_stood else float(figures.fell)
+    # A robot that never stood did not fall either.
+    return math.nan if never_stood(run) else float(run.figures.fell)
 
 
 def _height(run: TrialRun) -> float:

@@ -37,7 +37,7 @@ from pronk.jump.study.config import (
     StudyConfig,
     comparison_robots,
 )
-from pronk.jump.study.outcomes import OUTCOMES
+from pronk.jump.study.outcomes import OUTCOMES, never_stood
 from pronk.jump.study.robot_inputs import RobotInput, robot_input
 from pronk.jump.study.schedule import TaskStatus
 from pronk.jump.study.study_results import (
@@ -732,11 +732,13 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
     means: dict[str, float | None] = {}
     count = 0
     with_value = 0
+    not_standing = 0
     for seed, runs in by_seed.items():
         strata = values_by_command(runs, outcome_name)
         seeds.append(strata)
         means[str(seed)] = seed_mean(strata)
         count += len(runs)
+        not_standing += sum(never_stood(run) for run in runs)
         for values in strata:
             with_value += int(np.isfinite(values).sum())
     estimate = mean_interval(seeds, is_share=OUTCOMES[outcome_name].is_share)
@@ -752,6 +754,7 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
         by_seed=means,
         jumps=count,
         jumps_with_value=with_value,
+        jumps_not_standing=not_standing,
     )
 
 

@@ -83,6 +83,9 @@ class OutcomeCell:
     """Number of commanded jumps of all seeds."""
     jumps_with_value: int | None = None
     """Number of those that have this outcome; None in results of an earlier pronk."""
+    jumps_not_standing: int = 0
+    """Number of those before which the drives did not hold the robot up, so that no policy started;
+    0 in results of an earlier pronk."""
 
     @property
     def seeds(self) -> int:
@@ -315,6 +318,12 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
                 single_seed.append(f"{arm} on {robot}")
         rows.append(tuple(row))
     notes = [f"{outcome.replace('_', ' ')}: {definition.meaning}."]
+    not_standing = _not_standing(results, outcome, shown)
+    if not_standing:
+        notes.append(
+            "Before some jumps the drives did not hold the robot up, so that no policy started. "
+            f"They count here as if the policy had failed: {'; '.join(not_standing)}."
+        )
     uneven = _uneven_counts(results, outcome, shown)
     if uneven:
         notes.append(
@@ -330,6 +339,28 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
         notes=tuple(notes),
         is_detail=in_series,
     )
+
+
+def _not_standing(results: StudyResults, outcome: str, robots: Collection[str]) -> list[str]:
+    """Return how many jumps have an outcome although the robot did not stand before them.
+
+    Args:
+        results: The study.
+        outcome: Name of the outcome.
+        robots: Names of the robots that count.
+    """
+    texts = []
+    for robot in results.robots:
+        jumps = 0
+        not_standing = 0
+        for arm in results.arms:
+            cell = results.cell(arm, robot, outcome)
+            if robot in robots and cell.jumps_with_value == cell.jumps:
+                jumps += cell.jumps
+                not_standing += cell.jumps_not_standing
+        if not_standing:
+            texts.append(f"{not_standing} of {jumps} on {robot}")
+    return texts
 
 
 def _uneven_counts(results: StudyResults, outcome: str, robots: Collection[str]) -> list[str]:
