@@ -22,7 +22,7 @@ from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import Link, RunPlan
 from pronk.deploy.runtime.poses import RunTiming
-from pronk.deploy.runtime.records import ACTIONS, OPERATOR, TICK, Event
+from pronk.deploy.runtime.records import ACTIONS, OPERATOR, REQUEST, TICK, Event
 from pronk.deploy.runtime.servo import Servo
 from pronk.errors import HardwareError
 from virtual_robot import POSE
@@ -55,14 +55,12 @@ class Run:
     def over(self) -> bool:
         return not self._thread.is_alive()
 
-    def until(
-        self, condition: Callable[[], bool], request: OperatorRequest = OperatorRequest.NONE
-    ) -> None:
-        """Hold the dead-man button until something is so."""
+    def until(self, condition: Callable[[], bool], *requests: OperatorRequest) -> None:
+        """Make requests at once, and hold the dead-man button until something is so."""
         record = self._record
         end = time.monotonic() + 20.0
-        record["request"] = request
-        record["requests"] += request is not OperatorRequest.NONE
+        for request in requests:
+            self.shared.requests.put(np.array((request,), dtype=REQUEST))
         while not condition():
             assert time.monotonic() < end, (self.servo.modes.mode, self.said)
             record["time"] = time.monotonic()
@@ -76,8 +74,8 @@ class Run:
         end = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > end)
 
-    def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
-        self.until(lambda: self.servo.modes.mode is mode, request)
+    def mode(self, mode: Mode, *requests: OperatorRequest) -> None:
+        self.until(lambda: self.servo.modes.mode is mode, *requests)
 
     def texts(self, event_kind: str) -> list[str]:
         """Texts of the events of a kind."""
@@ -143,6 +141,30 @@ def test_without_any_state_requests_are_read(link: FaultyLink) -> None:
         assert time.monotonic() - since < 5.0
     assert run.texts("mode") == ["IDLE", "ENDED"]
     assert not link.wire.read_text()
+
+
+@pytest.mark.parametrize(
+    "requests",
+    [
+        (OperatorRequest.DAMP, OperatorRequest.QUIT),
+        (OperatorRequest.QUIT, OperatorRequest.DAMP, OperatorRequest.STAND),
+    ],
+)
+def test_of_requests_that_wait_for_a_late_servo_none_hides_that_to_quit(
+    link: FaultyLink, requests: tuple[OperatorRequest, ...]
+) -> None:
+    with flown(link) as run:
+        run.mode(Mode.DAMP)
+        run.mode(Mode.STAND, OperatorRequest.STAND)
+        run.until(lambda: run.over, *requests)
+    assert run.texts("mode")[-2:] == ["DAMP", "ENDED"]
+
+
+def test_a_request_to_damp_is_not_lost_with_another_beside_it(link: FaultyLink) -> None:
+    with flown(link) as run:
+        run.mode(Mode.DAMP)
+        run.mode(Mode.STAND, OperatorRequest.STAND)
+        run.mode(Mode.DAMP, OperatorRequest.DAMP, OperatorRequest.WALK)
 
 
 def test_a_link_that_breaks_does_not_make_time_run_ahead(link: FaultyLink) -> None:

@@ -759,6 +759,9 @@ def test_keys_of_a_terminal() -> None:
         (b"01", OperatorRequest.DAMP),
         (b"102", OperatorRequest.DAMP),
         (b"q1", OperatorRequest.QUIT),
+        (b"0q", OperatorRequest.QUIT),
+        (b"q0", OperatorRequest.QUIT),
+        (b"01q2", OperatorRequest.QUIT),
         (b"12", OperatorRequest.WALK),
     ):
         assert pressed(keys, 1.15).request is request
@@ -799,6 +802,9 @@ def test_a_gamepad(tmp_path: Path) -> None:
     # B damps, whatever is pressed right after it.
     assert moved(0.15, (1, 1, 1), (1, 1, 0)).request is OperatorRequest.DAMP
     assert moved(0.16, (1, 1, 0), (1, 1, 1), (1, 1, 9)).request is OperatorRequest.DAMP
+    # BACK quits, whatever is pressed before it or after it.
+    assert moved(0.17, (1, 1, 1), (1, 1, 6)).request is OperatorRequest.QUIT
+    assert moved(0.18, (1, 1, 6), (1, 1, 1), (1, 1, 0)).request is OperatorRequest.QUIT
     # The jump input of a press, short or long, lasts as long as in training.
     assert moved(0.2, (1, 1, 5)).jump
     assert moved(0.68, (0, 1, 5)).jump

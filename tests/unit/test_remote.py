@@ -145,6 +145,12 @@ def test_damping_outweighs_what_is_pressed_with_it() -> None:
     assert remote.command(0.0, Mode.POLICY).request is OperatorRequest.DAMP
 
 
+def test_quitting_outweighs_damping_that_is_pressed_with_it() -> None:
+    remote = remote_with(held())
+    remote.sensed(held(RemoteButton.B, RemoteButton.SELECT, RemoteButton.A))
+    assert remote.command(0.0, Mode.POLICY).request is OperatorRequest.QUIT
+
+
 def test_what_is_held_from_the_begin_requests_nothing() -> None:
     remote = Remote(RANGES)
     remote.sensed(held(RemoteButton.A, RemoteButton.L1))

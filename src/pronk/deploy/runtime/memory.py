@@ -22,6 +22,7 @@ from pronk.deploy.runtime.records import (
     ACTIONS,
     EVENT,
     OPERATOR,
+    REQUEST,
     STANDBY,
     STEP,
     TICK,
@@ -47,6 +48,8 @@ STEP_SLOTS = 256
 """Steps of the policy that wait for the logger."""
 EVENT_SLOTS = 256
 """Events that wait for the logger or the operator."""
+REQUEST_SLOTS = 256
+"""Requests of the operator that wait for the servo: five seconds of them at 50 Hz."""
 
 
 def slots_dtype(record: np.dtype[Any], slots: int) -> np.dtype[Any]:
@@ -75,6 +78,7 @@ def memory_dtype(joints: int) -> np.dtype[Any]:
             ("events", slots_dtype(EVENT, EVENT_SLOTS)),
             ("policy_events", slots_dtype(EVENT, EVENT_SLOTS)),
             ("events_seen", slots_dtype(EVENT, EVENT_SLOTS)),
+            ("requests", slots_dtype(REQUEST, REQUEST_SLOTS)),
         ],
         align=True,
     )
@@ -242,6 +246,9 @@ class Shared:
         """Policy to logger: `EVENT`."""
         self.events_seen = Ring(memory["events_seen"])
         """Servo to operator: `EVENT`."""
+        self.requests = Ring(memory["requests"])
+        """Operator to servo: `REQUEST`. In a mailbox a later request would replace one that the
+        servo has not read yet."""
 
     @property
     def mode(self) -> Mode | None:
@@ -273,6 +280,7 @@ class Shared:
         self.events.close()
         self.policy_events.close()
         self.events_seen.close()
+        self.requests.close()
         self._memory.close()
         if self._owner:
             self._memory.unlink()

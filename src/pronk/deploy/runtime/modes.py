@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 
 
@@ -64,3 +65,19 @@ class OperatorRequest(IntEnum):
     """Damp the joints and end."""
     CLAMPED = 7
     """The joints of a sweep are clamped as requested."""
+
+
+def deciding_request(requests: Iterable[OperatorRequest]) -> OperatorRequest:
+    """Return which of requests that are read together counts, in whatever order they came.
+
+    To quit outweighs to damp, because it damps too, and either outweighs the others. Of the others
+    the last counts; without any it is `OperatorRequest.NONE`.
+    """
+    deciding = OperatorRequest.NONE
+    for request in requests:
+        if deciding is OperatorRequest.QUIT:
+            break
+        if deciding is OperatorRequest.DAMP and request is not OperatorRequest.QUIT:
+            continue
+        deciding = request
+    return deciding

@@ -86,15 +86,15 @@ STANDBY = np.dtype([("time", _FLOAT)])
 OPERATOR = np.dtype(
     [
         ("time", _FLOAT),
-        ("request", _INT),
-        ("requests", _INT),
         ("held", _INT),
         ("jump", _INT),
         ("command", _FLOAT, (3,)),
     ]
 )
-"""Record of the operator to servo and policy: the last request and the number of requests, dead-man
-button, jump input and velocity command."""
+"""Record of the operator to servo and policy: dead-man button, jump input and velocity command."""
+
+REQUEST = np.dtype([("request", _INT)])
+"""Record of the operator to the servo: a request, a number of `OperatorRequest`."""
 
 TICK = np.dtype(
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pronk.deploy.links.remote import RemoteButton, RemoteInput, decode_remote
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest, deciding_request
 from pronk.deploy.runtime.teleop import Operator, OperatorCommand, Ranges
 from pronk.policy.contract import COMMANDS
 from pronk.policy.gamepad import JUMP_S, stick_command
@@ -19,7 +19,8 @@ _REQUESTS: Mapping[RemoteButton, OperatorRequest] = {
     RemoteButton.SELECT: OperatorRequest.QUIT,
     RemoteButton.B: OperatorRequest.DAMP,
 }
-"""Requests by button. Of buttons that are pressed together, the last of these counts."""
+"""Requests by button. Of buttons that are pressed together, the last of these counts, unless one of
+them damps or quits (`deciding_request`)."""
 _NEVER = -1e9
 """Time of a button that was not pressed yet [s]."""
 
@@ -73,10 +74,7 @@ class Remote(Operator):
         if self._held_before is not None:
             pressed = remote.held - self._held_before
         self._held_before = remote.held
-        request = OperatorRequest.NONE
-        for button, button_request in _REQUESTS.items():
-            if button in pressed:
-                request = button_request
+        requests = [request for button, request in _REQUESTS.items() if button in pressed]
         if RemoteButton.R1 in pressed:
             self._jump_pressed = now
         forward, left, yaw_rate = COMMANDS
@@ -88,5 +86,5 @@ class Remote(Operator):
             ),
             jump=now - self._jump_pressed < JUMP_S,
             dead_man=RemoteButton.L1 in remote.held,
-            request=request,
+            request=deciding_request(requests),
         )

@@ -23,7 +23,7 @@ from pronk.deploy.runtime.memory import Shared
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.plan import SERVO_PRIORITY, RunPlan
 from pronk.deploy.runtime.policy_process import serve_policy
-from pronk.deploy.runtime.records import OPERATOR, Event
+from pronk.deploy.runtime.records import OPERATOR, REQUEST, Event
 from pronk.deploy.runtime.servo import serve_robot
 from pronk.deploy.runtime.standby import HAS_STANDBY, NO_STANDBY, serve_standby
 from pronk.deploy.runtime.teleop import Operator, OperatorCommand
@@ -243,10 +243,9 @@ class Deployment:
         """
         if self._open:
             self._interrupts.check()
-        record = self._record.copy()
         if command.request is not OperatorRequest.NONE:
-            record["request"] = command.request
-            record["requests"] += 1
+            self.shared.requests.put(np.array((command.request,), dtype=REQUEST))
+        record = self._record.copy()
         record["time"] = time.monotonic()
         record["held"] = command.dead_man
         record["jump"] = command.jump

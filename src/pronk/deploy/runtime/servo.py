@@ -26,7 +26,7 @@ import numpy as np
 
 from pronk.deploy.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.deploy.runtime.memory import Shared
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest, deciding_request
 from pronk.deploy.runtime.plan import SERVO_PRIORITY, RunPlan, TrajectoryMachine
 from pronk.deploy.runtime.preflight import delay_objection, refusals
 from pronk.deploy.runtime.process_body import run_to_end
@@ -80,8 +80,8 @@ class Servo:
 
     1. Wait for the deadline and collect the states of the link. The tick begins: `tick_begun`.
     2. Note the states that are new. In PREFLIGHT, check them and perhaps leave that mode.
-    3. Read the operator's mailbox: dead-man button, request, silence. Without any state so far,
-       publish and end the tick.
+    3. Read the operator's mailbox, for dead-man button and silence, and the operator's requests.
+       Without any state so far, publish and end the tick.
     4. Read the policy's mailbox.
     5. Add the faults that are known before a command exists: the standby process damps, the link
        failed in step 1, the operator's program has ended.
@@ -135,8 +135,6 @@ class Servo:
         self._tick_record = np.zeros((), dtype=TICK)
         self._offset = 0.0
         """CLOCK_MONOTONIC less the machine's clock [s]."""
-        self._requests = 0
-        """Requests of the operator that were read."""
         self._state: State | None = None
         """Newest state."""
         self._new_states: list[State] = []
@@ -195,7 +193,7 @@ class Servo:
     # --- the other processes ----------------------------------------------------------------------
 
     def _operator(self, now: float) -> tuple[bool, bool]:
-        """Read the operator's mailbox and take a new request.
+        """Read the operator's mailbox and take the new requests.
 
         Returns:
             Whether the dead-man button is held, and whether the operator's program is gone: its
@@ -203,17 +201,19 @@ class Servo:
             the last change of mode if there never was one. The heartbeat of a program that hangs
             goes on for `run._STALL_S`.
         """
+        requests = []
+        for request_record in self.shared.requests.take():
+            request = OperatorRequest(int(request_record["request"]))
+            if request is OperatorRequest.CLAMPED:
+                self._clamped.set()
+            else:
+                requests.append(request)
+        if requests:
+            self.modes.request(deciding_request(requests))
         record = self.shared.operator.read()
         timeout = self.plan.operator_timeout_s
         if record is None:
             return False, now - self.modes.since > 10.0 * timeout
-        if record["requests"] != self._requests:
-            self._requests = int(record["requests"])
-            request = OperatorRequest(int(record["request"]))
-            if request is OperatorRequest.CLAMPED:
-                self._clamped.set()
-            else:
-                self.modes.request(request)
         gone = now - float(record["time"]) > timeout
         return bool(record["held"]) and not gone, gone
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.deploy.links.link import ClampOperator
-from pronk.deploy.runtime.modes import Mode, OperatorRequest
+from pronk.deploy.runtime.modes import Mode, OperatorRequest, deciding_request
 from pronk.errors import HardwareError, PronkError
 from pronk.policy.gamepad import JUMP_S, GamepadButton, GamepadReader
 from pronk.policy.script import STILL, Script, Velocity
@@ -204,13 +204,6 @@ HELP = """\
 """Keys of the keyboard."""
 
 
-def _more_urgent(first: OperatorRequest, second: OperatorRequest) -> OperatorRequest:
-    """Return which of two requests of the same reading counts: to damp or quit, else the later."""
-    if first in (OperatorRequest.DAMP, OperatorRequest.QUIT):
-        return first
-    return second
-
-
 _STEPS = {
     "w": (0, 0.25),
     "s": (0, -0.25),
@@ -274,7 +267,7 @@ class Keyboard(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """Return the keys' input."""
-        request = OperatorRequest.NONE
+        requests = []
         keys = self._read().decode("ascii", "ignore")
         if not self._connected:
             return OperatorCommand(request=OperatorRequest.QUIT)
@@ -290,13 +283,13 @@ class Keyboard(Operator):
             elif key in "\r\n":
                 self._jump_pressed = now
             elif key in _REQUESTS:
-                request = _more_urgent(request, _REQUESTS[key])
+                requests.append(_REQUESTS[key])
         forward, sideways, yaw_rate = self._command
         return OperatorCommand(
             command=(forward, sideways, yaw_rate),
             jump=now - self._jump_pressed < JUMP_S,
             dead_man=now - self._dead_man_pressed < _REPEAT_S,
-            request=request,
+            request=deciding_request(requests),
         )
 
     def _read(self) -> bytes:
@@ -344,10 +337,10 @@ class Gamepad(Operator):
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """Return the input of sticks and buttons."""
         pad = self._reader.read(now)
-        request = OperatorRequest.NONE
-        for button in pad.pressed:
-            if button in _PAD_REQUESTS:
-                request = _more_urgent(request, _PAD_REQUESTS[button])
+        requests = [_PAD_REQUESTS[button] for button in pad.pressed if button in _PAD_REQUESTS]
         return OperatorCommand(
-            command=pad.velocity, jump=pad.jump, dead_man=pad.dead_man, request=request
+            command=pad.velocity,
+            jump=pad.jump,
+            dead_man=pad.dead_man,
+            request=deciding_request(requests),
         )
