@@ -367,9 +367,19 @@ def test_a_robot_that_cannot_stand_has_not_landed(policies: list[Path], tmp_path
     conditions = [Condition(name="soft", changes=(soft,)), Condition(name="nominal")]
     results = run_conditions(policies[:1], conditions, PLAN, setup(tmp_path))
     cell, nominal = results.cells
-    assert (cell.jumps, cell.landed, cell.fell) == (1, 0, 0)
+    assert (cell.jumps, cell.landed, cell.stood, cell.fell) == (1, 0, 0, None)
+    assert (nominal.stood, nominal.fell) == (1, 0)
     assert math.isnan(cell.height.mean)
     assert nominal.height.mean > 0.0
+    table = tables.condition_table(results)
+    fell = [column.heading for column in table.columns].index("fell")
+    assert [row[fell] for row in table.rows] == ["-", "0/1"]
+    # The table says which runs these are, and of no others.
+    assert any(table.rows[0][0] in note for note in table.notes)
+    assert not any(table.rows[1][0] in note for note in table.notes)
+    with (tmp_path / "conditions.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["fell"] for row in rows] == ["", "0"]
     again = run_conditions(policies[:1], conditions, PLAN, setup(tmp_path))
     assert again.kept == 2
     draw_conditions(again)

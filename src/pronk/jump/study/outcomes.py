@@ -48,7 +48,7 @@ def _jumped(run: TrialRun) -> float:
 
 def never_stood(run: TrialRun) -> bool:
     """Return whether the drives did not hold the robot up, so that no policy started."""
-    return not (run.figures.standing or run.figures.fell)
+    return not run.figures.stood
 
 
 def _fell(run: TrialRun) -> float:

@@ -91,8 +91,10 @@ class ConditionCell:
     """Share of landings of all jumps [1]."""
     landed_interval: tuple[float, float]
     """Wilson's 95 % interval of that share [1]."""
-    fell: int
-    """Number of runs in which the robot fell."""
+    stood: int
+    """Number of runs in which the robot stood when the policy was to start."""
+    fell: int | None
+    """Number of those runs in which the robot fell; None without any of them."""
     height: Spread
     """Height of the jumps that there were [m]."""
     distance: Spread
@@ -372,12 +374,14 @@ def run_condition_job(job: TrialJob) -> TrialRun:
 
 def _sum_up(cell: _PlannedCell, rows: Sequence[TrialRun]) -> ConditionCell:
     landed = 0
+    stood = 0
     fell = 0
     heights = []
     distances = []
     velocity_errors = []
     for row in rows:
         landed += row.figures.success
+        stood += row.figures.stood
         fell += row.figures.fell
         velocity_errors.append(velocity_error(row))
         if row.figures.found:
@@ -391,7 +395,8 @@ def _sum_up(cell: _PlannedCell, rows: Sequence[TrialRun]) -> ConditionCell:
         landed=landed,
         landed_share=landed / len(rows),
         landed_interval=share_interval(landed, len(rows)),
-        fell=fell,
+        stood=stood,
+        fell=fell if stood else None,
         height=Spread.of(heights),
         distance=Spread.of(distances),
         velocity_error=Spread.of(velocity_errors),
@@ -490,8 +495,13 @@ def save_conditions(folder: Path, results: ConditionResults) -> tuple[Path, Path
     writer.writerow(
         [
             *("policy", "condition", "series", "place", "jumps", "landed", "landed_share"),
-            *("landed_low", "landed_high", "fell", "height_m", "height_std_m", "distance_m"),
-            *("distance_std_m", "velocity_error_m_per_s", "velocity_error_std_m_per_s"),
+            *("landed_low", "landed_high", "stood", "fell", "height_m", "height_std_m"),
+            *(
+                "distance_m",
+                "distance_std_m",
+                "velocity_error_m_per_s",
+                "velocity_error_std_m_per_s",
+            ),
         ]
     )
     conditions = {condition.name: condition for condition in results.conditions}
@@ -509,7 +519,8 @@ def save_conditions(folder: Path, results: ConditionResults) -> tuple[Path, Path
                 cell.landed_share,
                 low,
                 high,
-                cell.fell,
+                cell.stood,
+                "" if cell.fell is None else cell.fell,
                 _csv_number(cell.height.mean),
                 _csv_number(cell.height.std),
                 _csv_number(cell.distance.mean),

@@ -402,6 +402,14 @@ class JumpFigures:
         """Whether it landed: upright 2 s later, and nothing but feet touched the ground."""
         return self.upright and not self.non_foot_contact
 
+    @property
+    def stood(self) -> bool:
+        """Whether the robot stood when the policy was to start.
+
+        One that its drives could not hold did not, and so it did not fall either.
+        """
+        return self.standing or self.fell
+
 
 def figures_of(figures_class: type[Any]) -> dict[str, Figure]:
     """Return the figures of a dataclass, and of the parts it has, by name."""

@@ -19,6 +19,7 @@ from pronk.jump.trial.protocol import (
 )
 from pronk.jump.trial.results import FEWEST, RunCell, ScatterRatio, Spread, TrialResults
 from pronk.jump.trial.walk import SETTLE_S, WALK_FIGURES
+from pronk.policy.rollout import MAX_STANDING_DEVIATION_RAD, MAX_STANDING_TILT_DEG
 from pronk.tables import NOT_MEASURED, Cell, Column, Table, counted, number
 
 DEFINITIONS = "Definitions"
@@ -553,17 +554,39 @@ def _capital_place(trial: TrialResults) -> str:
 def condition_table(results: ConditionResults) -> Table:
     """Return landings, height, distance and velocity error under every condition."""
     rows: list[tuple[Cell, ...]] = []
+    unable = []
     for cell in results.cells:
+        if cell.stood < cell.jumps:
+            unable.append(
+                f"{cell.condition}: {cell.policy} ({cell.jumps - cell.stood} of {cell.jumps})"
+            )
         rows.append(
             (
                 f"{cell.condition}: {cell.policy}",
                 f"{cell.landed}/{cell.jumps}",
                 interval_text(cell.landed_interval),
-                cell.fell,
+                NOT_MEASURED if cell.fell is None else f"{cell.fell}/{cell.stood}",
                 spread_text(cell.height),
                 spread_text(cell.distance),
                 spread_text(cell.velocity_error),
             )
+        )
+    notes = [
+        f"Commands: {', '.join(results.commands)}; {counted(results.jumps, 'jump')} with each, "
+        f"seed {results.seed}. Mean +- standard deviation; height and distance of the jumps that "
+        "left the ground.",
+        "landed: of all commanded. fell: at any time of the run, of the runs in which the robot "
+        "stood when the policy was to start.",
+        "velocity error: difference of mean and commanded velocity along the command before the "
+        "jump input.",
+    ]
+    if unable:
+        notes.append(
+            f"Never stood, in this number of runs: {', '.join(unable)}. When the policy was to "
+            f"start, a joint was more than {MAX_STANDING_DEVIATION_RAD:g} rad from its default "
+            f"position, or the trunk tilted by more than {MAX_STANDING_TILT_DEG:g} degrees, as on "
+            "drives that are too weak for the robot's weight. These runs count as not landed, and "
+            "have no value in the other columns."
         )
     return Table(
         title=f"{place_words(results.virtual).capitalize()} under conditions, all commands",
@@ -577,10 +600,5 @@ def condition_table(results: ConditionResults) -> Table:
             Column(heading="velocity error", unit="m/s"),
         ),
         rows=tuple(rows),
-        notes=(
-            f"Commands: {', '.join(results.commands)}; {counted(results.jumps, 'jump')} with each, "
-            f"seed {results.seed}. Mean +- standard deviation over all jumps.",
-            "velocity error: difference of mean and commanded velocity along the command before "
-            "the jump input.",
-        ),
+        notes=tuple(notes),
     )
