@@ -11,7 +11,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.identify.logs.joint_log import Excitation, JointLog
-from pronk.identify.logs.options import TIME_UNITS
+from pronk.identify.logs.options import ANGLE_UNITS, TIME_UNITS
 
 PLAUSIBLE_HZ = (5.0, 50_000.0)
 """Lowest and highest sample rate that a log can have [Hz]; another one means a wrong unit, as a
@@ -26,6 +26,10 @@ LARGEST_COMMAND = 6.3
 """Largest plausible peak of a command about its middle: a full turn [rad]."""
 LARGEST_POSITION = 4.0 * np.pi
 """Largest plausible position: two turns [rad]."""
+
+_ONE_UNIT = 10.0
+"""Largest factor between the travels of a position and its command that may have one unit: a joint
+amplifies its command by less at its resonance, and lets more through above it."""
 
 _UNMOVED = 0.01
 """Share of the command's travel below which a joint did not move; chirps begin far below any
@@ -257,23 +261,51 @@ def saturation_note(log: JointLog, joint: str) -> str:
 
 
 def check_radians(log: JointLog, joint: str) -> None:
-    """Refuse a joint in radians that moves as only degrees would, with a LogError."""
+    """Refuse a joint in radians that moves as only degrees would, with a LogError.
+
+    Where one of command and position is too large and the other is not, the two have different
+    units or zeros, which no unit of the file mends.
+    """
     if log.unit(joint) != "rad":
         return
     column = log.column(joint)
     command = log.command[:, column]
     position = log.position[:, column]
-    peak = 0.5 * float(np.ptp(command))
-    farthest = float(max(np.abs(position).max(), np.abs(command).max()))
-    if peak > LARGEST_COMMAND:
-        excess = f"its command swings by {peak:.3g}"
-    elif farthest > LARGEST_POSITION:
-        excess = f"it reaches {farthest:.3g}"
-    else:
+    swing = 0.5 * float(np.ptp(command))
+    command_farthest = float(np.abs(command).max())
+    position_farthest = float(np.abs(position).max())
+    command_is_large = swing > LARGEST_COMMAND or command_farthest > LARGEST_POSITION
+    position_is_large = position_farthest > LARGEST_POSITION
+    if not (command_is_large or position_is_large):
         return
+    if swing > LARGEST_COMMAND:
+        excess = f"its command swings by {swing:.3g}"
+    else:
+        excess = f"it reaches {max(command_farthest, position_farthest):.3g}"
+    seen = (
+        f"{log.source or 'log'}: {joint} is read in radians and {excess}, more than a joint turns"
+    )
+    moved = float(np.ptp(position))
+    if command_is_large != position_is_large and swing > 0.0 and moved > 0.0:
+        ratio = moved / (2.0 * swing)
+        offset = abs(float(np.median(command) - np.median(position)))
+        if not 1.0 / _ONE_UNIT < ratio < _ONE_UNIT:
+            raise LogError(
+                f"{seen}, and its position moves {ratio:.3g} times as far as its command. A column "
+                f"in degrees beside one in radians ({np.rad2deg(1.0):.1f} or "
+                f"{np.deg2rad(1.0):.4f} times), a position of the motor before its gear and a "
+                "joint that is held look so; convert the column that is too large (--unit and "
+                "--scale change both alike)."
+            )
+        if offset > moved + 2.0 * swing:
+            raise LogError(
+                f"{seen}, and its position moves {ratio:.3g} times as far as its command, but "
+                f"{offset:.3g} away from it: the two have different zeros, so that no unit of the "
+                "file fits both; shift one of the columns."
+            )
     raise LogError(
-        f"{log.source or 'log'}: {joint} is read in radians and {excess}, more than a joint "
-        "turns; the file is probably in degrees (--unit deg, or convert it)."
+        f"{seen}; the file is probably in degrees (--unit deg; --scale {joint}="
+        f"{ANGLE_UNITS['deg']:.6f} if this joint alone is; or convert it)."
     )
 
 

@@ -34,6 +34,9 @@ _SAMPLES = 3
 """Rows of a log that a guess shows."""
 _USUAL_HZ = (20.0, 5_000.0)
 """Rates that logs usually have [Hz], by which the unit of time is told where no name says it."""
+_UNIT_FACTOR = 2.0
+"""Largest factor between the travel of a position over its command's and the number of degrees in a
+radian that makes them columns of two units: a joint amplifies its command at its resonance."""
 _LEAST_DEGREES = 1.0
 """Travel below which a command is not in degrees: gears have more backlash [deg]."""
 _LEAST_RADIANS = 0.02
@@ -592,6 +595,30 @@ def _joints_of_two_units(values: Mapping[str, Array], robot: RobotSpec | None) -
     return "", ""
 
 
+def _joint_of_two_units(values: Mapping[str, Array]) -> tuple[str, float]:
+    """Find a joint whose position moves as if in degrees beside a command in radians, or reversed.
+
+    Args:
+        values: Angles in the file's unit by `command.JOINT` and `position.JOINT`, shape (n,).
+
+    Returns:
+        The joint, and the travel of its position over that of its command; an empty name and 1
+        where there is none.
+    """
+    for reading, command in values.items():
+        quantity, _, joint = reading.partition(".")
+        position = values.get(f"position.{joint}")
+        travel = float(np.ptp(command))
+        if quantity != "command" or position is None or travel == 0.0:
+            continue
+        ratio = float(np.ptp(position)) / travel
+        in_degrees = 1.0 / _UNIT_FACTOR < ratio * ANGLE_UNITS["deg"] < _UNIT_FACTOR
+        command_in_degrees = 1.0 / _UNIT_FACTOR < ratio / ANGLE_UNITS["deg"] < _UNIT_FACTOR
+        if in_degrees or (command_in_degrees and travel >= _LEAST_DEGREES):
+            return joint, ratio
+    return "", 1.0
+
+
 def unit_by_values(
     values: Mapping[str, Array],
     robot: RobotSpec | None,
@@ -615,6 +642,15 @@ def unit_by_values(
         farthest = max(farthest, float(np.abs(angles).max()))
         if reading.startswith("command.") or travel == 0.0:
             travel = max(travel, float(np.ptp(angles)))
+    joint, ratio = _joint_of_two_units(values)
+    if joint:
+        questions.append(
+            f"the position of {joint} moves {ratio:.3g} times as far as its command; if one of the "
+            "two is in degrees and the other in radians, convert one; if the command is a torque, "
+            f"name the right column with --columns; if {joint} was held, or its position is that "
+            "of the motor before a gear, give --unit rad or --unit deg"
+        )
+        return ""
     joint_in_degrees, joint_in_radians = _joints_of_two_units(values, robot)
     if joint_in_degrees:
         questions.append(

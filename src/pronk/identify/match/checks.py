@@ -30,6 +30,25 @@ from pronk.robots.robot import Joint, RobotSpec
 
 DEGREES = 180.0 / math.pi
 """Degrees in a radian, the factor by which a wrong unit scales a column."""
+TURN = 2.0 * math.pi
+"""Radians in a turn."""
+COLUMN_UNITS = (
+    (DEGREES, "degrees", "radians"),
+    (1.0 / DEGREES, "radians", "degrees"),
+    (TURN, "radians", "turns"),
+    (1.0 / TURN, "turns", "radians"),
+    (360.0, "degrees", "turns"),
+    (1.0 / 360.0, "turns", "degrees"),
+)
+"""Gains of the slow response of a joint whose columns have two units: gain, unit of the position,
+unit of the command."""
+UNIT_TOLERANCE = 0.05
+"""Largest relative difference of the gain of a slow response from one of `COLUMN_UNITS` that looks
+like these units. Most drives follow slow commands within it, and a gear of 50 : 1 is outside of it
+for a position of the motor."""
+FOLLOWS = 2.0
+"""Largest factor between the motions of a joint and of its command in one unit, at low frequency,
+where no other cause is to be told from them."""
 LEAST_DEGREES = 0.7
 """Least half of the travel of a command that may be in degrees: 0.7 degrees, 0.012 rad, are less
 than the dry friction of most drives lets through, and 0.7 rad are more than most joints are
@@ -108,9 +127,9 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
         robot: The robot.
 
     Returns:
-        Flags, one sentence each: too few samples, another clock, a joint that stands still or moves
-        farther than commanded, a measured torque at the effort limit. Empty for a joint whose
-        unit is not radians.
+        Flags, one sentence each: too few samples, another clock, a joint that stands still, is
+        commanded too little or moves farther than commanded, a measured torque at the effort limit.
+        Empty for a joint whose unit is not radians.
 
     Raises:
         LogError: Another joint moved, a sign is flipped, or angles are in degrees.
@@ -121,7 +140,7 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
             continue
         joint = robot.joint(excitation.joint)
         for problem in (
-            wrong_joint(excitation),
+            wrong_joint(excitation, robot),
             wrong_unit(excitation, joint),
             wrong_sign(excitation, joint),
         ):
@@ -131,6 +150,7 @@ def check_excitations(excitations: Sequence[Excitation], robot: RobotSpec) -> tu
         for flag in (
             position_jump(excitation, joint),
             standstill(excitation, joint),
+            small_command(excitation),
             slow_gain(excitation, robot),
             too_few_samples(excitation, joint),
             wrong_clock(excitation, robot.policy_rate_hz),
@@ -150,15 +170,18 @@ def _is_repeated(flag: str, flags: Sequence[str]) -> bool:
 # ---- errors: what makes every number meaningless ----
 
 
-def wrong_joint(excitation: Excitation) -> str:
+def wrong_joint(excitation: Excitation, robot: RobotSpec) -> str:
     """Say how the recorded joint is not the excited one.
 
     The log names another joint, or a joint whose command stands still travelled twice as far as
     the commanded joint and more than half of its command: dynamic coupling of a limb moves its
-    other joints less than the excited one.
+    other joints less than the excited one. The slow responses tell the cause where they can: the
+    columns are exchanged if the other joint follows this command and the commanded one does not,
+    and a joint whose position is 180 / pi times its own command has columns of two units.
 
     Args:
         excitation: Excitation of a joint.
+        robot: The robot.
 
     Returns:
         What was seen and the way out; empty if nothing contradicts the joint.
@@ -177,12 +200,102 @@ def wrong_joint(excitation: Excitation) -> str:
     largest = max(0.5 * command_travel[column], 2.0 * travel[column])
     for other, name in enumerate(log.joints):
         commanded = other == column or command_travel[other] > 0.0
-        if not commanded and log.unit(name) == "rad" and travel[other] > largest:
-            return (
-                f"{name} moved by {travel[other]:.2g} rad while {excitation.joint} was commanded; "
-                f"the columns are another joint's: {remedy}"
-            )
+        if commanded or log.unit(name) != "rad" or travel[other] <= largest:
+            continue
+        seen = f"{name} moved by {travel[other]:.2g} rad while {excitation.joint} was commanded"
+        return f"{seen}; {_cause_of_motion(excitation, name, robot, remedy)}"
     return ""
+
+
+def _cause_of_motion(excitation: Excitation, other: str, robot: RobotSpec, remedy: str) -> str:
+    """Say why a joint may have moved farther than the excited one.
+
+    Args:
+        excitation: Excitation of a joint.
+        other: The joint that moved, whose command stood still.
+        robot: The robot.
+        remedy: The way out where columns are exchanged.
+
+    Returns:
+        The cause if the slow responses show it, else what would look so; with the way out.
+    """
+    log = excitation.log
+    joint = robot.joint(excitation.joint)
+    if other in log.excited_joints and other in robot.joint_names:
+        for other_excitation in log.excitations(other):
+            other_gain = abs(slow_response(other_excitation, robot.joint(other)))
+            if _is_in_degrees(other_gain):
+                return f"where {other} is commanded, {_two_units(other_gain)}"
+    gain = abs(slow_response(excitation, joint))
+    follows = 1.0 / FOLLOWS < gain < FOLLOWS
+    other_position = log.position[excitation.samples, log.column(other)]
+    other_gain = abs(slow_gain_of(excitation, joint, other_position))
+    if not follows and 1.0 / FOLLOWS < other_gain < FOLLOWS:
+        return (
+            f"at low frequency it moves {other_gain:.2g} times as far as that command, which "
+            f"{excitation.joint} does not follow, so the columns are another joint's: {remedy}"
+        )
+    causes = f"something else that moves {other}, as a hand, or a drive that is off"
+    units = (
+        "joints of two units in one file (--unit rad, with --scale "
+        f"JOINT={1.0 / DEGREES:.6f} for each joint in degrees)"
+    )
+    if not follows:
+        if _column_units(gain):
+            units = f"{_looks_of_two_units(gain)}, {units}"
+        return (
+            "so would look, and this log does not tell them apart: columns of another joint "
+            f"({remedy}), {units}, and {causes}"
+        )
+    swing = 0.5 * float(np.ptp(excitation.command))
+    small = ""
+    if swing * DEGREES < LEAST_DEGREES:
+        small = (
+            f" Its command swings by {swing:.2g} rad, {swing * DEGREES:.2g} degrees, as one in "
+            "radians that is read in degrees does"
+        )
+    return (
+        f"{excitation.joint} follows its command ({gain:.2g} times at low frequency), so the "
+        f"columns are its own. So would look, and this log does not tell them apart: {units}, and "
+        f"{causes}.{small}"
+    )
+
+
+def _column_units(gain: float) -> tuple[str, str] | None:
+    """Return the units of position and command whose ratio a gain is; None if it is none."""
+    for ratio, position_unit, command_unit in COLUMN_UNITS:
+        if abs(gain / ratio - 1.0) < UNIT_TOLERANCE:
+            return position_unit, command_unit
+    return None
+
+
+def _is_in_degrees(gain: float) -> bool:
+    """Return True if a position is so many times its command that its unit must be degrees."""
+    units = _column_units(gain)
+    return units is not None and units[0] == "degrees" and gain > 1.0
+
+
+def _looks_of_two_units(gain: float) -> str:
+    """Return in words the units whose ratio a gain is, which is near one of `COLUMN_UNITS`."""
+    units = _column_units(gain)
+    assert units is not None
+    position_unit, command_unit = units
+    return (
+        f"a position in {position_unit} beside a command in {command_unit} ({gain:.3g} times the "
+        "command at low frequency)"
+    )
+
+
+def _two_units(gain: float) -> str:
+    """Say that a position in degrees stands beside a command in another unit."""
+    units = _column_units(gain)
+    assert units is not None
+    position_unit, command_unit = units
+    return (
+        f"the position is {gain:.3g} times the command at low frequency, so that it is in "
+        f"{position_unit} and the command in {command_unit}: convert one of the two columns "
+        "(--unit and --scale change both alike)"
+    )
 
 
 def wrong_unit(excitation: Excitation, joint: Joint) -> str:
@@ -193,7 +306,8 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
     slow commands with a gain near 1. A position that is 180 / pi times too small is also that of a
     joint at rest which the excited one shakes; its command is in degrees only if it is large enough
     for that (`LEAST_DEGREES`). A larger command may still be one in radians of a joint that
-    something holds; the two look alike, and both are named.
+    something holds; the two look alike, and both are named. A command outside of the range may also
+    be of another zero, unless it travels farther than the joint can.
 
     Args:
         excitation: Excitation of a joint.
@@ -202,30 +316,50 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
     Returns:
         What was seen and the way out; empty if the unit fits.
     """
-    remedy = "degrees are read as radians: read the log with unit deg"
     command = excitation.command
     lowest = float(command.min())
     highest = float(command.max())
     low, high = joint.range
-    outside = lowest < low - 1.0 or highest > high + 1.0
-    fits_in_degrees = low <= lowest / DEGREES and highest / DEGREES <= high
-    if outside and fits_in_degrees:
-        return (
-            f"the command goes from {lowest:.3g} to {highest:.3g}, the joint from {low:.3g} to "
-            f"{high:.3g} rad; {remedy}"
-        )
     gain = abs(slow_response(excitation, joint))
-    position_in_degrees = 0.5 < gain / DEGREES < 2.0
-    command_in_degrees = 0.5 < gain * DEGREES < 2.0 and 0.5 * (highest - lowest) > LEAST_DEGREES
-    if position_in_degrees:
-        return f"at low frequency the position is {gain:.3g} times the command; {remedy}"
-    if command_in_degrees:
+    if _is_in_degrees(gain):
+        return _two_units(gain)
+    if 1.0 / FOLLOWS < gain / DEGREES < FOLLOWS:
+        return (
+            f"at low frequency the position is {gain:.3g} times the command; so would look, and "
+            "this log does not tell them apart: a position in degrees beside a command in radians, "
+            "and a position of the motor, before its gear: convert the position"
+        )
+    large = 0.5 * (highest - lowest) > LEAST_DEGREES
+    if 1.0 / FOLLOWS < gain * DEGREES < FOLLOWS and large:
         return (
             f"at low frequency the position is {gain:.3g} times the command; either the command is "
             "in degrees and the position in radians: convert the command, or the joint is stuck "
             "or held: free it and record again"
         )
-    return ""
+    outside = lowest < low - 1.0 or highest > high + 1.0
+    fits_in_degrees = low <= lowest / DEGREES and highest / DEGREES <= high
+    if not (outside and fits_in_degrees):
+        return ""
+    seen = (
+        f"the command goes from {lowest:.3g} to {highest:.3g}, the joint from {low:.3g} to "
+        f"{high:.3g} rad"
+    )
+    degrees = (
+        f"read the log with --unit deg, or with --scale {joint.name}={1.0 / DEGREES:.6f} if this "
+        "joint alone is in degrees"
+    )
+    if highest - lowest > high - low + 2.0:
+        return f"{seen}; degrees are read as radians: {degrees}"
+    other_causes = (
+        "another zero than that of the robot's file, columns of another joint, and a range in the "
+        "robot's file that is too small"
+    )
+    if not large:
+        return f"{seen}; so would look, and this log does not tell them apart: {other_causes}"
+    return (
+        f"{seen}; so would look, and this log does not tell them apart: degrees that are read as "
+        f"radians ({degrees}), {other_causes}"
+    )
 
 
 def wrong_sign(excitation: Excitation, joint: Joint) -> str:
@@ -248,10 +382,7 @@ def wrong_sign(excitation: Excitation, joint: Joint) -> str:
 
 
 def slow_response(excitation: Excitation, joint: Joint) -> complex:
-    """Compute the response of a joint to the slow part of its command.
-
-    `sum(conj(U) Y) / sum(conj(U) U)` over the excited frequencies from `LOWEST_HZ` to a fifth of
-    the joint's band, for the spectra U of the command and Y of the position.
+    """Compute the response of a joint to the slow part of its command, as `slow_gain_of` does.
 
     Args:
         excitation: Excitation of a joint.
@@ -260,10 +391,27 @@ def slow_response(excitation: Excitation, joint: Joint) -> complex:
     Returns:
         Complex gain; NaN where nothing slow is excited or the motion is not coherent with it.
     """
+    return slow_gain_of(excitation, joint, excitation.position)
+
+
+def slow_gain_of(excitation: Excitation, joint: Joint, motion: Array) -> complex:
+    """Compute the response of some motion to the slow part of a command.
+
+    `sum(conj(U) Y) / sum(conj(U) U)` over the excited frequencies from `LOWEST_HZ` to a fifth of
+    the joint's band, for the spectra U of the command and Y of the motion.
+
+    Args:
+        excitation: Excitation of a joint, which has the command.
+        joint: Its model.
+        motion: Position of this or another joint at the samples of the excitation, shape (n,).
+
+    Returns:
+        Complex gain; NaN where nothing slow is excited or the motion is not coherent with it.
+    """
     time = excitation.time
     grid, step = np.linspace(time[0], time[-1], len(time), retstep=True)
     command = np.interp(grid, time, excitation.command)
-    position = np.interp(grid, time, excitation.position)
+    position = np.interp(grid, time, motion)
     command_spectrum = np.fft.rfft(command - command.mean())
     position_spectrum = np.fft.rfft(position - position.mean())
     hz = np.fft.rfftfreq(len(grid), float(step))
@@ -310,12 +458,38 @@ def standstill(excitation: Excitation, joint: Joint) -> str:
         travel = float(np.ptp(excitation.position[first:stop]))
         slow_standstill = inside_band and travel < STILL_SHARE * float(np.ptp(command))
         if travel == 0.0 or slow_standstill:
+            gain = abs(slow_response(excitation, joint))
+            units = ""
+            if _column_units(gain):
+                units = f"{_looks_of_two_units(gain)}, "
             return (
                 f"standstill: {excitation.joint} does not move at {time[first]:.1f} s while its "
-                "command does; a drive that is off, an encoder that is stuck and friction above "
-                "the torque of the drive all show like this: check them and record again"
+                f"command does; {units}a drive that is off, an encoder that is stuck and friction "
+                "above the torque of the drive all show like this: check them and record again"
             )
     return ""
+
+
+def small_command(excitation: Excitation) -> str:
+    """Say when a command swings by less than `LEAST_DEGREES` degrees.
+
+    So little is lost in the dry friction of most drives. A file in radians that is read in degrees
+    has such commands, and nothing else in it shows the unit.
+
+    Args:
+        excitation: Excitation of a joint.
+
+    Returns:
+        What was seen and the way out; empty for a larger command.
+    """
+    swing = 0.5 * float(np.ptp(excitation.command))
+    if swing * DEGREES >= LEAST_DEGREES:
+        return ""
+    return (
+        f"amplitude: the command swings by {swing:.2g} rad, {swing * DEGREES:.2g} degrees, less "
+        "than the dry friction of most drives lets through; excite it farther, or read the log "
+        "with --unit rad if its angles are in radians"
+    )
 
 
 JUMP_SPEED = 3.0

@@ -320,8 +320,15 @@ def _pose(excitation: Excitation, robot: RobotSpec) -> Array:
         default = robot.joint(name).default_position
         position = pose[robot.joint_names.index(name)]
         if abs(position - default) > _POSE_SLACK:
+            unit = ""
+            if abs(np.rad2deg(position) - default) <= _POSE_SLACK:
+                unit = (
+                    f" The log gives {np.rad2deg(position):.3f} degrees: if its angles are in "
+                    "radians, read it with --unit rad."
+                )
             raise LogError(
                 f"{log.source or 'log'}: {name} was clamped at {position:.3f} rad while {joint} "
                 f"was excited; the bench model of {robot.name} clamps it at {default:.3f} rad."
+                f"{unit}"
             )
     return pose
