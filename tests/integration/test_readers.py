@@ -260,8 +260,27 @@ def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> No
     # The same timestamp with another value is not a duplicate, and stays an error.
     rows[8] = f"{0.01 * 7},0.5,0.5"
     path.write_text("\n".join(["time,position.a,command.a", *rows]))
-    with pytest.raises(LogError, match="repeats the timestamp"):
-        read_log(path, options=ReadOptions(unit="rad", drop_duplicates=True))
+    for drop_duplicates in (False, True):
+        options = ReadOptions(unit="rad", drop_duplicates=drop_duplicates)
+        with pytest.raises(LogError, match="row 10 repeats the timestamp") as caught:
+            read_log(path, options=options)
+        # The option would not mend it, so it is not offered.
+        assert "--drop-duplicates" not in str(caught.value)
+        assert "loses data" in str(caught.value)
+
+
+def test_a_duplicate_with_a_value_that_is_missing_twice_is_one(tmp_path: Path) -> None:
+    time = np.sort(np.append(0.01 * np.arange(50), 0.07))
+    index = np.round(time / 0.01)
+    velocity = np.where(index == 7.0, np.nan, 0.0)[:, None]
+    arrays = {"time": time, "position": 0.1 * index[:, None], "command": 0.1 * index[:, None]}
+    np.savez(tmp_path / "a.npz", velocity=velocity, joints=np.array(["a"]), **arrays)
+    with pytest.raises(LogError, match="--drop-duplicates"):
+        read_log(tmp_path / "a.npz", options=ReadOptions(unit="rad"))
+    # The value is missing still.
+    options = ReadOptions(unit="rad", drop_duplicates=True)
+    with pytest.raises(LogError, match="velocity of a is not finite"):
+        read_log(tmp_path / "a.npz", options=options)
 
 
 def test_an_epoch_clock_begins_at_zero(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.arrays import Array
+from pronk.arrays import Array, Mask
 from pronk.errors import LogError
 from pronk.identify.logs.checks import check_unit, correlation_note
 from pronk.identify.logs.joint_log import JointLog, LogOrigin, check_increasing
@@ -95,11 +95,11 @@ def import_columns(columns: Columns, robot: RobotSpec | None, options: ReadOptio
         command = np.repeat(columns.position[:1], len(columns.time), axis=0)
         notes.append("no commanded position, so the drives count as commanded in torque")
     rows = np.arange(len(columns.time))
-    if options.drop_duplicates:
-        rows = _distinct_rows(columns, command)
-        if len(rows) < len(columns.time):
-            dropped = len(columns.time) - len(rows)
-            notes.append(f"{dropped} rows that repeat the one before were dropped")
+    repeats = _repeated_rows(columns, command)
+    _check_repeats(columns, command, repeats, dropped=options.drop_duplicates)
+    if options.drop_duplicates and repeats.any():
+        rows = np.flatnonzero(~repeats)
+        notes.append(f"{np.count_nonzero(repeats)} rows that repeat the one before were dropped")
 
     time = columns.time[rows]
     seconds = TIME_UNITS[time_unit]
@@ -185,15 +185,71 @@ def _joint_names(
     return names
 
 
-def _distinct_rows(columns: Columns, command: Array) -> NDArray[np.intp]:
-    """Indices of the rows that do not repeat the one before in full."""
-    table = [columns.time, command, columns.position]
+def _quantities(columns: Columns, command: Array) -> dict[str, Array]:
+    """Quantities of the joints in the file by name, shape (n, joints) each."""
+    quantities = {"command": command, "position": columns.position}
     if columns.velocity is not None:
-        table.append(columns.velocity)
+        quantities["velocity"] = columns.velocity
     if columns.torque is not None:
-        table.append(columns.torque)
-    repeats = (np.diff(np.column_stack(table), axis=0) == 0.0).all(axis=1)
-    return np.flatnonzero(np.concatenate(([True], ~repeats)))
+        quantities["torque"] = columns.torque
+    return quantities
+
+
+def _repeated_rows(columns: Columns, command: Array) -> Mask:
+    """Return True for each row that repeats the one before in full, shape (n,)."""
+    repeats = np.concatenate(([False], np.diff(columns.time) == 0.0))
+    for values in _quantities(columns, command).values():
+        is_same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+        repeats[1:] &= is_same.all(axis=1)
+    return repeats
+
+
+def _check_repeats(columns: Columns, command: Array, repeats: Mask, *, dropped: bool) -> None:
+    """Refuse rows that repeat the timestamp of the one before, with a LogError.
+
+    Rows of one time with other values are samples. No option drops them, as that loses data.
+
+    Args:
+        columns: Columns as they stand in the file.
+        command: Their commands in the unit of the file, shape (n, joints).
+        repeats: True for each row that repeats the one before in full, shape (n,).
+        dropped: Whether those rows are dropped.
+    """
+    source = columns.origin.source
+    same_time = np.concatenate(([False], np.diff(columns.time) == 0.0))
+    different = np.flatnonzero(same_time & ~repeats)
+    if len(different):
+        row = int(different[0])
+        difference = _first_difference(columns, command, row)
+        raise LogError(
+            f"{source}: {columns.row(row)} repeats the timestamp {columns.time[row]:.9g} of the "
+            f"one before with other values ({difference}). Of {len(columns.time)} rows "
+            f"{len(different)} do so; they are samples, and to drop them loses data. Timestamps "
+            "that are rounded too coarsely, the times of packets that hold several samples, and "
+            "two recordings in one file look so: write the time of each sample with more digits, "
+            "or split the file."
+        )
+    if repeats.any() and not dropped:
+        row = int(np.argmax(repeats))
+        raise LogError(
+            f"{source}: {columns.row(row)} repeats the timestamp {columns.time[row]:.9g} of the "
+            f"one before; timestamps must increase. Of {len(columns.time)} rows "
+            f"{np.count_nonzero(repeats)} repeat the one before in full, and none has other values "
+            "at the same time: --drop-duplicates drops them."
+        )
+
+
+def _first_difference(columns: Columns, command: Array, row: int) -> str:
+    """Say which quantity of a row first differs from that of the row before."""
+    for quantity, values in _quantities(columns, command).items():
+        for column, (before, after) in enumerate(zip(values[row - 1], values[row], strict=True)):
+            if before == after or (np.isnan(before) and np.isnan(after)):
+                continue
+            name = quantity
+            if columns.joints:
+                name = f"{quantity} of {columns.joints[column]}"
+            return f"{name} {after:.6g} after {before:.6g}"
+    raise ValueError(f"row {row} repeats the one before")
 
 
 def ordered_joints(

@@ -361,7 +361,7 @@ def check_increasing(time: Array, source: str, row: Callable[[int], str]) -> Non
     if time[i] == time[i - 1]:
         raise LogError(
             f"{source}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
-            "must increase (--drop-duplicates drops rows that repeat the one before in full)."
+            "must increase."
         )
     raise LogError(
         f"{source}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
