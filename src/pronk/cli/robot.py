@@ -10,7 +10,7 @@ import tyro
 
 from pronk.cli import console
 from pronk.errors import RobotError
-from pronk.tables import Column, Table
+from pronk.tables import Column, Table, counted
 
 Action = Literal["new", "check"]
 
@@ -54,6 +54,7 @@ def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
     """Write the robot.yaml of a model, and say what cannot be used or is assumed."""
     from pronk.files import require_new, write_text
     from pronk.robots.bare import describe_model, yaml_of_model
+    from pronk.robots.consistency import marked_lines
 
     require_new(target, "--out", overwrite=overwrite, kind=RobotError)
     if target.parent.resolve() != model.parent.resolve():
@@ -71,7 +72,7 @@ def _write_robot(model: Path, target: Path, *, overwrite: bool) -> None:
             assumed.append(name)
     if assumed:
         console.say(f"without a position servo, gains assumed: {', '.join(assumed)}")
-    console.say(f"wrote {target}; {text.count('# CHECK')} of its lines are marked CHECK")
+    console.say(f"wrote {target}; {counted(marked_lines(text), 'line')} of it marked CHECK")
     console.following(f"pronk robot check {shlex.quote(str(target))}")
 
 
@@ -86,7 +87,7 @@ def _held_sentence(names: tuple[str, ...]) -> str:
 def _check_robot(path: Path, *, wide: bool) -> None:
     """Print the joints of a robot, and what is missing or inconsistent."""
     from pronk.robots import load_robot
-    from pronk.robots.consistency import problems_of
+    from pronk.robots.consistency import problems_of, unchecked_lines
     from pronk.robots.model import bench_spec
 
     robot_spec = load_robot(path)
@@ -104,10 +105,23 @@ def _check_robot(path: Path, *, wide: bool) -> None:
         )
         rows.append(row)
     problems = problems_of(robot_spec)
+    marks = unchecked_lines(robot_spec)
     title = f"{robot_spec.name}: {len(robot_spec.joints)} joints"
     console.show(Table(title=title, columns=COLUMNS, rows=tuple(rows)), wide=wide)
     if robot_spec.held_joints:
         console.say(_held_sentence(robot_spec.held_joints))
     for problem in problems:
         console.warn(problem)
-    console.say(f"{len(problems)} to check" if problems else "nothing is inconsistent")
+    to_check = []
+    if marks:
+        console.warn(
+            f"{counted(marks, 'line')} of the robot's file marked CHECK: compare their numbers "
+            "with the data sheet and remove the marks"
+        )
+        to_check.append(f"{counted(marks, 'line')} marked CHECK")
+    if problems:
+        to_check.append(counted(len(problems), "finding"))
+    if to_check:
+        console.say(f"to check: {' and '.join(to_check)}")
+    else:
+        console.say("nothing is inconsistent")

@@ -25,13 +25,27 @@ SAME = 0.01
 """Relative difference up to which two limits are the same."""
 
 
+def marked_lines(text: str) -> int:
+    """Return the number of lines of a robot.yaml that are marked CHECK."""
+    return sum("# CHECK" in line for line in text.splitlines())
+
+
+def unchecked_lines(robot: RobotSpec) -> int:
+    """Return how many lines of the robot's file are still marked CHECK; 0 for a bare model."""
+    path = robot_file_path(robot.source)
+    if path.suffix in MODEL_SUFFIXES:
+        return 0
+    return marked_lines(path.read_text(encoding="utf-8"))
+
+
 def problems_of(robot: RobotSpec) -> list[str]:
     """List what is missing or inconsistent about a robot, a sentence each.
 
     Compared are each effort limit with 0.1 rad of stiffness, with the torque of gravity in the
     default pose and with the limit of the model; the speed limit with that of a URDF; the pose
-    with the ranges. Named are the lines of the robot.yaml that are still marked CHECK, rotor
-    inertia and dry friction of 0, and joints without a position servo in the model.
+    with the ranges. Named are numbers of a bare model that are assumed, rotor inertia and dry
+    friction of 0, and joints without a position servo in the model. The lines of a robot.yaml that
+    are marked CHECK are no problems of this list (`unchecked_lines`).
     """
     path = robot_file_path(robot.source)
     model_path = path
@@ -40,12 +54,6 @@ def problems_of(robot: RobotSpec) -> list[str]:
         problems.extend(_assumed(path))
     else:
         model_path = path.parent / read_robot_file(path).model
-        marks = path.read_text(encoding="utf-8").count("# CHECK")
-        if marks:
-            problems.append(
-                f"{marks} lines of {path.name} are marked CHECK; compare their numbers with the "
-                "data sheet and remove the marks"
-            )
     source = read_source(model_path)
     problems.extend(source.notes)
     gravity = _gravity(robot)
@@ -77,7 +85,8 @@ def _assumed(path: Path) -> list[str]:
     for number, names in by_number.items():
         sentences.append(f"{number} is assumed for {', '.join(names)}")
     if sentences:
-        sentences.append(f"correct these numbers in the file of `pronk robot new {path}`")
+        # Part of the last one, so that there are as many sentences as numbers.
+        sentences[-1] += f"; correct such numbers in the file of `pronk robot new {path}`"
     return sentences
 
 
