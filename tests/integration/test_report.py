@@ -241,6 +241,22 @@ def test_a_robot_of_its_own_is_read_from_its_file(tmp_path: Path) -> None:
     assert content["scale"].rows[0][1] == pytest.approx(joint.gains.stiffness.value / 30.0)
 
 
+def test_joints_belong_to_the_groups_of_the_robot_where_it_is_known() -> None:
+    result = match(legs=2)
+    robot = load_robot("mini_cheetah")
+    members = result.joints_of_groups({joint.name: joint for joint in robot.joints})
+    assert list(members) == list(result.groups)
+    for group, names in members.items():
+        assert names == [joint.name for joint in robot.group(group) if joint.name in result.joints]
+    # Joints of the robot's file may be called anything.
+    renamed = {}
+    for joint in robot.joints:
+        renamed[joint.name] = replace(joint, group="knee")
+    assert result.joints_of_groups(renamed)["knee"] == list(result.joints)
+    # Without the file the names alone tell.
+    assert result.joints_of_groups({}) == members
+
+
 def test_the_curves_of_a_chart_are_those_of_the_responses(tmp_path: Path) -> None:
     result = match(legs=1)
     page = match_report(write_match(tmp_path, result))

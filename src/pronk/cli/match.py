@@ -18,7 +18,6 @@ from pronk.exit_status import ExitStatus
 
 if TYPE_CHECKING:
     from pronk.identify.match.result import MatchResult
-    from pronk.robots.robot import RobotSpec
     from pronk.tables import Table
 
 Mode = Literal["gains", "drive"]
@@ -146,7 +145,7 @@ def match_command(
             result_paths.append(folder / "match.npz")
 
     result = results[simulator]
-    members = joints_of_groups(robot_spec, result)
+    members = result.joints_of_groups({joint.name: joint for joint in robot_spec.joints})
     figures = summary(result)
     # Where frameworks are named, their gains are wanted, and those of the simulator are an extra.
     named_first = [*frameworks, simulator]
@@ -304,17 +303,6 @@ def by_torque_alone(result: MatchResult) -> bool:
         if joint.responses is not None or not math.isnan(joint.fit.rmse):
             return False
     return True
-
-
-def joints_of_groups(robot: RobotSpec, result: MatchResult) -> dict[str, list[str]]:
-    """Return the names of the matched joints of each joint group."""
-    members: dict[str, list[str]] = {}
-    for group in result.groups:
-        members[group] = []
-        for joint in robot.group(group):
-            if joint.name in result.joints:
-                members[group].append(joint.name)
-    return members
 
 
 def has_compared_responses(result: MatchResult) -> bool:

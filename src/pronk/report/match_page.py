@@ -144,7 +144,7 @@ def _content(
     fitted_together = any(joint.fit.moved_together for joint in result.joints.values())
     has_grid = any(joint.grid is not None for joint in result.joints.values())
     robot_joints = _robot_joints(result)
-    members = _members(result, robot_joints)
+    members = result.joints_of_groups(robot_joints)
     drive_gains = {name: (joint.stiffness, joint.damping) for name, joint in robot_joints.items()}
     for name, joint_result in result.joints.items():
         if joint_result.drive_gains is not None:
@@ -258,22 +258,6 @@ def _robot_joints(result: MatchResult) -> dict[str, Joint]:
     except PronkError:
         return {}
     return {joint.name: joint for joint in robot.joints if joint.name in result.joints}
-
-
-def _members(result: MatchResult, robot_joints: Mapping[str, Joint]) -> dict[str, list[str]]:
-    """Return the matched joints of each group, by the robot or, if unknown, by their names."""
-    members: dict[str, list[str]] = {}
-    for group in result.groups:
-        names = []
-        for name in result.joints:
-            if name in robot_joints:
-                belongs = robot_joints[name].group == group
-            else:
-                belongs = name.endswith(group)
-            if belongs:
-                names.append(name)
-        members[group] = names
-    return members
 
 
 def _is_papers(result: MatchResult) -> bool:

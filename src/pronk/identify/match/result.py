@@ -30,7 +30,7 @@ from pronk.identify.match.gains import (
 from pronk.identify.match.parameters import GAINS, PARAMETERS
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.robots.model import bench_inertia
-from pronk.robots.robot import RobotSpec
+from pronk.robots.robot import Joint, RobotSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -260,6 +260,25 @@ class MatchResult:
             if joint.gains.matched:
                 matched.append(name)
         return tuple(matched)
+
+    def joints_of_groups(self, robot_joints: Mapping[str, Joint]) -> dict[str, list[str]]:
+        """Return the names of the matched joints of each joint group, in the robot's order.
+
+        Args:
+            robot_joints: The robot's joints by name. One that is not known, as of a robot whose
+                file is gone, belongs to the group whose name its own ends with.
+        """
+        members: dict[str, list[str]] = {}
+        for group in self.groups:
+            members[group] = []
+            for name in self.joints:
+                if name in robot_joints:
+                    belongs = robot_joints[name].group == group
+                else:
+                    belongs = name.endswith(group)
+                if belongs:
+                    members[group].append(name)
+        return members
 
     @property
     def not_better(self) -> bool:
