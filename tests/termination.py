@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from repetition import meanwhile
 
 
 @contextmanager
@@ -18,21 +19,18 @@ def terminated(is_due: Callable[[], bool], handler: Any = signal.SIG_IGN) -> Ite
         is_due: Whether the signal is to be sent; asked again and again.
         handler: What the process does with a signal for which the block sets no handler of its own.
     """
-    over = threading.Event()
+    sent = False
 
     def terminate() -> None:
-        while not over.wait(0.05):
-            if is_due():
-                os.kill(os.getpid(), signal.SIGTERM)
-                return
+        nonlocal sent
+        if not sent and is_due():
+            sent = True
+            os.kill(os.getpid(), signal.SIGTERM)
 
     # After the block the signal would end the tests.
     handler_before = signal.signal(signal.SIGTERM, handler)
-    thread = threading.Thread(target=terminate)
-    thread.start()
     try:
-        yield
+        with meanwhile(terminate, 0.05):
+            yield
     finally:
-        over.set()
-        thread.join()
         signal.signal(signal.SIGTERM, handler_before)

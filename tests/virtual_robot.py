@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -84,24 +81,6 @@ def connected(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobo
     machine = VirtualRobot(ROBOT, sim_params, **options)
     machine.connect()
     return machine
-
-
-@contextmanager
-def meanwhile(act: Callable[[], object], period_s: float) -> Iterator[None]:
-    """Repeat something in another thread."""
-    done = threading.Event()
-
-    def loop() -> None:
-        while not done.wait(period_s):
-            act()
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def gains(stiffness: float = 17.0, damping: float = 0.4) -> dict[str, Any]:

@@ -35,7 +35,8 @@ from pronk.deploy.links.link import Freshness, LinkSettings, wait_for
 from pronk.errors import HardwareError, RobotError
 from pronk.jump.virtual.robot import hold_of
 from pronk.robots.machine import Command
-from virtual_robot import ROBOT, connected, meanwhile
+from repetition import meanwhile
+from virtual_robot import ROBOT, connected
 
 pytestmark = pytest.mark.live
 

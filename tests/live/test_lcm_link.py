@@ -30,7 +30,8 @@ from pronk.deploy.links.link import Freshness, LinkSettings, wait_for
 from pronk.errors import HardwareError
 from pronk.jump.virtual.robot import hold_of
 from pronk.robots.machine import Command, State
-from virtual_robot import ROBOT, connected, meanwhile
+from repetition import meanwhile
+from virtual_robot import ROBOT, connected
 
 pytestmark = pytest.mark.live
 
