@@ -121,6 +121,19 @@ def test_exchanged_columns_are_named(tmp_path: Path) -> None:
         assert "--scale" not in error
 
 
+@pytest.mark.parametrize(("gain", "may_be_another"), [(-1.0, False), (-0.1, True)])
+def test_a_joint_that_is_pushed_the_other_way_has_no_flipped_sign_for_sure(
+    tmp_path: Path, gain: float, may_be_another: bool
+) -> None:
+    table = columns()
+    for name in ("command.FR_hip_pitch", "position.FR_hip_pitch"):
+        del table[name]
+    table["position.FR_knee"] *= gain
+    error = sentence(read(write(tmp_path / "a.csv", table), "rad"), "FR_knee")
+    assert "sign" in error
+    assert ("--joint-order" in error) is may_be_another
+
+
 def test_a_joint_that_is_pushed_is_no_exchanged_one(tmp_path: Path) -> None:
     table = columns()
     time = table["time"]

@@ -365,6 +365,9 @@ def wrong_unit(excitation: Excitation, joint: Joint) -> str:
 def wrong_sign(excitation: Excitation, joint: Joint) -> str:
     """Say how the position has the other sign than the command: `cos(phase) < OPPOSITE`.
 
+    A sign is flipped where the position moves about as far as the command. A joint that moves far
+    less may be another one, which the excited joint pushes the other way.
+
     Args:
         excitation: Excitation of a joint.
         joint: Its model.
@@ -373,12 +376,19 @@ def wrong_sign(excitation: Excitation, joint: Joint) -> str:
         What was seen and the way out; empty if the signs agree.
     """
     response = slow_response(excitation, joint)
-    if response.real < OPPOSITE * abs(response):
-        return (
-            "at low frequency the position moves against the command; a sign is flipped: negate "
-            "the position or the command when reading"
-        )
-    return ""
+    gain = abs(response)
+    if not response.real < OPPOSITE * gain:
+        return ""
+    seen = "at low frequency the position moves against the command"
+    remedy = "negate the position or the command when reading"
+    if 1.0 / FOLLOWS < gain < FOLLOWS:
+        return f"{seen}; a sign is flipped: {remedy}"
+    return (
+        f"{seen}, {gain:.2g} times as far; so would look, and this log does not tell them apart: a "
+        f"flipped sign ({remedy}) beside another scale or a drive that is far too weak, and the "
+        "column of another joint, which the excited one pushes the other way (--joint-order, "
+        "--joint-names)"
+    )
 
 
 def slow_response(excitation: Excitation, joint: Joint) -> complex:
