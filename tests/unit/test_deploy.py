@@ -811,8 +811,12 @@ def test_a_gamepad(tmp_path: Path) -> None:
     assert not moved(0.72).jump
     assert moved(0.8, (1, 1, 5)).jump
     assert not moved(1.4).jump
+    # So does one whose begin and end are read together.
+    assert moved(2.0, (0, 1, 5), (1, 1, 5), (0, 1, 5)).jump
+    assert moved(2.4).jump
+    assert not moved(2.6).jump
     os.close(wire)
-    command = moved(1.5)
+    command = moved(2.7)
     assert not command.dead_man, "unplugged"
     assert command.command == (0.0, 0.0, 0.0)
     pad.close()

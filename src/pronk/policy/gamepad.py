@@ -105,7 +105,6 @@ class GamepadReader:
         self._connected = True
         self._axes: dict[int, float] = {}
         self._buttons: dict[int, bool] = {}
-        self._jump_held = False
         self._jump_pressed_at = -1e9
 
     def close(self) -> None:
@@ -124,10 +123,9 @@ class GamepadReader:
                     pressed.append(number)
         if not self._connected:
             return GamepadInput(pressed=tuple(pressed))
-        jump_held = self._buttons.get(GamepadButton.RIGHT_BUMPER, False)
-        if jump_held and not self._jump_held:
+        # Of a press whose end is read with its begin, the state of the button shows nothing.
+        if GamepadButton.RIGHT_BUMPER in pressed:
             self._jump_pressed_at = now
-        self._jump_held = jump_held
         forward, left, yaw_rate = COMMANDS
         return GamepadInput(
             velocity=(
