@@ -84,7 +84,7 @@ def test_countermovement_of_the_go2_is_within_reach() -> None:
     settings = motion_command(nominal()).cfg.settings
     since = torch.linspace(0.0, settings.prompt_s, 200, dtype=torch.float64)
     length = standing_leg(BODY) + settings.countermovement(since)
-    pitch, knee = leg_angles(BODY, length)
+    pitch, knee = leg_angles(BODY, "FR", length)
     assert pitch[0].item() == pytest.approx(BODY.default_position["hip_pitch"], abs=1e-3)
     assert knee[0].item() == pytest.approx(BODY.default_position["knee"], abs=1e-3)
     foot = BODY.thigh_length * pitch.sin() + BODY.shank_length * (pitch + knee).sin()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -9,8 +10,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots import load_robot, robot_version
+from pronk.robots.robot import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +27,12 @@ class Legged:
     leg_joints: tuple[str, ...]
     """Joints of a leg from the hip down, without the prefix."""
     default_position: dict[str, float]
-    """Position of each joint of a leg in the default pose [rad]."""
+    """Position of each joint of the first leg in the default pose [rad]."""
+    leg_poses: dict[str, dict[str, float]]
+    """Position of each joint in the default pose [rad], by the prefix of the leg."""
+    forward: float
+    """Sign of the turn of a hip pitch that moves a foot below it forwards: 1 for an axis to the
+    right, -1 for one to the left."""
     thigh_length: float
     """Distance from the axis of the thigh's joint to the knee, in the plane of the leg [m]."""
     shank_length: float
@@ -32,7 +40,7 @@ class Legged:
     foot_radius: float
     """Radius of the spherical foot [m]."""
     standing_height: float
-    """Height of the base over the floor in the default pose [m]."""
+    """Height of the base over the floor that the lowest foot stands on in the default pose [m]."""
     total_mass: float
     """Mass of the whole robot [kg]."""
     base_mass: float
@@ -57,31 +65,89 @@ def _read_legged(path: Path, _modified_ns: int, _model_modified_ns: int) -> Legg
     robot = load_robot(path)
     if not robot.legs:
         raise RobotError(f"{robot.name} has no legs; name them as `legs` in its robot.yaml.")
-    leg = f"{robot.legs[0]}_"
-    joints = [joint for joint in robot.joints if joint.name.startswith(leg)]
     model = robot.build_spec().compile()
-    shank = model.joint(joints[-1].name).bodyid[0]
-    is_sphere = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
-    feet = np.flatnonzero(is_sphere & (model.geom_bodyid == shank))
-    if not len(feet):
-        raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
     shanks = {}
-    for prefix in robot.legs:
-        last_joint = [joint for joint in robot.joint_names if joint.startswith(f"{prefix}_")][-1]
-        shanks[prefix] = model.body(model.joint(last_joint).bodyid[0]).name
+    leg_poses = {}
+    feet = []
+    for leg in robot.legs:
+        joints = [joint for joint in robot.joints if joint.name.startswith(f"{leg}_")]
+        leg_poses[leg] = {
+            joint.name.removeprefix(f"{leg}_"): joint.default_position for joint in joints
+        }
+        shank = model.joint(joints[-1].name).bodyid[0]
+        shanks[leg] = model.body(shank).name
+        is_sphere = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+        spheres = np.flatnonzero(is_sphere & (model.geom_bodyid == shank))
+        if not len(spheres):
+            raise RobotError(f"{robot.name}: the leg {leg} has no sphere as its foot.")
+        feet.append(int(spheres[-1]))
     base = model.body(robot.base_body)
-    default_position = {}
-    for joint in joints:
-        default_position[joint.name.removeprefix(leg)] = joint.default_position
+    default_position = leg_poses[robot.legs[0]]
+    first_shank = model.body(shanks[robot.legs[0]]).id
     return Legged(
         legs=robot.legs,
         shanks=shanks,
         leg_joints=tuple(default_position),
         default_position=default_position,
-        thigh_length=float(-model.body_pos[shank, 2]),
-        shank_length=float(-model.geom_pos[feet[-1], 2]),
-        foot_radius=float(model.geom_size[feet[-1], 0]),
-        standing_height=float(base.pos[2]),
+        leg_poses=leg_poses,
+        forward=_forward(robot, model),
+        thigh_length=float(-model.body_pos[first_shank, 2]),
+        shank_length=float(-model.geom_pos[feet[0], 2]),
+        foot_radius=float(model.geom_size[feet[0], 0]),
+        standing_height=_standing_height(robot, model, feet),
         total_mass=float(np.sum(model.body_mass)),
         base_mass=float(base.mass[0]),
     )
+
+
+def other_side(leg: str) -> str:
+    """Return the leg on the other side, as HL for HR."""
+    return leg[0] + ("L" if leg[1] == "R" else "R")
+
+
+def posed(
+    robot: RobotSpec, model: mujoco.MjModel, position: Mapping[str, float]
+) -> tuple[mujoco.MjData, Array]:
+    """Put a robot into a pose.
+
+    Args:
+        robot: The robot.
+        model: Its compiled model.
+        position: Position of each joint [rad].
+
+    Returns:
+        The kinematics, and the axes of the base as rows, which turn the world's vectors into its
+        frame, (3, 3).
+    """
+    data = mujoco.MjData(model)
+    for name, angle in position.items():
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data, data.xmat[model.body(robot.base_body).id].reshape(3, 3).T
+
+
+def default_pose(robot: RobotSpec) -> dict[str, float]:
+    """Return the position of each joint in the default pose [rad]."""
+    return {joint.name: joint.default_position for joint in robot.joints}
+
+
+def _forward(robot: RobotSpec, model: mujoco.MjModel) -> float:
+    """Return the sign of the turn of the first thigh that moves a foot below it forwards."""
+    data, to_base = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+    joints = [name for name in robot.joint_names if name.startswith(f"{robot.legs[0]}_")]
+    thigh_joint = joints[-2] if len(joints) > 1 else joints[-1]
+    axis = to_base @ data.xaxis[model.joint(thigh_joint).id]
+    return -1.0 if axis[1] > 0.0 else 1.0
+
+
+def _standing_height(robot: RobotSpec, model: mujoco.MjModel, feet: Sequence[int]) -> float:
+    """Return the height of the base over the lowest point of its feet in the default pose [m].
+
+    The height at which the model has its base is another one where the file has the robot above
+    the floor, or its base at the origin as a URDF has it.
+    """
+    data, to_base = posed(robot, model, default_pose(robot))
+    origin = data.xpos[model.body(robot.base_body).id]
+    lowest = min(float((to_base @ (data.geom_xpos[foot] - origin))[2]) for foot in feet)
+    return float(model.geom_size[feet[0], 0]) - lowest

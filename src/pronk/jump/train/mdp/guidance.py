@@ -21,11 +21,12 @@ _DIFFERENCE = 1e-4
 """Time step of the finite difference that gives joint velocities [s]."""
 
 
-def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
+def leg_angles(body: Legged, leg: str, length: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the angles of a leg whose foot is below its hip, bent as in the default pose.
 
     Args:
         body: Dimensions of the robot.
+        leg: Prefix of the leg: its knee bends to the side to which it is bent in the default pose.
         length: Distance from the axis of the hip pitch to the foot [m], at most that of a straight
             leg; any shape.
 
@@ -37,7 +38,7 @@ def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = torch.arccos(cosine.clamp(-1.0, 1.0))
     pitch = -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos())
-    sign = 1.0 if body.default_position["knee"] >= 0.0 else -1.0
+    sign = 1.0 if body.leg_poses[leg]["knee"] >= 0.0 else -1.0
     return sign * pitch, sign * knee
 
 
@@ -63,7 +64,7 @@ def guidance(
     """
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
-    default = torch.tensor([body.default_position[name] for name in body.leg_joints]).double()
+    default = _default_angles(body)
     pose = _countermovement_angles(body, settings, time)
     later_pose = _countermovement_angles(body, settings, time + _DIFFERENCE)
     earlier_pose = _countermovement_angles(body, settings, time - _DIFFERENCE)
@@ -71,11 +72,10 @@ def guidance(
     force = (0.25 * body.total_mass * (upwards + GRAVITY)).clamp_min(0.0)
     torque = torch.zeros_like(pose)
     # The force passes through the hip; the knee is beside it by the thigh's horizontal part.
-    torque[:, 2] = force * body.thigh_length * pose[:, 1].sin()
-    legs = len(body.legs)
-    offset = (pose - default).repeat(1, legs)
-    torque = torque.repeat(1, legs)
-    change = (later_pose - earlier_pose).repeat(1, legs)
+    torque[:, :, 2] = force[:, None] * body.thigh_length * pose[:, :, 1].sin()
+    offset = (pose - default).flatten(1)
+    torque = torque.flatten(1)
+    change = (later_pose - earlier_pose).flatten(1)
     damping_torque = damping.double().cpu() * change / (2.0 * _DIFFERENCE)
     added = offset + (torque + damping_torque) / stiffness.double().cpu()
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)
@@ -86,8 +86,8 @@ def foot_sweep(body: Legged, settings: JumpSettings, dt: float) -> Tensor:
 
     A standing foot stays where it is while the trunk passes over it. The trunk is over the foot in
     the middle of the push, and the sweep begins with it: a foot is then ahead of its hip by half of
-    the way of the push, and behind it by as much at the lift-off. Positive angles of the hip pitch
-    move the foot forwards, in the sense in which a positive knee moves it.
+    the way of the push, and behind it by as much at the lift-off. To which side the knees bend is
+    nothing to the sweep.
 
     Args:
         body: Dimensions of the robot.
@@ -102,14 +102,25 @@ def foot_sweep(body: Legged, settings: JumpSettings, dt: float) -> Tensor:
     middle = settings.fall_s + 0.5 * push_s
     ahead = (middle - time).clamp(-0.5 * push_s, 0.5 * push_s)  # at 1 m/s [m]
     length = standing_leg(body) + settings.countermovement(time)
-    sign = 1.0 if body.default_position["knee"] >= 0.0 else -1.0
     angles = torch.zeros(len(time), len(body.leg_joints), dtype=torch.float64)
-    angles[:, body.leg_joints.index("hip_pitch")] = sign * torch.atan(ahead / length)
+    angles[:, body.leg_joints.index("hip_pitch")] = body.forward * torch.atan(ahead / length)
     offsets = angles.repeat(1, len(body.legs))
     return torch.cat((offsets, torch.zeros_like(offsets[:1]))).float()
 
 
+def _default_angles(body: Legged) -> Tensor:
+    """Return the angles of the joints of each leg in the default pose [rad], (legs, 3)."""
+    angles = []
+    for leg in body.legs:
+        angles.append([body.leg_poses[leg][joint] for joint in body.leg_joints])
+    return torch.tensor(angles).double()
+
+
 def _countermovement_angles(body: Legged, settings: JumpSettings, time: Tensor) -> Tensor:
-    """Compute the angles of a leg's joints at times after a jump command [rad], (n, 3)."""
-    pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(time))
-    return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)
+    """Compute the angles of all legs at times after a jump command [rad], (n, legs, 3)."""
+    length = standing_leg(body) + settings.countermovement(time)
+    angles = []
+    for leg in body.legs:
+        pitch, knee = leg_angles(body, leg, length)
+        angles.append(torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1))
+    return torch.stack(angles, dim=1)

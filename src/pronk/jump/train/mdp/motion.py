@@ -13,7 +13,7 @@ from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
-from pronk.robots.legged import Legged
+from pronk.robots.legged import Legged, other_side
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -90,11 +90,6 @@ class StepMotion:
         """Leave robots that start a new episode, env_ids (n,), without a step before."""
         self.legs.foot_velocity[env_ids] = 0.0
         self.joints.torque[env_ids] = 0.0
-
-
-def other_side(leg: str) -> str:
-    """Return the leg on the other side, as HL for HR."""
-    return leg[0] + ("L" if leg[1] == "R" else "R")
 
 
 def mirror_joints(body: Legged) -> dict[str, str]:

@@ -27,10 +27,9 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.train.mdp.motion import other_side
 from pronk.jump.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.policy.observation import ESTIMATE, MEASURED
-from pronk.robots.legged import Legged
+from pronk.robots.legged import Legged, other_side
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: len(part) for name, part in MEASURED.items()},
