@@ -89,6 +89,7 @@ def _check_robot(path: Path, *, wide: bool) -> None:
     from pronk.robots import load_robot
     from pronk.robots.consistency import problems_of, unchecked_lines
     from pronk.robots.model import bench_spec
+    from pronk.robots.quadruped import quadruped_problems
 
     robot_spec = load_robot(path)
     rows = []
@@ -125,3 +126,6 @@ def _check_robot(path: Path, *, wide: bool) -> None:
         console.say(f"to check: {' and '.join(to_check)}")
     else:
         console.say("nothing is inconsistent")
+    if robot_spec.legs:
+        for problem in quadruped_problems(robot_spec):
+            console.say(f"not ready for `pronk train`: {problem}")

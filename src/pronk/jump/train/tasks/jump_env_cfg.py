@@ -40,6 +40,7 @@ from pronk.jump.train.tasks.reward_weights import reward_weights
 from pronk.jump.train.tasks.robot_scale import robot_scale
 from pronk.policy.observation import ACTIONS, HISTORY
 from pronk.robots.legged import legged
+from pronk.robots.quadruped import require_quadruped
 from pronk.robots.robot import RobotSpec
 
 FOOT_CONTACT = (0.0105, 1.0)
@@ -71,7 +72,11 @@ def jump_env_cfg(
             by joint are drawn in the ellipse of each joint.
         num_envs: Number of robots.
         seed: Seed of all draws.
+
+    Raises:
+        RobotError: The model lacks something that the task reads.
     """
+    require_quadruped(robot)
     delay = round(gains.delay_s / robot.timestep_s)
     delay_steps = (max(0, delay - DELAY_STEPS), delay + DELAY_STEPS)
     delay_span = None

@@ -1,0 +1,326 @@
+"""What the training task reads of a quadruped's model, and what of it a model lacks.
+
+The task finds joints, feet and limbs by their names, and takes from the model that all legs hang
+straight down where their joints are at zero, that left and right have the same axes, and that
+nothing but the named parts touches the ground. A model that differs would train all the same, with
+wrong lengths, a wrong mirror image or contacts that count for nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from pronk.errors import RobotError
+from pronk.robots.legged import default_pose, other_side, posed
+from pronk.robots.robot import RobotSpec
+
+LEG_JOINTS = ("hip_roll", "hip_pitch", "knee")
+"""Joints of a leg from the hip down, without the prefix."""
+LEG_PARTS = ("thigh_collision", "shank_collision", "foot_collision")
+"""Geoms of a leg that touch the ground, without the prefix."""
+TRUNK = "trunk_collision"
+"""Geom of the trunk."""
+STRAIGHT = 0.05
+"""Largest angle between a thigh or a shank and the vertical with all joints at zero [rad]."""
+PARALLEL = 0.999
+"""Smallest cosine of the angle between an axis and that of the trunk which it has to be."""
+CENTRE = 1e-3
+"""Largest distance of a foot's site from the centre of its sphere [m]."""
+BENT = 0.1
+"""Smallest angle of a knee in the default pose, of which the side that it bends to is read
+[rad]."""
+SAME_POSE = 1e-3
+"""Largest difference of a left and a right joint in the default pose [rad]."""
+STEADY = 0.15
+"""Smallest distance of the centre of mass from the foremost and from the hindmost foot, as a share
+of the distance between these."""
+PAGE = "docs/train-your-robot.md"
+"""Page that has these rules."""
+
+
+def require_quadruped(robot: RobotSpec) -> None:
+    """Refuse a robot that the training task would read wrongly.
+
+    Args:
+        robot: The robot.
+
+    Raises:
+        RobotError: Something is missing; the message names all of it.
+    """
+    problems = quadruped_problems(robot)
+    if problems:
+        raise RobotError(
+            f"{robot.source or robot.name} cannot be trained: {'; '.join(problems)}. {PAGE} says "
+            "what a model must have."
+        )
+
+
+def quadruped_problems(robot: RobotSpec) -> list[str]:
+    """List what the training task needs and a robot lacks, a clause each.
+
+    Places and axes are looked at only where all names are there.
+
+    Args:
+        robot: The robot.
+    """
+    problems = _leg_problems(robot)
+    if problems:
+        return problems
+    model = robot.build_spec().compile()
+    problems = _name_problems(robot, model)
+    if problems:
+        return problems
+    problems = [
+        *_shape_problems(robot, model),
+        *_axis_problems(robot, model),
+        *_straightness_problems(robot, model),
+        *_contact_problems(robot, model),
+        *_pose_problems(robot),
+    ]
+    if not problems:
+        problems = _balance_problems(robot, model)
+    return problems
+
+
+def _leg_problems(robot: RobotSpec) -> list[str]:
+    """List what is wrong about the legs and the names of their joints."""
+    if not robot.legs:
+        return [
+            "it has no legs, and the task is one of a quadruped; if it is one, name the prefixes "
+            "of its joints in its robot.yaml, as in legs: [FR, FL, RR, RL]"
+        ]
+    legs = ", ".join(robot.legs)
+    has_sides = all(len(leg) == 2 and leg[1] in "LR" for leg in robot.legs)
+    if len(robot.legs) != 4 or not has_sides:
+        return [
+            f"its legs are {legs}; expected four names of two letters, the second R for a right "
+            "leg and L for a left one, as FR, FL, RR and RL"
+        ]
+    for leg in robot.legs:
+        if other_side(leg) not in robot.legs:
+            return [f"its legs are {legs}; {leg} has no {other_side(leg)} on the other side"]
+    expected = []
+    for leg in robot.legs:
+        for joint in LEG_JOINTS:
+            expected.append(f"{leg}_{joint}")
+    names = robot.joint_names
+    if names == tuple(expected):
+        return []
+    if sorted(names) == sorted(expected):
+        order = tuple(dict.fromkeys(name[:2] for name in names))
+        if len(order) == 4 and names == tuple(
+            f"{leg}_{name}" for leg in order for name in LEG_JOINTS
+        ):
+            return [
+                f"the model has its legs in the order {', '.join(order)}, and `legs` in its "
+                f"robot.yaml says {legs}; give them in the order of the model"
+            ]
+    return [
+        f"its joints are {', '.join(names)}; expected {', '.join(expected)}, leg by leg: rename "
+        "the joints in the model, and hold others by `held` in its robot.yaml"
+    ]
+
+
+def _name_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List the sites and geoms that are missing, and a base that cannot move."""
+    problems = []
+    if mujoco.mjtJoint.mjJNT_FREE not in model.jnt_type:
+        problems.append("the base is fixed; give the trunk's body a <freejoint/>")
+    sites = [f"{leg}_foot" for leg in robot.legs]
+    missing_sites = _missing(model, mujoco.mjtObj.mjOBJ_SITE, sites)
+    if missing_sites:
+        problems.append(f"the model has no site {', '.join(missing_sites)}")
+    missing_geoms = _missing(model, mujoco.mjtObj.mjOBJ_GEOM, _parts(robot))
+    if missing_geoms:
+        problems.append(f"the model has no geom {', '.join(missing_geoms)}")
+    return problems
+
+
+def _missing(model: mujoco.MjModel, kind: mujoco.mjtObj, names: Sequence[str]) -> list[str]:
+    """Return the names that no element of a kind has."""
+    return [name for name in names if mujoco.mj_name2id(model, kind, name) < 0]
+
+
+def _parts(robot: RobotSpec) -> list[str]:
+    """Return the names of the geoms that touch the ground."""
+    parts = [TRUNK]
+    for leg in robot.legs:
+        for part in LEG_PARTS:
+            parts.append(f"{leg}_{part}")
+    return parts
+
+
+def _shape_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List feet that are no spheres on the shank, and shanks that are no capsules along z."""
+    other_feet = []
+    other_sites = []
+    other_shanks = []
+    for leg in robot.legs:
+        shank_body = model.joint(f"{leg}_knee").bodyid[0]
+        foot = model.geom(f"{leg}_foot_collision")
+        site = model.site(f"{leg}_foot")
+        is_sphere = foot.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
+        if not is_sphere or foot.bodyid[0] != shank_body:
+            other_feet.append(foot.name)
+        elif site.bodyid[0] != shank_body or np.linalg.norm(site.pos - foot.pos) > CENTRE:
+            other_sites.append(site.name)
+        shank = model.geom(f"{leg}_shank_collision")
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, shank.quat)
+        is_capsule = shank.type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        if not is_capsule or shank.bodyid[0] != shank_body or abs(turn[8]) < PARALLEL:
+            other_shanks.append(shank.name)
+    problems = []
+    if other_feet:
+        problems.append(
+            f"{', '.join(other_feet)}: expected a sphere of the body that the knee turns; a foot "
+            "with a body of its own has to go into it"
+        )
+    if other_sites:
+        problems.append(f"{', '.join(other_sites)}: expected a site at the centre of the foot")
+    if other_shanks:
+        problems.append(
+            f"{', '.join(other_shanks)}: expected a capsule along the z axis of the body that the "
+            "knee turns, since training changes its length"
+        )
+    return problems
+
+
+def _axis_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List axes that are not the trunk's, or not those of the other legs."""
+    data, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+    problems = []
+    signs: dict[str, dict[str, float]] = {name: {} for name in LEG_JOINTS}
+    for leg in robot.legs:
+        for name in LEG_JOINTS:
+            direction = "xyz"[name != "hip_roll"]
+            joint = model.joint(f"{leg}_{name}").id
+            component = float((to_trunk @ data.xaxis[joint])["xyz".index(direction)])
+            if abs(component) < PARALLEL:
+                problems.append(
+                    f"{leg}_{name} does not turn about the trunk's {direction} axis with all "
+                    "joints at zero"
+                )
+            signs[name][leg] = math.copysign(1.0, component)
+    if problems:
+        return [*problems, "the trunk's x axis has to point forwards and its z axis upwards"]
+    for name, sign_of_leg in signs.items():
+        if len(set(sign_of_leg.values())) > 1:
+            positive = [leg for leg, sign in sign_of_leg.items() if sign > 0.0]
+            negative = [leg for leg, sign in sign_of_leg.items() if sign < 0.0]
+            problems.append(
+                f"the axes of *_{name} differ in sign, + for {', '.join(positive)} and - for "
+                f"{', '.join(negative)}; expected one sign for all legs"
+            )
+    if not problems and signs["hip_pitch"] != signs["knee"]:
+        problems.append(
+            "the axes of *_hip_pitch and *_knee have opposite signs; expected the same sign"
+        )
+    return problems
+
+
+def _straightness_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List legs that do not hang straight down with all joints at zero."""
+    data, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+    bent = []
+    for leg in robot.legs:
+        hip = data.xanchor[model.joint(f"{leg}_hip_pitch").id]
+        knee = data.xanchor[model.joint(f"{leg}_knee").id]
+        foot = data.geom_xpos[model.geom(f"{leg}_foot_collision").id]
+        for part, upper, lower in (("thigh", hip, knee), ("shank", knee, foot)):
+            x, _, z = to_trunk @ (lower - upper)
+            angle = math.atan2(abs(x), -z)
+            if angle > STRAIGHT:
+                bent.append(f"the {part} of {leg} is {angle:.2f} rad off")
+    if not bent:
+        return []
+    return [
+        f"with all joints at zero {', '.join(bent)}; expected legs that hang straight down there: "
+        "turn the bodies in the model, so that its joints are zero there"
+    ]
+
+
+def _contact_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List parts that touch no floor or one another, and whatever else collides.
+
+    A floor has 1 as its contype and as its conaffinity.
+    """
+    parts = _parts(robot)
+    others = []
+    through = []
+    among_themselves = []
+    for index in range(model.ngeom):
+        geom = model.geom(index)
+        touches_floor = bool((geom.contype[0] | geom.conaffinity[0]) & 1)
+        if geom.name not in parts:
+            if touches_floor:
+                others.append(geom.name or f"one of the body {model.body(geom.bodyid[0]).name}")
+        elif not touches_floor:
+            through.append(geom.name)
+        elif geom.contype[0] & 1:
+            among_themselves.append(geom.name)
+    problems = []
+    if through:
+        problems.append(
+            f'{", ".join(through)} would fall through the floor; expected contype="0" '
+            'conaffinity="1"'
+        )
+    if among_themselves:
+        problems.append(
+            f"{', '.join(among_themselves)} touch parts of the robot too, for which the task has "
+            'no room; expected contype="0" conaffinity="1"'
+        )
+    if others:
+        problems.append(
+            f"other geoms collide too: {', '.join(dict.fromkeys(others))}; their contacts count "
+            "for nothing and take the room of those that do; expected "
+            'contype="0" conaffinity="0"'
+        )
+    return problems
+
+
+def _pose_problems(robot: RobotSpec) -> list[str]:
+    """List straight knees, and left legs that are not the mirror image of the right ones."""
+    problems = []
+    position = default_pose(robot)
+    for leg in robot.legs:
+        if abs(position[f"{leg}_knee"]) < BENT:
+            problems.append(
+                f"poses.default has {leg}_knee at {position[f'{leg}_knee']:g} rad; expected a "
+                f"bent knee, {BENT:g} rad or more to either side"
+            )
+        if leg[1] == "L":
+            continue
+        for name in LEG_JOINTS:
+            angle = position[f"{leg}_{name}"]
+            image = f"{other_side(leg)}_{name}"
+            expected = -angle if name == "hip_roll" else angle
+            if abs(position[image] - expected) > SAME_POSE:
+                problems.append(
+                    f"poses.default has {leg}_{name} at {angle:g} rad and {image} at "
+                    f"{position[image]:g} rad; expected {expected:g} rad there, the mirror image"
+                )
+    return problems
+
+
+def _balance_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """Say where the robot would tip over in its default pose."""
+    data, to_trunk = posed(robot, model, default_pose(robot))
+    base = model.body(robot.base_body).id
+    feet = []
+    for leg in robot.legs:
+        foot = data.geom_xpos[model.geom(f"{leg}_foot_collision").id]
+        feet.append(float((to_trunk @ (foot - data.xpos[base]))[0]))
+    mass_x = float((to_trunk @ (data.subtree_com[base] - data.xpos[base]))[0])
+    margin = STEADY * (max(feet) - min(feet))
+    if not min(feet) + margin <= mass_x <= max(feet) - margin:
+        return [
+            f"in poses.default the centre of mass is at x = {mass_x:.3f} m and the feet are at "
+            f"{min(feet):.3f} to {max(feet):.3f} m, so that it tips over; expected feet below the "
+            "hips, as with hip_pitch at about minus half of knee"
+        ]
+    return []

@@ -1,0 +1,162 @@
+"""What the training task reads of a quadruped, and robots that it would read wrongly."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import pronk.robots
+from command_line import accepted, refused
+from pronk.errors import RobotError
+from pronk.robots import load_robot
+from pronk.robots.legged import legged
+from pronk.robots.quadruped import quadruped_problems, require_quadruped
+
+GO2 = Path(pronk.robots.__file__).parent / "go2"
+Edit = Callable[[str], str]
+
+
+def same(text: str) -> str:
+    """Leave a file as it is."""
+    return text
+
+
+def replaced(old: str, new: str) -> Edit:
+    """Return an edit that replaces what a pattern matches, which has to be there."""
+
+    def edit(text: str) -> str:
+        changed, count = re.subn(old, new, text)
+        assert count
+        return changed
+
+    return edit
+
+
+def go2_in(folder: Path, model: Edit = same, robot: Edit = same) -> Path:
+    """Write the Go2 with a changed model or a changed robot.yaml to a folder; return the latter.
+
+    Its mirror symmetry is left out, which `load_robot` verifies by itself.
+    """
+    folder.mkdir()
+    shutil.copy(GO2 / "env_cfgs.py", folder)
+    (folder / "go2.xml").write_text(model((GO2 / "go2.xml").read_text()))
+    text = (GO2 / "robot.yaml").read_text()
+    text = re.sub(r"symmetry:\n(  .*\n)+", "", text)
+    path = folder / "robot.yaml"
+    path.write_text(robot(text))
+    return path
+
+
+def renamed_knee(text: str) -> str:
+    """Give the knee of the Go2 that is called FL_tibia a group of its own."""
+    group = "  FL_tibia: {drive: knee, stiffness: 20.0, damping: 0.5, band_hz: [0.1, 15.0]}\n"
+    text = replaced(r"(?m)^poses:", group + "\nposes:")(text)
+    return replaced("knee: (-[0-9.]+)}", r"knee: \1, FL_tibia: \1}")(text)
+
+
+def without_folded(text: str) -> str:
+    """Leave out the pose from which the robot rises."""
+    return replaced(r"(?m)^  folded:.*\n", "")(text)
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_shipped_quadrupeds_can_be_trained(name: str) -> None:
+    assert quadruped_problems(load_robot(name)) == []
+
+
+@pytest.mark.parametrize(
+    ("model", "robot", "named"),
+    [
+        (same, replaced(r"(?m)^legs:.*$", ""), ["legs: [FR, FL, RR, RL]"]),
+        (same, replaced(r"(?m)^legs:.*$", "legs: [FL, FR, RL, RR]"), ["FR, FL, RR, RL"]),
+        (same, replaced(r"(?m)^legs:.*$", "legs: [FR, FL, RR]"), ["four"]),
+        (replaced("FL_knee", "FL_tibia"), renamed_knee, ["FL_tibia", "FL_knee"]),
+        (replaced(r"<geom name=\"F._foot_collision.*\n", ""), same, ["FR_foot_", "FL_foot_"]),
+        (replaced(r"<site name=\"RL_foot.*\n", ""), same, ["site RL_foot"]),
+        (replaced(r"<freejoint[^>]*>", ""), same, ["<freejoint/>"]),
+        (replaced(r'(<site name="RL_foot" pos="-0.002 0 )-0.213', r"\1-0.1"), same, ["RL_foot"]),
+        (
+            replaced(r'(FR_shank_collision" .* fromto=")0 0 -0.02', r"\g<1>0.05 0 -0.02"),
+            same,
+            ["FR_shank_collision", "capsule"],
+        ),
+        (
+            replaced(r"(<freejoint[^>]*>)", r'\1<geom name="guard" size=".1" mass="0"/>'),
+            same,
+            ["guard", "contype"],
+        ),
+        (
+            replaced(r'(trunk_collision" class="collision")', r'\1 contype="0" conaffinity="0"'),
+            same,
+            ["trunk_collision", "floor"],
+        ),
+        (
+            replaced(r'(FR_foot_collision" class="collision")', r'\1 contype="1"'),
+            same,
+            ["FR_foot_collision", "parts of the robot"],
+        ),
+        (replaced(r'(FL_hip_roll"[^>]*axis=")1 0 0', r"\1-1 0 0"), same, ["hip_roll", "FL"]),
+        (replaced(r'(_hip_pitch"[^>]*axis=")0 1 0', r"\g<1>1 0 0"), same, ["y axis"]),
+        (
+            same,
+            replaced("hip_roll: 0.0, hip_pitch: 0.9", "hip_roll: 0.2, hip_pitch: 0.9"),
+            ["-0.2"],
+        ),
+        (same, replaced("hip_pitch: 0.9, knee: -1.8", "hip_pitch: 0.0, knee: -1.3"), ["tips over"]),
+    ],
+)
+def test_a_robot_that_would_be_read_wrongly_is_refused(
+    model: Edit, robot: Edit, named: list[str], tmp_path: Path
+) -> None:
+    path = go2_in(tmp_path / "robot", model, robot)
+    spec = load_robot(path)
+    with pytest.raises(RobotError) as refusal:
+        require_quadruped(spec)
+    for name in [*named, str(path)]:
+        assert name in str(refusal.value)
+
+
+def test_all_missing_parts_are_named_at_once(tmp_path: Path) -> None:
+    model = replaced(r"<(geom|site) name=\"R._(thigh_collision|foot)\".*\n", "")
+    text = " ".join(quadruped_problems(load_robot(go2_in(tmp_path / "robot", model))))
+    for name in ("RR_foot", "RL_foot", "RR_thigh_collision", "RL_thigh_collision"):
+        assert name in text
+
+
+def test_the_sign_of_the_axes_is_free(tmp_path: Path) -> None:
+    """The Go2 with pitch and knee axes to the right, as the Mini Cheetah's."""
+    model = replaced(r'axis="0 1 0" range="(\S+) (\S+)"', r'axis="0 -1 0" range="-3.6 3.6"')
+    robot = replaced("hip_pitch: 0.9, knee: -1.8", "hip_pitch: -0.9, knee: 1.8")
+    robot_file = go2_in(tmp_path / "robot", model, lambda text: robot(without_folded(text)))
+    assert quadruped_problems(load_robot(robot_file)) == []
+    assert legged(robot_file).forward == -legged("go2").forward
+    assert legged(robot_file).standing_height == pytest.approx(legged("go2").standing_height)
+
+
+@pytest.mark.train
+def test_training_refuses_such_a_robot_before_it_builds_it(tmp_path: Path) -> None:
+    pytest.importorskip("mjlab")
+    robot = go2_in(tmp_path / "robot", replaced("_thigh_collision", "_thigh_cover"))
+    out = tmp_path / "run"
+    words = ("--gains", "naive", "--envs", "2", "--device", "cpu", "--out", out)
+    said = refused("train", "all", "--robot", robot, *words)
+    assert "FR_thigh_collision" in said
+    assert "train-your-robot.md" in said
+
+
+def test_check_names_what_training_needs(tmp_path: Path) -> None:
+    bare = go2_in(tmp_path / "robot", replaced(r"<site name=\"RL_foot.*\n", ""))
+    assert "RL_foot" in accepted("robot", "check", bare)
+    assert "train" not in accepted("robot", "check", "go2")
+
+
+@pytest.mark.parametrize("height", ["0 0 0", "0 0 0.7"])
+def test_the_standing_height_is_that_of_the_feet(height: str, tmp_path: Path) -> None:
+    """Wherever a file has its base: at the origin, as a URDF, or above the floor."""
+    model = replaced(r'(<body name="trunk" pos=)"[^"]*"', rf'\1"{height}"')
+    body = legged(go2_in(tmp_path / "robot", model))
+    assert body.standing_height == pytest.approx(legged("go2").standing_height, abs=1e-9)
