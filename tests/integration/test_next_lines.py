@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pronk.robots
 from chirp_logs import chirp_log
-from command_line import accepted
+from command_line import accepted, refused
+from hopper import write_hopper
 from log_files import write_mcap
+from pronk.errors import ArtefactError
 from pronk.identify.match.gains import load_gains
 from pronk.robots import load_robot
 
@@ -81,3 +85,43 @@ def test_a_match_for_a_framework_goes_on_with_its_gains(framework: str, tmp_path
         return
     numbers = [float(number) for number in re.findall(r"\d+\.?\d*", file.read_text())]
     assert pytest.approx(matched.stiffness.value, rel=2e-3) in numbers
+
+
+def own_robot(folder: Path) -> Path:
+    """Write the Mini Cheetah as the robot `hopping` of a user, with a task; return its file."""
+    shutil.copytree(Path(pronk.robots.__file__).parent / "mini_cheetah", folder)
+    path = folder / "robot.yaml"
+    path.write_text(path.read_text().replace("name: mini_cheetah", "name: hopping"))
+    task = "from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg as env_cfg\n"
+    (folder / "env_cfgs.py").write_text(task)
+    return path
+
+
+def test_a_policy_of_a_robot_of_files_needs_the_files(tmp_path: Path) -> None:
+    """A policy holds the name of its robot; each command says how to give its files."""
+    robot = own_robot(tmp_path / "my robot")
+    policy = write_hopper(tmp_path / "policy.onnx", robot="hopping")
+    for command in ("trial", "play", "deploy"):
+        said = refused(command, policy)
+        assert "'hopping'" in said
+        assert "--robot" in said
+    one_jump = ("--jumps", "1", "--commands", "0,0", "--no-video", "--out", tmp_path / "out")
+    said = accepted("trial", policy, "--robot", robot, *one_jump)
+    assert following(said, "play") == ["play", str(policy), "--robot", str(robot)]
+
+
+@pytest.mark.train
+def test_a_training_names_its_robot_to_what_follows(tmp_path: Path) -> None:
+    pytest.importorskip("mjlab")
+    from pronk.jump.trial.training_sim.adapter import load_evaluated_policy
+
+    robot = str(own_robot(tmp_path / "robot"))
+    words = ("--gains", "naive", "--phase", "walk=1", "--envs", "2", "--device", "cpu")
+    said = accepted("train", "walk", "--robot", robot, *words, "--out", tmp_path / "run")
+    for command in ("evaluate", "train"):
+        next_words = following(said, command)
+        assert next_words[next_words.index("--robot") + 1] == robot
+    policy = Path(following(said, "evaluate")[1])
+    with pytest.raises(ArtefactError, match="--robot"):
+        load_evaluated_policy(policy, "cpu")
+    assert load_evaluated_policy(policy, "cpu", robot).robot == robot

@@ -31,6 +31,7 @@ from rich.text import Text
 from pronk.errors import HardwareError
 from pronk.exit_status import ExitStatus
 from pronk.files import write_text
+from pronk.robots import ROBOT_NAMES
 from pronk.tables import Column, Table
 
 _PIPED_WIDTH = 200
@@ -82,6 +83,17 @@ def note(text: str, style: str | None = None) -> None:
 def warn(text: str) -> None:
     """Print a warning to standard error."""
     note(f"warning: {text}", style="yellow")
+
+
+def robot_words(robot: str | None) -> list[str]:
+    """Return the option that names a robot to a command which finds only its name in a policy.
+
+    Args:
+        robot: A robot, as of `load_robot`; None for the one that a command takes without it.
+    """
+    if robot is None or robot in ROBOT_NAMES:
+        return []
+    return ["--robot", robot]
 
 
 def following(*commands: str) -> None:

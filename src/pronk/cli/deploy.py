@@ -122,6 +122,7 @@ def deploy_command(
         TimeLimit,
     )
     from pronk.files import require_new, require_place
+    from pronk.policy.contract import policy_robot_name
     from pronk.policy.deploy_yaml import read_deploy_yaml
     from pronk.policy.deployable import open_policy
     from pronk.policy.foreign import deploy_problems
@@ -133,7 +134,7 @@ def deploy_command(
     seconds = steering.seconds
     robot_name = robot
     if deploy is None:
-        robot_name = robot or load_policy(policy).contract.robot
+        robot_name = robot or policy_robot_name(load_policy(policy).contract)
     if robot_name is None:
         raise PronkError("--deploy needs --robot, such as --robot go2; deploy.yaml names none.")
     robot_spec = load_robot(robot_name)

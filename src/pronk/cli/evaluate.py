@@ -43,6 +43,8 @@ class TrainingSimOptions:
     by_joint: bool | None = None
     """Draw each joint about its own gains, as `pronk train` does; as the policy was trained if left
     out, about those of its group where that is not known."""
+    robot: str | None = None
+    """A name, or a path to a robot.yaml; the policy's if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU if there is one. On the CPU take a few robots: the time grows with their number,
     and is said once it is known."""
@@ -96,7 +98,7 @@ def evaluate_command(
     errors_before = {}
     if evaluated.before is not None:
         errors_before = load_speed_errors(evaluated.before)
-    evaluated_policy = load_evaluated_policy(policy, simulation_device)
+    evaluated_policy = load_evaluated_policy(policy, simulation_device, simulated.robot)
     robot = load_task(evaluated_policy.robot).robot
     plan = EvaluationPlan(
         robot=robot,

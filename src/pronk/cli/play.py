@@ -39,7 +39,7 @@ def play(
     from pronk.jump.play.page import WebPage, require_viser
     from pronk.jump.play.play import Joystick, play_in_real_time
     from pronk.jump.virtual.sim_params import load_sim_params
-    from pronk.policy.contract import check
+    from pronk.policy.contract import check, policy_robot_name
     from pronk.policy.gamepad import GamepadReader
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
@@ -48,7 +48,7 @@ def play(
     require_viser()
     loaded_policy = load_policy(policy)
     contract = loaded_policy.contract
-    spec = load_robot(robot or contract.robot)
+    spec = load_robot(robot or policy_robot_name(contract))
     params = load_sim_params(sim_params, spec)
     check(contract, spec)
     title = (

@@ -124,7 +124,8 @@ def _train_many(
                 policies.append(str(root / training["folder"] / "policy.onnx"))
     following = []
     if policies:
-        following.append(shlex.join(["pronk", "trial", *policies]))
+        words = ["pronk", "trial", *policies, *console.robot_words(settings.robot)]
+        following.append(shlex.join(words))
     return console.Outcome(
         figures={**summary, "tables": [table]},
         wrote=[root / TRAININGS_FILE],
@@ -208,12 +209,13 @@ def _next_steps(settings: TrainSettings, record: Mapping[str, Any]) -> list[str]
         if record["gains"]["sha256"]:
             gains_options += ["--ranges-from", gains_copy]
     evaluation = str(folder / "evaluation.json")
-    evaluate = ["pronk", "evaluate", policy, *gains_options, "--out", evaluation]
+    robot_options = console.robot_words(settings.robot)
+    evaluate = ["pronk", "evaluate", policy, *gains_options, *robot_options, "--out", evaluation]
     if settings.task == "walk":
         start = ["--init-checkpoint", str(folder)]
         out = ["--out", f"{folder}_jump"]
-        use = ["pronk", "train", "jump", *start, *gains_options, *out]
+        use = ["pronk", "train", "jump", *start, *gains_options, *robot_options, *out]
     else:
-        use = ["pronk", "trial", policy]
+        use = ["pronk", "trial", policy, *robot_options]
     curves = ["tensorboard", "--logdir", str(folder)]
     return [shlex.join(evaluate), shlex.join(use), shlex.join(curves)]

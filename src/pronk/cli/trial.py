@@ -203,6 +203,7 @@ def _trial_of_jumps(
     for table in study_tables:
         console.show(table, wide=output.wide)
     wrote.append(page)
+    play = ["pronk", "play", str(policies[0]), *console.robot_words(setup.robot.source)]
     return console.Outcome(
         figures={
             "virtual": results.virtual,
@@ -215,7 +216,7 @@ def _trial_of_jumps(
             "videos": films,
         },
         wrote=wrote,
-        following=[f"open {page} in a browser", f"pronk play {shlex.quote(str(policies[0]))}"],
+        following=[f"open {page} in a browser", shlex.join(play)],
     )
 
 

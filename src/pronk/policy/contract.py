@@ -13,9 +13,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pronk.errors import ArtefactError
+from pronk.errors import ArtefactError, RobotError
 from pronk.names import check_names
 from pronk.policy.observation import ACTIONS, HISTORY, MEASURED
+from pronk.robots import robot_file_path
 from pronk.robots.robot import RobotSpec
 
 SCHEMA = "pronk/policy/1"
@@ -211,6 +212,25 @@ def from_json(text: str, *, source: object) -> Contract:
         ) from None
 
 
+def policy_robot_name(contract: Contract) -> str:
+    """Return the robot of a policy by its name, as `load_robot` takes it.
+
+    Args:
+        contract: That of the policy.
+
+    Raises:
+        ArtefactError: No robot has that name here, as that of a user who has its files.
+    """
+    try:
+        robot_file_path(contract.robot)
+    except RobotError:
+        raise ArtefactError(
+            f"the policy is for the robot {contract.robot!r}, which pronk does not bring: say "
+            "where its files are, as in --robot my_robot/robot.yaml."
+        ) from None
+    return contract.robot
+
+
 def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = None) -> None:
     """Refuse a policy that is not for this robot.
 
@@ -231,7 +251,9 @@ def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = No
     }
     for field, expected in expected_values.items():
         value = getattr(contract, field)
-        _demand(value == expected, field, value, f"{expected!r}, as the robot has it")
+        _demand(
+            value == expected, field, value, f"{expected!r}, as {robot.source or robot.name} has it"
+        )
     for joint, position in zip(robot.joints, contract.default_position, strict=True):
         lower, upper = joint.range
         _demand(

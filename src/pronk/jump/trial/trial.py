@@ -45,7 +45,7 @@ from pronk.jump.virtual import capture as captures
 from pronk.jump.virtual.ground import Start
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.jump.virtual.sim_params import SimParams, load_sim_params, shipped_file
-from pronk.policy.contract import check
+from pronk.policy.contract import check, policy_robot_name
 from pronk.policy.rollout import check_standing, ticks
 from pronk.policy.runtime import Policy, load_policy
 from pronk.policy.script import STILL, Script
@@ -394,7 +394,7 @@ def setup_of(
         robot: Name or path of the robot; that of the policy if None.
         processes: Number of runs at once; as many as there are cores if None.
     """
-    spec = load_robot(robot or load_policy(policy).contract.robot)
+    spec = load_robot(robot or policy_robot_name(load_policy(policy).contract))
     file = sim_params or shipped_file(spec)
     if sim_params is not None:
         source = str(sim_params)

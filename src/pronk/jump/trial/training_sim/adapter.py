@@ -40,7 +40,7 @@ from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
 from pronk.jump.train.versions import package_versions
 from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, Act, Estimate, StepListener, evaluate_policy
-from pronk.policy.contract import check
+from pronk.policy.contract import check, policy_robot_name
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.policy.runtime import Inference, Policy, load_policy
 from pronk.robots import load_robot
@@ -182,18 +182,19 @@ class EvaluatedPolicy:
         return gains.name == "naive" or self.about.get("gains_sha256") == gains.sha256
 
 
-def load_evaluated_policy(path: Path, device: str) -> EvaluatedPolicy:
+def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> EvaluatedPolicy:
     """Read a policy.
 
     Args:
         path: `policy.onnx`, a checkpoint, or the folder of a run, whose last checkpoint is read.
         device: Device of the simulation.
+        robot: Name or path of the robot; that of the policy if None.
 
     Raises:
         ArtefactError: No such file, or one that is no policy of this pronk.
     """
     if path.suffix == ".onnx":
-        return _exported_policy(path, device)
+        return _exported_policy(path, device, robot)
     file = RunFolder(path).checkpoint() if path.is_dir() else path
     state = read_checkpoint(file)
     actor = blank_actor()
@@ -221,7 +222,7 @@ def load_evaluated_policy(path: Path, device: str) -> EvaluatedPolicy:
         act=actor,
         estimate=actor.estimate,
         jump=uses_jump_input(state),
-        robot=run.robot(settings.get("robot", "mini_cheetah")),
+        robot=robot or run.robot(settings.get("robot", "mini_cheetah")),
         about=about,
         draws=_draws_of(settings),
     )
@@ -245,12 +246,13 @@ def blank_actor() -> EstimatorActor:
     )
 
 
-def _exported_policy(path: Path, device: str) -> EvaluatedPolicy:
+def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPolicy:
     """Read an exported policy."""
     policy = load_policy(path)
     contract = policy.contract
+    robot = robot or policy_robot_name(contract)
     try:
-        check(contract, load_robot(contract.robot))
+        check(contract, load_robot(robot))
     except ArtefactError as error:
         raise ArtefactError(f"{path}: {error}") from None
     about = {
@@ -267,7 +269,7 @@ def _exported_policy(path: Path, device: str) -> EvaluatedPolicy:
         act=runner.act,
         estimate=runner.estimate,
         jump=contract.jump,
-        robot=contract.robot,
+        robot=robot,
         about=about,
         draws=_draws_of(contract.provenance),
     )
