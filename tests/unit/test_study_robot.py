@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("onnxruntime")
 import pronk.robots
+from command_line import refused
 from hopper import write_hopper
 from pronk.jump.study.config import load_study
 from pronk.jump.study.study import plan_study, study_tasks
@@ -121,3 +122,31 @@ def test_a_folder_and_a_model_without_a_file_are_robots_of_a_study(tmp_path: Pat
     of_model = training_of(str(path.with_name("mini_cheetah.xml")), tmp_path / "study")
     (robot,) = [file for file in of_model.inputs if file.endswith(".xml")]
     assert of_model.settings["robot"] == robot
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "named"),
+    [
+        ("mini_cheetah.xml", "_thigh_collision", "_thigh_cover", "FR_thigh_collision"),
+        ("env_cfgs.py", "", "", "env_cfgs.py"),
+    ],
+)
+def test_a_robot_that_cannot_be_trained_is_refused_before_anything_is_written(
+    tmp_path: Path, file: str, old: str, new: str, named: str
+) -> None:
+    """Not by each of its trainings, twice."""
+    path = robot_in(tmp_path / "robot")
+    if old:
+        change(path.with_name(file), old, new)
+    else:
+        path.with_name(file).unlink()
+    out = tmp_path / "study"
+    words = ("--gains", "naive", "--seeds", "1-2", "--device", "cpu", "--jobs", "1")
+    assert named in refused("train", "all", "--robot", path, *words, "--out", out)
+    study = write_study(
+        tmp_path / "study.yaml",
+        arms={"nominal": {"gains": "naive"}},
+        training={"robot": str(path)},
+    )
+    assert named in refused("study", study, "--out", out, "--device", "cpu", "--jobs", "1")
+    assert not out.exists()

@@ -150,18 +150,28 @@ def check_arm(arm: TrainingArm) -> None:
     host that only sends trainings to others its form alone is checked.
 
     Raises:
-        PronkError: The gains, the recipe or the phases are impossible.
+        PronkError: The robot cannot be trained, or the gains, the recipe or the phases are
+            impossible.
     """
     from pronk.jump.train.recipe import load_recipes
-    from pronk.robots import load_robot
+    from pronk.robots import ROBOT_NAMES, load_robot, robot_file_path
+    from pronk.robots.quadruped import require_quadruped
 
     settings = replace(arm.settings, seed=0).completed()
+    robot = load_robot(str(settings.robot))
+    task_file = robot_file_path(robot.source).with_name("env_cfgs.py")
+    if robot.source not in ROBOT_NAMES and not task_file.is_file():
+        raise PronkError(
+            f"{settings.robot} has no training task: expected {task_file} with a function env_cfg, "
+            "as docs/train-your-robot.md has one."
+        )
+    require_quadruped(robot)
     if settings.recipe and importlib.util.find_spec("mjlab") is not None:
         from pronk.jump.train.run import check_training
 
         check_training(settings)
         return
-    settings.training_gains(load_robot(str(settings.robot)))
+    settings.training_gains(robot)
     if settings.recipe:
         load_recipes(settings.recipe)
 

@@ -62,8 +62,8 @@ def load_task(robot: str) -> Task:
         if spec.source in ROBOTS:
             return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
         raise PronkError(
-            f"{robot} has no training task: expected {env_file} with a function env_cfg, or one of "
-            f"the robots {', '.join(ROBOTS)}."
+            f"{robot} has no training task: expected {env_file} with a function env_cfg, as "
+            f"docs/train-your-robot.md has one, or one of the robots {', '.join(ROBOTS)}."
         )
     env_cfg = _function(env_file, "env_cfg")
     rl_cfg = _function(rl_file, "rl_cfg") if rl_file.is_file() else jump_rl_cfg
