@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+import pronk.robots
 from command_line import accepted, invoke, refused
 from pronk.deploy.runtime.limits import Limits
 from pronk.errors import RobotError
@@ -456,6 +458,21 @@ def test_a_pose_at_a_stop_is_moved_and_named(pose: float, tmp_path: Path) -> Non
         content["poses"]["default"]["knee"] = position
         file.write_text(yaml.safe_dump(content))
         assert ("end of its range" in invoke(("robot", "check", file)).stderr) == is_named
+
+
+def test_ranges_in_rad_that_are_read_in_degrees_are_named(tmp_path: Path) -> None:
+    """MuJoCo reads an MJCF in degrees unless it says otherwise, as many that are in rad do not."""
+    shutil.copytree(Path(pronk.robots.__file__).parent / "go2", tmp_path / "go2")
+    model = tmp_path / "go2" / "go2.xml"
+    text = model.read_text()
+    model.write_text(text.replace('<compiler angle="radian"/>', ""))
+    assert model.read_text() != text
+    with pytest.raises(RobotError, match='<compiler angle="radian"/>'):
+        load_robot(tmp_path / "go2")
+    said = invoke(("robot", "new", model, "--overwrite")).stderr
+    assert '<compiler angle="radian"/>' in said
+    model.write_text(text)
+    assert "radian" not in invoke(("robot", "new", model, "--overwrite")).stderr
 
 
 LINKS = """

@@ -28,7 +28,12 @@ from pronk.robots.held_reasons import held_reasons
 from pronk.robots.limits import OperatingLimits, StandingUp
 from pronk.robots.robot import Drive, Joint, RobotSpec, ServoKind
 from pronk.robots.servos import joint_servos
-from pronk.robots.source_model import MUJOCO_ERRORS, SourceModel, read_source
+from pronk.robots.source_model import (
+    MUJOCO_ERRORS,
+    TURN_READ_AS_DEGREES,
+    SourceModel,
+    read_source,
+)
 
 T = TypeVar("T")
 
@@ -584,9 +589,16 @@ def _pose_angle(
     low, high = model.joint(name).range
     limited = model.jnt_limited[model.joint(name).id]
     if limited and not low - POSE_ROUNDING <= angle <= high + POSE_ROUNDING:
+        hint = ""
+        reach = max(abs(low), abs(high))
+        if reach <= TURN_READ_AS_DEGREES and low <= math.radians(angle) <= high:
+            hint = (
+                " The range looks like one in rad that was read in degrees, as MuJoCo reads an "
+                'MJCF without <compiler angle="radian"/>.'
+            )
         raise RobotError(
             f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
-            f"{low:g} to {high:g} rad."
+            f"{low:g} to {high:g} rad.{hint}"
         )
     return angle
 

@@ -33,6 +33,8 @@ SMALLEST_MASS = 1e-4
 """Mass of a link of a URDF that moves and has none [kg]."""
 SMALLEST_INERTIA = 1e-8
 """Moment of inertia of such a link, as of a ball of 0.1 g and 16 mm [kg m^2]."""
+TURN_READ_AS_DEGREES = math.radians(2.0 * math.pi)
+"""Angle that a whole turn in rad is where its number is read in degrees [rad]."""
 SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample", "num", "dim")
 """Attributes whose product is the number of samples of an element."""
 FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -169,7 +171,20 @@ def _read_source(path: Path, _modified_ns: int) -> SourceModel:
     except MUJOCO_ERRORS as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
-    return _source(path, model, None, notes)
+    return _source(path, model, None, (*notes, *_degree_notes(spec, model)))
+
+
+def _degree_notes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Say so where the ranges of an MJCF in degrees are numbers that look like angles in rad."""
+    is_limited_hinge = (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited == 1)
+    ranges = model.jnt_range[is_limited_hinge]
+    if not spec.compiler.degree or not len(ranges) or np.abs(ranges).max() > TURN_READ_AS_DEGREES:
+        return ()
+    return (
+        f"no hinge has a range beyond {math.degrees(TURN_READ_AS_DEGREES):.2g} degrees: MuJoCo "
+        "reads an MJCF in degrees, and these look like rad; if they are, write "
+        '<compiler angle="radian"/> into it',
+    )
 
 
 def _is_urdf(path: Path) -> bool:
