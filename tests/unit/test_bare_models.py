@@ -475,6 +475,28 @@ def test_ranges_in_rad_that_are_read_in_degrees_are_named(tmp_path: Path) -> Non
     assert "radian" not in invoke(("robot", "new", model, "--overwrite")).stderr
 
 
+@pytest.mark.parametrize(
+    ("geom", "inertial", "is_named"),
+    [
+        ("", "", True),
+        (' density="700"', "", False),
+        (' mass="0.4"', "", False),
+        ("", '<inertial pos="0 0 -.1" mass="1" diaginertia=".01 .01 .01"/>', False),
+    ],
+)
+def test_masses_that_mujoco_assumes_are_named(
+    geom: str, inertial: str, is_named: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="rod"><joint name="j" axis="0 1 0" range="-90 90"/>'
+        f'{inertial}<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"{geom}/></body>'
+        "</worldbody></mujoco>"
+    )
+    said = invoke(("robot", "check", path)).stderr
+    assert ("rod 0.411 kg" in said) == is_named
+
+
 LINKS = """
 <?xml version="1.0"?>
 <robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">

@@ -33,6 +33,8 @@ SMALLEST_MASS = 1e-4
 """Mass of a link of a URDF that moves and has none [kg]."""
 SMALLEST_INERTIA = 1e-8
 """Moment of inertia of such a link, as of a ball of 0.1 g and 16 mm [kg m^2]."""
+WATER = 1000.0
+"""Density of a geom that states neither mass nor density, as MuJoCo assumes it [kg/m^3]."""
 TURN_READ_AS_DEGREES = math.radians(2.0 * math.pi)
 """Angle that a whole turn in rad is where its number is read in degrees [rad]."""
 SIZES = ("count", "width", "height", "nrow", "ncol", "gridlayout", "nsample", "num", "dim")
@@ -171,7 +173,8 @@ def _read_source(path: Path, _modified_ns: int) -> SourceModel:
     except MUJOCO_ERRORS as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
-    return _source(path, model, None, (*notes, *_degree_notes(spec, model)))
+    notes = (*notes, *_degree_notes(spec, model), *_density_notes(spec, model))
+    return _source(path, model, None, notes)
 
 
 def _degree_notes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -184,6 +187,28 @@ def _degree_notes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, ...]
         f"no hinge has a range beyond {math.degrees(TURN_READ_AS_DEGREES):.2g} degrees: MuJoCo "
         "reads an MJCF in degrees, and these look like rad; if they are, write "
         '<compiler angle="radian"/> into it',
+    )
+
+
+def _density_notes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Name the bodies of an MJCF whose mass is their volume times a density that is assumed."""
+    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    assumed = []
+    for body in spec.bodies:
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name)
+        moves = index > 0 and model.body_weldid[index] != 0
+        states_inertia = body.explicitinertial and spec.compiler.inertiafromgeom != from_geoms
+        if not moves or states_inertia or not model.body_mass[index] > 0.0:
+            continue
+        for geom in body.geoms:
+            if math.isnan(geom.mass) and geom.density == WATER:
+                assumed.append(f"{body.name} {model.body_mass[index]:.3g} kg")
+                break
+    if not assumed:
+        return ()
+    return (
+        "the model states no mass of some bodies, so that MuJoCo took the volume of their geoms at "
+        f"{WATER:g} kg/m^3 ({', '.join(assumed)}): give them an <inertial>, or their geoms a mass",
     )
 
 
