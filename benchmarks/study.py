@@ -58,7 +58,7 @@ def study_section(results: StudyResults, command: str, figures: str) -> str:
     """
     versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
     parts = [
-        f"Measured by `{command}` on pronk's virtual robot: {len(results.arms)} arms, "
+        f"Measured by `{command}` on pronk's virtual robot: {_arms_text(results)}, "
         f"{len(results.commands)} commands, {_jumps_text(results)} with each of every policy on a "
         f"robot ({versions})."
     ]
@@ -91,6 +91,14 @@ def evidence_section(results: StudyResults, command: str) -> str:
         parts.append(markdown(table))
     parts += _missing(results)
     return "\n\n".join(parts)
+
+
+def _arms_text(results: StudyResults) -> str:
+    """Return the number of arms of which policies were tried, and of all if it is another one."""
+    tried = len(results.tried_arms)
+    if tried == len(results.arms):
+        return counted(tried, "arm")
+    return f"{tried} of {counted(len(results.arms), 'arm')}"
 
 
 def _jumps_text(results: StudyResults) -> str:

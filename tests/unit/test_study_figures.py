@@ -252,6 +252,22 @@ def test_a_table_says_where_the_drives_did_not_hold_the_robot_up(results: StudyR
     assert "on shipped" not in " ".join(height.notes)
 
 
+def test_tables_have_no_column_of_an_arm_that_is_not_tried_yet(results: StudyResults) -> None:
+    nominal, matched = results.arms
+    cells = []
+    for cell in results.cells:
+        if cell.arm == matched:
+            cell = replace(cell, jumps=0, value=math.nan, low=math.nan, high=math.nan, by_seed={})
+        cells.append(cell)
+    partial = replace(results, cells=tuple(cells))
+    assert results.tried_arms == (nominal, matched)
+    assert partial.tried_arms == (nominal,)
+    for table in outcome_tables(partial):
+        assert [column.heading for column in table.columns] == ["robot", nominal]
+    text = render(draw_robots(partial, partial.outcomes))
+    assert text != render(draw_robots(results, results.outcomes))
+
+
 def test_the_page_has_both_figures(results: StudyResults, tmp_path: Path) -> None:
     save_study(tmp_path / "study.json", results)
     assert load_study_results(tmp_path / "study.json").cells[0] == results.cells[0]

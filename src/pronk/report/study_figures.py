@@ -74,7 +74,8 @@ def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
     """
     names = {cell.robot for cell in results.cells if not cell.series}
     robots = [robot for robot in results.robots if robot in names]
-    look_by_arm = arm_looks(results.arms)
+    looks_of_all = arm_looks(results.arms)
+    look_by_arm = {arm: looks_of_all[arm] for arm in results.tried_arms}
     row_height = 3.0 if len(outcomes) == 1 else 1.9
     height = row_height * len(outcomes) + 0.7 + 0.2 * _legend_rows(results)
     with drawing(len(outcomes), height=height, sharex=True) as (figure, grid):
@@ -151,7 +152,7 @@ def draw_tolerance(results: StudyResults) -> MplFigure:
     interval has no band.
     """
     series = list(dict.fromkeys(cell.series for cell in results.cells if cell.series))
-    tried = {cell.arm for cell in results.cells if cell.series}
+    tried = {cell.arm for cell in results.cells if cell.series and cell.jumps}
     arms = [arm for arm in results.arms if arm in tried]
     look_by_arm = arm_looks(results.arms)
     cells: dict[tuple[str, str, str], list[OutcomeCell]] = {}
@@ -205,5 +206,5 @@ def _dress(axes: Axes, outcome: str) -> None:
 
 
 def _legend_rows(results: StudyResults) -> int:
-    """Return the number of rows of the legend of all arms."""
-    return -(-len(results.arms) // LEGEND_COLUMNS)
+    """Return the number of rows of the legend of the arms that were tried."""
+    return -(-len(results.tried_arms) // LEGEND_COLUMNS)

@@ -46,14 +46,8 @@ def _jumped(run: TrialRun) -> float:
     return float(run.figures.found)
 
 
-def never_stood(run: TrialRun) -> bool:
-    """Return whether the drives did not hold the robot up, so that no policy started."""
-    return not run.figures.stood
-
-
 def _fell(run: TrialRun) -> float:
-    # A robot that never stood did not fall either.
-    return math.nan if never_stood(run) else float(run.figures.fell)
+    return float(run.figures.fell) if run.figures.stood else math.nan
 
 
 def _height(run: TrialRun) -> float:

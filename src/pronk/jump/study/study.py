@@ -37,7 +37,7 @@ from pronk.jump.study.config import (
     StudyConfig,
     comparison_robots,
 )
-from pronk.jump.study.outcomes import OUTCOMES, never_stood
+from pronk.jump.study.outcomes import OUTCOMES
 from pronk.jump.study.robot_inputs import RobotInput, robot_input
 from pronk.jump.study.schedule import TaskStatus
 from pronk.jump.study.study_results import (
@@ -738,7 +738,7 @@ def _outcome_cell(jumps: Jumps, arm: str, robot: StudiedRobot, outcome_name: str
         seeds.append(strata)
         means[str(seed)] = seed_mean(strata)
         count += len(runs)
-        not_standing += sum(never_stood(run) for run in runs)
+        not_standing += sum(not run.figures.stood for run in runs)
         for values in strata:
             with_value += int(np.isfinite(values).sum())
     estimate = mean_interval(seeds, is_share=OUTCOMES[outcome_name].is_share)

@@ -192,6 +192,12 @@ class StudyResults:
     the same of the trainings, except of finished policies and in results of an earlier pronk."""
 
     @property
+    def tried_arms(self) -> tuple[str, ...]:
+        """The arms of which a policy was tried, in the order of the study's file."""
+        arms_with_jumps = {cell.arm for cell in self.cells if cell.jumps}
+        return tuple(arm for arm in self.arms if arm in arms_with_jumps)
+
+    @property
     def mixed_versions(self) -> str:
         """Sentences on trials and trainings of several versions; empty if all are of the same."""
         sentences = []
@@ -298,7 +304,7 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
     """
     definition = OUTCOMES[outcome]
     columns = [Column(heading="robot")]
-    for arm in results.arms:
+    for arm in results.tried_arms:
         columns.append(Column(heading=arm))
     rows: list[tuple[Cell, ...]] = []
     single_seed = []
@@ -307,7 +313,7 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
         if robot not in shown:
             continue
         row: list[Cell] = [robot]
-        for arm in results.arms:
+        for arm in results.tried_arms:
             cell = results.cell(arm, robot, outcome)
             if not cell.jumps:
                 row.append("-")
