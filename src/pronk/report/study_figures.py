@@ -16,6 +16,8 @@ from pronk.report.trial_figures import offsets
 
 ROOM = 0.7
 """Share of the room of a robot that the marks of all arms take [1]."""
+LARGEST_ARM_DISTANCE = 0.3
+"""Largest distance of the marks of two arms, so that those of few arms stay by their robot [1]."""
 _LOOKS: tuple[Look, ...] = (
     {"color": "#D55E00", "marker": "D", "linestyle": "-"},
     {"color": "#0072B2", "marker": "o", "linestyle": "-"},
@@ -79,7 +81,8 @@ def draw_robots(results: StudyResults, outcomes: Sequence[str]) -> MplFigure:
     row_height = 3.0 if len(outcomes) == 1 else 1.9
     height = row_height * len(outcomes) + 0.7 + 0.2 * _legend_rows(results)
     with drawing(len(outcomes), height=height, sharex=True) as (figure, grid):
-        shifts = offsets(len(look_by_arm), ROOM)
+        width = min(ROOM, LARGEST_ARM_DISTANCE * (len(look_by_arm) - 1))
+        shifts = offsets(len(look_by_arm), width)
         distance = min(ROOM / len(look_by_arm), _MAX_DISTANCE)
         for axes, outcome in zip(grid[:, 0], outcomes, strict=True):
             for shift, (arm, look) in zip(shifts, look_by_arm.items(), strict=True):
