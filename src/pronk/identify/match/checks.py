@@ -47,8 +47,8 @@ UNIT_TOLERANCE = 0.05
 like these units. Most drives follow slow commands within it, and a gear of 50 : 1 is outside of it
 for a position of the motor."""
 FOLLOWS = 2.0
-"""Largest factor between the motions of a joint and of its command in one unit, at low frequency,
-where no other cause is to be told from them."""
+"""Largest factor between the motions of a joint and of its command, at low frequency and in one
+unit, of a joint that follows its command."""
 LEAST_DEGREES = 0.7
 """Least half of the travel of a command that may be in degrees: 0.7 degrees, 0.012 rad, are less
 than the dry friction of most drives lets through, and 0.7 rad are more than most joints are
@@ -241,8 +241,9 @@ def _cause_of_motion(excitation: Excitation, other: str, robot: RobotSpec, remed
         f"JOINT={1.0 / DEGREES:.6f} for each joint in degrees)"
     )
     if not follows:
-        if _column_units(gain):
-            units = f"{_looks_of_two_units(gain)}, {units}"
+        column_units = _column_units(gain)
+        if column_units is not None:
+            units = f"{_looks_of_two_units(gain, column_units)}, {units}"
         return (
             "so would look, and this log does not tell them apart: columns of another joint "
             f"({remedy}), {units}, and {causes}"
@@ -275,11 +276,9 @@ def _is_in_degrees(gain: float) -> bool:
     return units is not None and units[0] == "degrees" and gain > 1.0
 
 
-def _looks_of_two_units(gain: float) -> str:
-    """Return in words the units whose ratio a gain is, which is near one of `COLUMN_UNITS`."""
-    units = _column_units(gain)
-    assert units is not None
-    position_unit, command_unit = units
+def _looks_of_two_units(gain: float, column_units: tuple[str, str]) -> str:
+    """Return in words the units of position and command whose ratio a gain is."""
+    position_unit, command_unit = column_units
     return (
         f"a position in {position_unit} beside a command in {command_unit} ({gain:.3g} times the "
         "command at low frequency)"
@@ -470,8 +469,9 @@ def standstill(excitation: Excitation, joint: Joint) -> str:
         if travel == 0.0 or slow_standstill:
             gain = abs(slow_response(excitation, joint))
             units = ""
-            if _column_units(gain):
-                units = f"{_looks_of_two_units(gain)}, "
+            column_units = _column_units(gain)
+            if column_units is not None:
+                units = f"{_looks_of_two_units(gain, column_units)}, "
             return (
                 f"standstill: {excitation.joint} does not move at {time[first]:.1f} s while its "
                 f"command does; {units}a drive that is off, an encoder that is stuck and friction "
