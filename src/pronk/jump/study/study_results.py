@@ -347,6 +347,12 @@ def outcome_table(results: StudyResults, outcome: str, *, in_series: bool = Fals
     )
 
 
+def _cells_on(results: StudyResults, robot: str, outcome: str) -> list[OutcomeCell]:
+    """Return one outcome on one robot of the arms that were tried there, in their order."""
+    cells = [results.cell(arm, robot, outcome) for arm in results.arms]
+    return [cell for cell in cells if cell.jumps]
+
+
 def _not_standing(results: StudyResults, outcome: str, robots: Collection[str]) -> list[str]:
     """Return how many jumps have an outcome although the robot did not stand before them.
 
@@ -359,8 +365,7 @@ def _not_standing(results: StudyResults, outcome: str, robots: Collection[str]) 
     for robot in results.robots:
         jumps = 0
         not_standing = 0
-        for arm in results.arms:
-            cell = results.cell(arm, robot, outcome)
+        for cell in _cells_on(results, robot, outcome):
             if robot in robots and cell.jumps_with_value == cell.jumps:
                 jumps += cell.jumps
                 not_standing += cell.jumps_not_standing
@@ -381,11 +386,10 @@ def _uneven_counts(results: StudyResults, outcome: str, robots: Collection[str])
     for robot in results.robots:
         counts = []
         shares = set()
-        for arm in results.arms:
-            cell = results.cell(arm, robot, outcome)
-            if robot in robots and cell.jumps and cell.jumps_with_value is not None:
+        for cell in _cells_on(results, robot, outcome):
+            if robot in robots and cell.jumps_with_value is not None:
                 shares.add(Fraction(cell.jumps_with_value, cell.jumps))
-                counts.append(f"{arm} {cell.jumps_with_value} of {cell.jumps}")
+                counts.append(f"{cell.arm} {cell.jumps_with_value} of {cell.jumps}")
         if len(shares) > 1:
             texts.append(f"on {robot} {', '.join(counts)}")
     if len(texts) > MAX_UNEVEN:
