@@ -13,6 +13,7 @@ import numpy as np
 from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots import load_robot, robot_version
+from pronk.robots.model import kinematics
 from pronk.robots.robot import RobotSpec
 
 
@@ -119,11 +120,7 @@ def posed(
         The kinematics, and the axes of the base as rows, which turn the world's vectors into its
         frame, (3, 3).
     """
-    data = mujoco.MjData(model)
-    for name, angle in position.items():
-        data.qpos[model.joint(name).qposadr[0]] = angle
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    data = kinematics(model, position)
     return data, data.xmat[model.body(robot.base_body).id].reshape(3, 3).T
 
 

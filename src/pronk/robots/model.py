@@ -379,11 +379,22 @@ def model_at_zero(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
         robot: The robot.
     """
     model = robot.build_spec().compile()
+    return model, kinematics(model, dict.fromkeys(robot.joint_names, 0.0))
+
+
+def kinematics(model: mujoco.MjModel, position: Mapping[str, float]) -> mujoco.MjData:
+    """Return where the bodies of a model are in a pose, with their centres of mass.
+
+    Args:
+        model: The model.
+        position: Position by joint [rad] or [m]; other joints are as in the model.
+    """
     data = mujoco.MjData(model)
-    for joint in robot.joints:
-        data.qpos[model.joint(joint.name).qposadr[0]] = 0.0
+    for name, joint_position in position.items():
+        data.qpos[model.joint(name).qposadr[0]] = joint_position
     mujoco.mj_kinematics(model, data)
-    return model, data
+    mujoco.mj_comPos(model, data)
+    return data
 
 
 def bench_inertia(robot: RobotSpec, joint_name: str) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from pronk.arrays import Array
 from pronk.errors import RobotError
 from pronk.robots.legged import default_pose, other_side, posed
 from pronk.robots.robot import RobotSpec
@@ -74,10 +75,11 @@ def quadruped_problems(robot: RobotSpec) -> list[str]:
     problems = _name_problems(robot, model)
     if problems:
         return problems
+    at_zero, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
     problems = [
         *_shape_problems(robot, model),
-        *_axis_problems(robot, model),
-        *_straightness_problems(robot, model),
+        *_axis_problems(robot, at_zero, to_trunk),
+        *_straightness_problems(robot, at_zero, to_trunk),
         *_contact_problems(robot, model),
         *_pose_problems(robot),
     ]
@@ -190,19 +192,25 @@ def _shape_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     return problems
 
 
-def _axis_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
-    """List axes that are not the trunk's, or not those of the other legs."""
-    data, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> list[str]:
+    """List axes that are not the trunk's, or not those of the other legs.
+
+    Args:
+        robot: The robot.
+        data: Its kinematics with all joints at zero.
+        to_trunk: Axes of the trunk as rows, (3, 3).
+    """
+    model = data.model
     problems = []
     signs: dict[str, dict[str, float]] = {name: {} for name in LEG_JOINTS}
     for leg in robot.legs:
         for name in LEG_JOINTS:
-            direction = "xyz"[name != "hip_roll"]
+            direction = 0 if name == "hip_roll" else 1
             joint = model.joint(f"{leg}_{name}").id
-            component = float((to_trunk @ data.xaxis[joint])["xyz".index(direction)])
+            component = float((to_trunk @ data.xaxis[joint])[direction])
             if abs(component) < PARALLEL:
                 problems.append(
-                    f"{leg}_{name} does not turn about the trunk's {direction} axis with all "
+                    f"{leg}_{name} does not turn about the trunk's {'xy'[direction]} axis with all "
                     "joints at zero"
                 )
             signs[name][leg] = math.copysign(1.0, component)
@@ -223,9 +231,15 @@ def _axis_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     return problems
 
 
-def _straightness_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
-    """List legs that do not hang straight down with all joints at zero."""
-    data, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+def _straightness_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> list[str]:
+    """List legs that do not hang straight down with all joints at zero.
+
+    Args:
+        robot: The robot.
+        data: Its kinematics with all joints at zero.
+        to_trunk: Axes of the trunk as rows, (3, 3).
+    """
+    model = data.model
     bent = []
     for leg in robot.legs:
         hip = data.xanchor[model.joint(f"{leg}_hip_pitch").id]
