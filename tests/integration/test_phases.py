@@ -77,7 +77,7 @@ def test_values_of_a_phase_by_hand(
     curriculum(env).apply(env, PHASES[name], done)
     term = env.reward_manager.get_term_cfg
     command = motion_command(env)
-    assert term("jump_height").weight == pytest.approx(weight)
+    assert term("height_by_speed").weight == pytest.approx(weight)
     assert term("posture").weight == reward_weights()["posture"].weight
     assert term("collision").params["jump_scale"] == pytest.approx(scale)
     assert command.state.liftoff_std == pytest.approx(std)
@@ -147,8 +147,9 @@ def test_swept_feet_stand_still_on_the_ground(monkeypatch: pytest.MonkeyPatch) -
     command = motion_command(env)
     command.jump[:2] = True
     command.velocity[0, 0] = 2.0
-    command.compute(0.0)
     action = joint_position_action(env)
+    monkeypatch.setattr(command.cfg, "guidance_sweep", 0.0)
+    command.compute(0.0)
     plain = action.guidance.clone()
     assert torch.equal(plain[0], plain[1]), "blind to the command"
     monkeypatch.setattr(command.cfg, "guidance_sweep", 0.5)

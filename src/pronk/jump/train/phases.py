@@ -63,13 +63,11 @@ class Phase:
 
 
 _JUMP_A = {
-    "dense_jump": (-0.02, -0.02),
     "sparse_jump": (16.0, 16.0),
-    "jump_height": (16.0, 16.0),
-    "flight_distance": (28.0, 28.0),
-    "clearance_gap": (12.0, 12.0),
+    "flight_distance": (40.0, 40.0),
     "countermovement": (60.0, 60.0),
-    "hop": (-1.0, -1.0),
+    "liftoff_angle": (4.0, 4.0),
+    "height_by_speed": (16.0, 16.0),
 }
 
 PHASES: Mapping[str, Phase] = {
@@ -87,12 +85,11 @@ PHASES: Mapping[str, Phase] = {
     "jump_b": Phase(
         jump=True,
         weights={
-            **_JUMP_A,
-            "dense_jump": (-0.002, -0.002),
-            "sparse_jump": (16.0, 12.0),
-            "jump_height": (16.0, 10.0),
-            "clearance_gap": (12.0, 11.0),
+            "sparse_jump": (16.0, 8.0),
+            "flight_distance": (40.0, 38.0),
             "countermovement": (60.0, 0.0),
+            "liftoff_angle": (4.0, 12.0),
+            "height_by_speed": (16.0, 10.0),
             "landing": (0.0, -40.0),
         },
         jump_scales={"collision": (1.0, 9.0), "knees": (1.0, 10.0)},

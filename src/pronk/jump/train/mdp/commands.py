@@ -79,9 +79,9 @@ class MotionCommandCfg(CommandTermCfg):
     """In jump mode the rewarded horizontal speed is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not rewarded."""
-    guidance_sweep: float = 0.0
+    guidance_sweep: float = 1.0
     """Share of the commanded forward velocity with which guided feet are swept backwards; 0 keeps
-    them below the hips."""
+    them below the hips, where they brake the robot before it pushes."""
     backward_share: float = 1.0
     """Share of the pay for height, distance and gap that is left for commands backwards at
     `BACKWARD_FULL_SPEED` and faster, 0 to 1."""

@@ -1,7 +1,7 @@
 """mjlab's reward manager with all terms weighed and summed together.
 
 mjlab's own takes seven operations a term. On a GPU a step is bound by the number of operations, and
-with thirty terms the difference is a fifth of a step. mjlab's environment names the class of its
+with thirty terms the difference was a fifth of a step. mjlab's environment names the class of its
 manager itself, so `StackedRewardManager.install` puts this one in its place: the one patch of mjlab
 that pronk makes.
 """
