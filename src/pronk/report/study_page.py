@@ -53,11 +53,14 @@ def study_part(path: Path) -> Part:
     for comparison in results.comparisons:
         decided += comparison.verdict in ("more", "less")
     policies = 0
-    for arm in results.arms:
+    for arm in results.tried_arms:
         cells = [cell for cell in results.cells if cell.arm == arm]
         policies += max((len(cell.by_seed) for cell in cells), default=0)
+    arms = counted(len(results.tried_arms), "arm")
+    if len(results.tried_arms) < len(results.arms):
+        arms = f"{len(results.tried_arms)} of {counted(len(results.arms), 'arm')}"
     summary = (
-        f"{results.title}: {counted(len(results.arms), 'arm')}, "
+        f"{results.title}: {arms}, "
         f"{counted(policies, 'policy', 'policies')}, {counted(len(results.robots), 'robot')}"
     )
     if results.comparisons:
