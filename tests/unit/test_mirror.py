@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -14,6 +15,7 @@ from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
+from quadruped_model import write_quadruped
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
@@ -53,6 +55,14 @@ def test_mirror_by_hand(
     monkeypatch.setattr(symmetry, "GROUPS", {group: parts})
     x = torch.arange(1.0, 1.0 + len(image))
     assert mirrored(group, x, BODY).tolist() == image
+
+
+def test_mirror_of_legs_in_another_order(tmp_path: Path) -> None:
+    """Legs LF, LH, RF, RH, as ANYmal's: the sides follow from the model, not from the names."""
+    body = legged(write_quadruped(tmp_path / "robot"))
+    x = torch.arange(1.0, 13.0)
+    image = [-7, 8, 9, -10, 11, 12, -1, 2, 3, -4, 5, 6]
+    assert mirrored("action", x, body).tolist() == image
 
 
 def test_a_batch_and_its_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:

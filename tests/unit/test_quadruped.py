@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,11 +13,15 @@ import pytest
 import pronk.robots
 from command_line import accepted, refused
 from pronk.errors import RobotError
+from pronk.jump.virtual.plant import legs_of
 from pronk.robots import load_robot
-from pronk.robots.legged import legged
+from pronk.robots.legged import legged, opposite_legs
 from pronk.robots.quadruped import quadruped_problems, require_quadruped
+from quadruped_model import ANYMAL, SPOT, write_quadruped
 
 GO2 = Path(pronk.robots.__file__).parent / "go2"
+ENDS = {"front": 0.3, "rear": -0.3}
+SIDES = {"left": 0.2, "right": -0.2}
 Edit = Callable[[str], str]
 
 
@@ -66,6 +71,62 @@ def without_folded(text: str) -> str:
 @pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
 def test_shipped_quadrupeds_can_be_trained(name: str) -> None:
     assert quadruped_problems(load_robot(name)) == []
+
+
+@pytest.mark.parametrize(
+    ("legs", "opposite"),
+    [
+        (ANYMAL, {"LF": "RF", "LH": "RH", "RF": "LF", "RH": "LH"}),
+        (SPOT, {"fl": "fr", "fr": "fl", "hl": "hr", "hr": "hl"}),
+        (
+            {"one": (0.3, 0.2), "two": (-0.3, -0.2), "three": (0.3, -0.2), "four": (-0.3, 0.2)},
+            {"one": "three", "two": "four", "three": "one", "four": "two"},
+        ),
+        (
+            {f"{end}_{side}": (x, y) for end, x in ENDS.items() for side, y in SIDES.items()},
+            {
+                "front_left": "front_right",
+                "front_right": "front_left",
+                "rear_left": "rear_right",
+                "rear_right": "rear_left",
+            },
+        ),
+    ],
+)
+def test_sides_are_those_of_the_hips(
+    legs: dict[str, tuple[float, float]], opposite: dict[str, str], tmp_path: Path
+) -> None:
+    """Whatever the legs are called, and in whatever order the model has them."""
+    path = write_quadruped(tmp_path / "robot", legs)
+    robot = load_robot(path)
+    assert quadruped_problems(robot) == []
+    assert legged(path).opposite == opposite
+    assert legs_of(robot) == tuple(legs)
+
+
+def test_sides_of_a_model_of_others() -> None:
+    """Unitree's A1 as PyBullet has it, whose joints are FR_hip_joint and so on."""
+    pybullet_data = pytest.importorskip("pybullet_data")
+    robot = load_robot(Path(pybullet_data.getDataPath()) / "a1" / "a1.urdf")
+    robot = replace(robot, legs=("FR", "FL", "RR", "RL"))
+    opposite = opposite_legs(robot, robot.build_spec().compile())
+    assert opposite == {"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}
+
+
+@pytest.mark.parametrize(
+    "legs",
+    [
+        {"LF": (0.36, 0.2), "RF": (0.36, -0.2), "LH": (-0.36, 0.2), "RH": (-0.36, 0.3)},
+        {"LF": (0.36, 0.2), "RF": (0.36, -0.2), "LH": (-0.36, 0.2), "RH": (-0.3, -0.2)},
+        # The front is where the model's x axis does not point.
+        {"LF": (-0.36, -0.2), "RF": (-0.36, 0.2), "LH": (0.36, -0.2), "RH": (0.36, 0.2)},
+    ],
+)
+def test_legs_in_wrong_places_are_named(
+    legs: dict[str, tuple[float, float]], tmp_path: Path
+) -> None:
+    problems = quadruped_problems(load_robot(write_quadruped(tmp_path / "robot", legs)))
+    assert any("hips are" in problem and "RH at x" in problem for problem in problems)
 
 
 @pytest.mark.parametrize(

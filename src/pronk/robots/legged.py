@@ -23,6 +23,8 @@ class Legged:
 
     legs: tuple[str, ...]
     """Prefixes of the joints of each leg."""
+    opposite: dict[str, str]
+    """Leg on the other side of each leg; empty where left and right have not as many."""
     shanks: dict[str, str]
     """Body that carries the foot of each leg, by the prefix of the leg."""
     leg_joints: tuple[str, ...]
@@ -87,6 +89,7 @@ def _read_legged(path: Path, _modified_ns: int, _model_modified_ns: int) -> Legg
     first_shank = model.body(shanks[robot.legs[0]]).id
     return Legged(
         legs=robot.legs,
+        opposite=opposite_legs(robot, model),
         shanks=shanks,
         leg_joints=tuple(default_position),
         default_position=default_position,
@@ -101,9 +104,53 @@ def _read_legged(path: Path, _modified_ns: int, _model_modified_ns: int) -> Legg
     )
 
 
-def other_side(leg: str) -> str:
-    """Return the leg on the other side, as HL for HR."""
-    return leg[0] + ("L" if leg[1] == "R" else "R")
+def hips(robot: RobotSpec, model: mujoco.MjModel) -> dict[str, Array]:
+    """Return where the thigh of each leg is jointed to the hip, by the prefix of the leg.
+
+    Args:
+        robot: A robot with legs.
+        model: Its compiled model.
+
+    Returns:
+        Places in the base's frame with all joints at zero, forwards, to the left and upwards from
+        the base [m], (3,).
+    """
+    data, to_base = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
+    origin = data.xpos[model.body(robot.base_body).id]
+    places = {}
+    for leg in robot.legs:
+        anchor = data.xanchor[model.joint(_thigh_joint(robot, leg)).id]
+        places[leg] = to_base @ (anchor - origin)
+    return places
+
+
+def opposite_legs(robot: RobotSpec, model: mujoco.MjModel) -> dict[str, str]:
+    """Return the leg on the other side of each leg, as HL for HR.
+
+    It follows from where the hips are, whatever the legs are called: the foremost leg of the left
+    is opposite to the foremost one of the right, and so on to the rear.
+
+    Args:
+        robot: A robot with legs.
+        model: Its compiled model.
+
+    Returns:
+        The legs by prefix; empty where left and right have not as many.
+    """
+    places = hips(robot, model)
+    middle = float(np.mean([place[1] for place in places.values()]))
+    left_legs: list[str] = []
+    right_legs: list[str] = []
+    for leg in sorted(robot.legs, key=lambda leg: -places[leg][0]):
+        side = left_legs if places[leg][1] > middle else right_legs
+        side.append(leg)
+    if len(left_legs) != len(right_legs):
+        return {}
+    opposite = {}
+    for left_leg, right_leg in zip(left_legs, right_legs, strict=True):
+        opposite[left_leg] = right_leg
+        opposite[right_leg] = left_leg
+    return opposite
 
 
 def posed(
@@ -132,10 +179,14 @@ def default_pose(robot: RobotSpec) -> dict[str, float]:
 def _forward(robot: RobotSpec, model: mujoco.MjModel) -> float:
     """Return the sign of the turn of the first thigh that moves a foot below it forwards."""
     data, to_base = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
-    joints = [name for name in robot.joint_names if name.startswith(f"{robot.legs[0]}_")]
-    thigh_joint = joints[-2] if len(joints) > 1 else joints[-1]
-    axis = to_base @ data.xaxis[model.joint(thigh_joint).id]
+    axis = to_base @ data.xaxis[model.joint(_thigh_joint(robot, robot.legs[0])).id]
     return -1.0 if axis[1] > 0.0 else 1.0
+
+
+def _thigh_joint(robot: RobotSpec, leg: str) -> str:
+    """Return the joint that turns the thigh of a leg: the last but one, or the only one."""
+    joints = [name for name in robot.joint_names if name.startswith(f"{leg}_")]
+    return joints[-2] if len(joints) > 1 else joints[-1]
 
 
 def _standing_height(robot: RobotSpec, model: mujoco.MjModel, feet: Sequence[int]) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
-from pronk.robots.legged import default_pose, other_side, posed
+from pronk.robots.legged import default_pose, hips, opposite_legs, posed
 from pronk.robots.robot import RobotSpec
 
 LEG_JOINTS = ("hip_roll", "hip_pitch", "knee")
@@ -36,6 +36,27 @@ BENT = 0.1
 [rad]."""
 SAME_POSE = 1e-3
 """Largest difference of a left and a right joint in the default pose [rad]."""
+SAME_HIP = 0.01
+"""Largest distance of a hip from the mirror image of the one on the other side [m]."""
+FRONT_RIGHT = ("front", "right")
+FRONT_LEFT = ("front", "left")
+REAR_RIGHT = ("rear", "right")
+REAR_LEFT = ("rear", "left")
+PLACES = {
+    "FR": FRONT_RIGHT,
+    "RF": FRONT_RIGHT,
+    "FL": FRONT_LEFT,
+    "LF": FRONT_LEFT,
+    "HR": REAR_RIGHT,
+    "RH": REAR_RIGHT,
+    "RR": REAR_RIGHT,
+    "BR": REAR_RIGHT,
+    "HL": REAR_LEFT,
+    "LH": REAR_LEFT,
+    "RL": REAR_LEFT,
+    "BL": REAR_LEFT,
+}
+"""Places that the usual names of legs say; other names say none, and need not."""
 STEADY = 0.15
 """Smallest distance of the centre of mass from the foremost and from the hindmost foot, as a share
 of the distance between these."""
@@ -79,9 +100,10 @@ def quadruped_problems(robot: RobotSpec) -> list[str]:
     problems = [
         *_shape_problems(robot, model),
         *_axis_problems(robot, at_zero, to_trunk),
+        *_side_problems(robot, model),
         *_straightness_problems(robot, at_zero, to_trunk),
         *_contact_problems(robot, model),
-        *_pose_problems(robot),
+        *_pose_problems(robot, model),
     ]
     if not problems:
         problems = _balance_problems(robot, model)
@@ -96,15 +118,8 @@ def _leg_problems(robot: RobotSpec) -> list[str]:
             "of its joints in its robot.yaml, as in legs: [FR, FL, RR, RL]"
         ]
     legs = ", ".join(robot.legs)
-    has_sides = all(len(leg) == 2 and leg[1] in "LR" for leg in robot.legs)
-    if len(robot.legs) != 4 or not has_sides:
-        return [
-            f"its legs are {legs}; expected four names of two letters, the second R for a right "
-            "leg and L for a left one, as FR, FL, RR and RL"
-        ]
-    for leg in robot.legs:
-        if other_side(leg) not in robot.legs:
-            return [f"its legs are {legs}; {leg} has no {other_side(leg)} on the other side"]
+    if len(robot.legs) != 4:
+        return [f"its legs are {legs}; expected four, as FR, FL, RR and RL or LF, RF, LH and RH"]
     expected = []
     for leg in robot.legs:
         for joint in LEG_JOINTS:
@@ -113,10 +128,8 @@ def _leg_problems(robot: RobotSpec) -> list[str]:
     if names == tuple(expected):
         return []
     if sorted(names) == sorted(expected):
-        order = tuple(dict.fromkeys(name[:2] for name in names))
-        if len(order) == 4 and names == tuple(
-            f"{leg}_{name}" for leg in order for name in LEG_JOINTS
-        ):
+        order = sorted(robot.legs, key=lambda leg: names.index(f"{leg}_{LEG_JOINTS[0]}"))
+        if names == tuple(f"{leg}_{name}" for leg in order for name in LEG_JOINTS):
             return [
                 f"the model has its legs in the order {', '.join(order)}, and `legs` in its "
                 f"robot.yaml says {legs}; give them in the order of the model"
@@ -231,6 +244,35 @@ def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> li
     return problems
 
 
+def _side_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+    """List hips that are no mirror images, and legs that are not where their names say."""
+    places = hips(robot, model)
+    opposite = opposite_legs(robot, model)
+    hip_texts = []
+    for leg, place in places.items():
+        hip_texts.append(f"{leg} at x = {place[0]:.3f}, y = {place[1]:.3f} m")
+    text = f"the hips are in the trunk's frame at zero: {'; '.join(hip_texts)}"
+    if not opposite:
+        return [f"{text}; expected two on its left, of larger y, and two on its right"]
+    for leg, opposite_leg in opposite.items():
+        image = places[opposite_leg] * (1.0, -1.0, 1.0)
+        if np.linalg.norm(places[leg] - image) > SAME_HIP:
+            return [f"{text}; expected those of {leg} and {opposite_leg} to be mirror images"]
+    middle = float(np.mean([place[0] for place in places.values()]))
+    misplaced = []
+    for leg, place in places.items():
+        end = "front" if place[0] > middle else "rear"
+        side = "left" if place[1] > 0.0 else "right"
+        if PLACES.get(leg.upper(), (end, side)) != (end, side):
+            misplaced.append(f"{leg} is the {end} {side} leg")
+    if misplaced:
+        return [
+            f"{text}: {', '.join(misplaced)}; the trunk's x axis has to point forwards and its "
+            "y axis to the left"
+        ]
+    return []
+
+
 def _straightness_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> list[str]:
     """List legs that do not hang straight down with all joints at zero.
 
@@ -297,21 +339,24 @@ def _contact_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     return problems
 
 
-def _pose_problems(robot: RobotSpec) -> list[str]:
+def _pose_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     """List straight knees, and left legs that are not the mirror image of the right ones."""
     problems = []
     position = default_pose(robot)
+    opposite = opposite_legs(robot, model)
+    compared: set[str] = set()
     for leg in robot.legs:
         if abs(position[f"{leg}_knee"]) < BENT:
             problems.append(
                 f"poses.default has {leg}_knee at {position[f'{leg}_knee']:g} rad; expected a "
                 f"bent knee, {BENT:g} rad or more to either side"
             )
-        if leg[1] == "L":
+        if leg in compared or leg not in opposite:
             continue
+        compared.add(opposite[leg])
         for name in LEG_JOINTS:
             angle = position[f"{leg}_{name}"]
-            image = f"{other_side(leg)}_{name}"
+            image = f"{opposite[leg]}_{name}"
             expected = -angle if name == "hip_roll" else angle
             if abs(position[image] - expected) > SAME_POSE:
                 problems.append(

@@ -352,7 +352,10 @@ def legs_of(robot: RobotSpec) -> tuple[str, ...]:
 
 
 def limb_of(robot: RobotSpec, name: str) -> str:
-    """Return the limb of a joint: what its joints' names begin with, or its first joint."""
+    """Return the limb of a joint: its leg, else what its joints' names begin with or its first."""
+    for leg in robot.legs:
+        if name.startswith(f"{leg}_"):
+            return leg
     joint = robot.joint(name)
     limb_joints = (name, *joint.chain, *joint.clamped)
     limb = [joint_name for joint_name in robot.joint_names if joint_name in limb_joints]

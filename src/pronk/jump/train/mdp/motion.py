@@ -13,7 +13,7 @@ from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
-from pronk.robots.legged import Legged, other_side
+from pronk.robots.legged import Legged
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -97,7 +97,7 @@ def mirror_joints(body: Legged) -> dict[str, str]:
     mirror = {}
     for leg in body.legs:
         for joint in body.leg_joints:
-            mirror[f"{leg}_{joint}"] = f"{other_side(leg)}_{joint}"
+            mirror[f"{leg}_{joint}"] = f"{body.opposite[leg]}_{joint}"
     return mirror
 
 

@@ -29,7 +29,7 @@ from pronk.errors import PronkError
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.policy.observation import ESTIMATE, MEASURED
-from pronk.robots.legged import Legged, other_side
+from pronk.robots.legged import Legged
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: len(part) for name, part in MEASURED.items()},
@@ -71,16 +71,23 @@ def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
             f"the observation group {group!r} has no known layout; expected one of "
             f"{', '.join(GROUPS)}."
         )
-    source, sign = _mirror(group, body.legs, body.leg_joints, x.device)
+    opposite = tuple(body.legs.index(body.opposite[leg]) for leg in body.legs)
+    source, sign = _mirror(group, opposite, body.leg_joints, x.device)
     return x[..., source] * sign
 
 
 @lru_cache
 def _mirror(
-    group: str, legs: tuple[str, ...], joints: tuple[str, ...], device: torch.device
+    group: str, leg_indices: tuple[int, ...], joints: tuple[str, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return index and sign of the original's number that each number of the image is."""
-    leg_indices = [legs.index(other_side(leg)) for leg in legs]
+    """Return index and sign of the original's number that each number of the image is.
+
+    Args:
+        group: Name of a group of `GROUPS`.
+        leg_indices: Index of the leg on the other side of each leg.
+        joints: Joints of a leg.
+        device: Device of the tensors.
+    """
     joint_indices = []
     joint_signs = []
     for leg_index in leg_indices:
@@ -96,8 +103,8 @@ def _mirror(
             quantity_indices = [0, 1, 2]
             quantity_signs = list(_SIGNS[name])
         elif name in _LEGS:
-            quantity_indices = leg_indices
-            quantity_signs = [1.0] * len(legs)
+            quantity_indices = list(leg_indices)
+            quantity_signs = [1.0] * len(leg_indices)
         elif name in _JOINTS:
             quantity_indices = joint_indices
             quantity_signs = joint_signs
