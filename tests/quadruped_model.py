@@ -45,7 +45,7 @@ def write_quadruped(
           <geom name="{leg}_thigh_collision" type="capsule" fromto="0 0 -0.05 0 0 -0.285"
                 size="0.03" mass="3" {COLLISION}/>
           <body name="{leg}_SHANK" pos="0 0 -0.285">
-            <joint name="{knee}" axis="0 1 0" range="-2.6 0.2"/>
+            <joint name="{knee}" axis="0 1 0" range="-2.6 0.6"/>
             <geom name="{leg}_shank_collision" type="capsule" fromto="0 0 -0.05 0 0 -0.27"
                   size="0.018" mass="0.5" {COLLISION}/>
             <geom name="{leg}_foot_collision" type="sphere" pos="0 0 -0.32" size="0.03" mass="0.1"

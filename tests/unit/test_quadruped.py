@@ -104,6 +104,46 @@ def test_sides_are_those_of_the_hips(
     assert legs_of(robot) == tuple(legs)
 
 
+@pytest.mark.parametrize(
+    ("legs", "joints"),
+    [
+        (ANYMAL, ("HAA", "HFE", "KFE")),
+        (SPOT, ("hx", "hy", "kn")),
+        (SPOT, ("hip_joint", "thigh_joint", "calf_joint")),
+    ],
+)
+def test_joints_are_called_as_their_maker_calls_them(
+    legs: dict[str, tuple[float, float]], joints: tuple[str, str, str], tmp_path: Path
+) -> None:
+    usual = legged(write_quadruped(tmp_path / "usual", legs))
+    path = write_quadruped(tmp_path / "robot", legs, joints)
+    assert quadruped_problems(load_robot(path)) == []
+    body = legged(path)
+    assert body.leg_joints == joints
+    assert body.forward == usual.forward
+    assert body.standing_height == usual.standing_height
+
+
+def test_joints_of_a_leg_in_another_order_are_refused(tmp_path: Path) -> None:
+    """Groups of one joint each, as in a fresh robot.yaml, and a thigh before its hip."""
+    path = write_quadruped(tmp_path / "robot")
+    text = path.read_text()
+    groups = "".join(f"  {leg}_knee: {{drive: drive}}\n" for leg in ANYMAL)
+    text = text.replace('  knee: {joints: "*_knee", drive: drive}\n', groups)
+    angles = ", ".join(f"{leg}_knee: -1.0" for leg in ANYMAL)
+    path.write_text(text.replace("knee: -1.0", angles))
+    (problem,) = quadruped_problems(load_robot(path))
+    assert "LH_knee" in problem
+    assert "*_hip_roll" in problem
+    assert "groups" in problem
+    swapped = write_quadruped(tmp_path / "swapped")
+    model = swapped.with_name("model.xml")
+    words = model.read_text().replace('"LH_knee"', '"x"').replace('"LH_hip_pitch"', '"LH_knee"')
+    model.write_text(words.replace('"x"', '"LH_hip_pitch"'))
+    (problem,) = quadruped_problems(load_robot(swapped))
+    assert "LH_knee, LH_hip_pitch" in problem
+
+
 def test_sides_of_a_model_of_others() -> None:
     """Unitree's A1 as PyBullet has it, whose joints are FR_hip_joint and so on."""
     pybullet_data = pytest.importorskip("pybullet_data")

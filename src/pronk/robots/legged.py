@@ -16,6 +16,13 @@ from pronk.robots import load_robot, robot_version
 from pronk.robots.model import kinematics
 from pronk.robots.robot import RobotSpec
 
+HIP_ROLL = 0
+"""Place among the joints of a leg of three of that about the trunk's x axis."""
+HIP_PITCH = 1
+"""Place of that which turns the thigh."""
+KNEE = 2
+"""Place of that which turns the shank."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Legged:
@@ -104,6 +111,11 @@ def _read_legged(path: Path, _modified_ns: int, _model_modified_ns: int) -> Legg
     )
 
 
+def joints_of_leg(robot: RobotSpec, leg: str) -> tuple[str, ...]:
+    """Return the joints of a leg in the order of the model, from the hip down."""
+    return tuple(name for name in robot.joint_names if name.startswith(f"{leg}_"))
+
+
 def hips(robot: RobotSpec, model: mujoco.MjModel) -> dict[str, Array]:
     """Return where the thigh of each leg is jointed to the hip, by the prefix of the leg.
 
@@ -185,7 +197,7 @@ def _forward(robot: RobotSpec, model: mujoco.MjModel) -> float:
 
 def _thigh_joint(robot: RobotSpec, leg: str) -> str:
     """Return the joint that turns the thigh of a leg: the last but one, or the only one."""
-    joints = [name for name in robot.joint_names if name.startswith(f"{leg}_")]
+    joints = joints_of_leg(robot, leg)
     return joints[-2] if len(joints) > 1 else joints[-1]
 
 

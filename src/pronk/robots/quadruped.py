@@ -16,11 +16,20 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
-from pronk.robots.legged import default_pose, hips, opposite_legs, posed
+from pronk.robots.legged import (
+    HIP_PITCH,
+    HIP_ROLL,
+    KNEE,
+    default_pose,
+    hips,
+    joints_of_leg,
+    opposite_legs,
+    posed,
+)
 from pronk.robots.robot import RobotSpec
 
-LEG_JOINTS = ("hip_roll", "hip_pitch", "knee")
-"""Joints of a leg from the hip down, without the prefix."""
+LEG_JOINTS = ("hip roll", "hip pitch", "knee")
+"""Joints of a leg from the hip down, in words."""
 LEG_PARTS = ("thigh_collision", "shank_collision", "foot_collision")
 """Geoms of a leg that touch the ground, without the prefix."""
 TRUNK = "trunk_collision"
@@ -93,7 +102,7 @@ def quadruped_problems(robot: RobotSpec) -> list[str]:
     if problems:
         return problems
     model = robot.build_spec().compile()
-    problems = _name_problems(robot, model)
+    problems = [*_group_problems(robot), *_name_problems(robot, model)]
     if problems:
         return problems
     at_zero, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
@@ -120,23 +129,61 @@ def _leg_problems(robot: RobotSpec) -> list[str]:
     legs = ", ".join(robot.legs)
     if len(robot.legs) != 4:
         return [f"its legs are {legs}; expected four, as FR, FL, RR and RL or LF, RF, LH and RH"]
-    expected = []
-    for leg in robot.legs:
-        for joint in LEG_JOINTS:
-            expected.append(f"{leg}_{joint}")
     names = robot.joint_names
-    if names == tuple(expected):
+    first_joints = joints_of_leg(robot, robot.legs[0])
+    rule = (
+        f"expected {', '.join(LEG_JOINTS)} of each leg in this order, leg by leg, and called alike "
+        "behind the prefix"
+    )
+    remedy = "rename the joints in the model, and hold others by `held` in its robot.yaml"
+    if len(first_joints) != len(LEG_JOINTS):
+        return [
+            f"the joints of its leg {robot.legs[0]} are {', '.join(first_joints)}; {rule}: {remedy}"
+        ]
+    suffixes = [name.removeprefix(f"{robot.legs[0]}_") for name in first_joints]
+    expected = _leg_by_leg(robot.legs, suffixes)
+    if names == expected:
         return []
     if sorted(names) == sorted(expected):
-        order = sorted(robot.legs, key=lambda leg: names.index(f"{leg}_{LEG_JOINTS[0]}"))
-        if names == tuple(f"{leg}_{name}" for leg in order for name in LEG_JOINTS):
+        order = sorted(robot.legs, key=lambda leg: names.index(f"{leg}_{suffixes[0]}"))
+        if names == _leg_by_leg(order, suffixes):
             return [
                 f"the model has its legs in the order {', '.join(order)}, and `legs` in its "
                 f"robot.yaml says {legs}; give them in the order of the model"
             ]
+    return [f"its joints are {', '.join(names)}; {rule}, as {', '.join(expected)}: {remedy}"]
+
+
+def _leg_by_leg(legs: Sequence[str], suffixes: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the joints of all legs, one leg after the other."""
+    names = []
+    for leg in legs:
+        for suffix in suffixes:
+            names.append(f"{leg}_{suffix}")
+    return tuple(names)
+
+
+def _group_problems(robot: RobotSpec) -> list[str]:
+    """Say which joint groups are not the four joints of one kind.
+
+    Training reads gains group by group, and takes each as that of one joint of all legs.
+    """
+    kinds = []
+    for number in range(len(LEG_JOINTS)):
+        kinds.append(tuple(joints_of_leg(robot, leg)[number] for leg in robot.legs))
+    groups = []
+    for group in robot.groups:
+        groups.append(tuple(joint.name for joint in robot.group(group)))
+    if groups == kinds:
+        return []
+    first_joints = joints_of_leg(robot, robot.legs[0])
+    patterns = []
+    for name in first_joints:
+        suffix = name.removeprefix(f"{robot.legs[0]}_")
+        patterns.append(f'{suffix}: {{joints: "*_{suffix}", ...}}')
     return [
-        f"its joints are {', '.join(names)}; expected {', '.join(expected)}, leg by leg: rename "
-        "the joints in the model, and hold others by `held` in its robot.yaml"
+        f"its joint groups are {', '.join(robot.groups)}; expected three, each with one joint of "
+        f"all legs from the hip down, as in groups: {', '.join(patterns)}"
     ]
 
 
@@ -175,7 +222,7 @@ def _shape_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     other_sites = []
     other_shanks = []
     for leg in robot.legs:
-        shank_body = model.joint(f"{leg}_knee").bodyid[0]
+        shank_body = model.joint(joints_of_leg(robot, leg)[KNEE]).bodyid[0]
         foot = model.geom(f"{leg}_foot_collision")
         site = model.site(f"{leg}_foot")
         is_sphere = foot.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
@@ -215,31 +262,30 @@ def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> li
     """
     model = data.model
     problems = []
-    signs: dict[str, dict[str, float]] = {name: {} for name in LEG_JOINTS}
+    signs: dict[str, dict[str, float]] = {word: {} for word in LEG_JOINTS}
     for leg in robot.legs:
-        for name in LEG_JOINTS:
-            direction = 0 if name == "hip_roll" else 1
-            joint = model.joint(f"{leg}_{name}").id
-            component = float((to_trunk @ data.xaxis[joint])[direction])
+        for number, name in enumerate(joints_of_leg(robot, leg)):
+            direction = 0 if number == HIP_ROLL else 1
+            component = float((to_trunk @ data.xaxis[model.joint(name).id])[direction])
             if abs(component) < PARALLEL:
                 problems.append(
-                    f"{leg}_{name} does not turn about the trunk's {'xy'[direction]} axis with all "
+                    f"{name} does not turn about the trunk's {'xy'[direction]} axis with all "
                     "joints at zero"
                 )
-            signs[name][leg] = math.copysign(1.0, component)
+            signs[LEG_JOINTS[number]][leg] = math.copysign(1.0, component)
     if problems:
         return [*problems, "the trunk's x axis has to point forwards and its z axis upwards"]
-    for name, sign_of_leg in signs.items():
+    for word, sign_of_leg in signs.items():
         if len(set(sign_of_leg.values())) > 1:
             positive = [leg for leg, sign in sign_of_leg.items() if sign > 0.0]
             negative = [leg for leg, sign in sign_of_leg.items() if sign < 0.0]
             problems.append(
-                f"the axes of *_{name} differ in sign, + for {', '.join(positive)} and - for "
+                f"the axes of the {word} differ in sign, + for {', '.join(positive)} and - for "
                 f"{', '.join(negative)}; expected one sign for all legs"
             )
-    if not problems and signs["hip_pitch"] != signs["knee"]:
+    if not problems and signs[LEG_JOINTS[HIP_PITCH]] != signs[LEG_JOINTS[KNEE]]:
         problems.append(
-            "the axes of *_hip_pitch and *_knee have opposite signs; expected the same sign"
+            "the axes of hip pitch and knee have opposite signs; expected the same sign"
         )
     return problems
 
@@ -284,8 +330,9 @@ def _straightness_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Arra
     model = data.model
     bent = []
     for leg in robot.legs:
-        hip = data.xanchor[model.joint(f"{leg}_hip_pitch").id]
-        knee = data.xanchor[model.joint(f"{leg}_knee").id]
+        joints = joints_of_leg(robot, leg)
+        hip = data.xanchor[model.joint(joints[HIP_PITCH]).id]
+        knee = data.xanchor[model.joint(joints[KNEE]).id]
         foot = data.geom_xpos[model.geom(f"{leg}_foot_collision").id]
         for part, upper, lower in (("thigh", hip, knee), ("shank", knee, foot)):
             x, _, z = to_trunk @ (lower - upper)
@@ -346,21 +393,23 @@ def _pose_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     opposite = opposite_legs(robot, model)
     compared: set[str] = set()
     for leg in robot.legs:
-        if abs(position[f"{leg}_knee"]) < BENT:
+        joints = joints_of_leg(robot, leg)
+        knee = position[joints[KNEE]]
+        if abs(knee) < BENT:
             problems.append(
-                f"poses.default has {leg}_knee at {position[f'{leg}_knee']:g} rad; expected a "
+                f"poses.default has {joints[KNEE]} at {knee:g} rad; expected a "
                 f"bent knee, {BENT:g} rad or more to either side"
             )
         if leg in compared or leg not in opposite:
             continue
         compared.add(opposite[leg])
-        for name in LEG_JOINTS:
-            angle = position[f"{leg}_{name}"]
-            image = f"{opposite[leg]}_{name}"
-            expected = -angle if name == "hip_roll" else angle
+        images = joints_of_leg(robot, opposite[leg])
+        for number, (name, image) in enumerate(zip(joints, images, strict=True)):
+            angle = position[name]
+            expected = -angle if number == HIP_ROLL else angle
             if abs(position[image] - expected) > SAME_POSE:
                 problems.append(
-                    f"poses.default has {leg}_{name} at {angle:g} rad and {image} at "
+                    f"poses.default has {name} at {angle:g} rad and {image} at "
                     f"{position[image]:g} rad; expected {expected:g} rad there, the mirror image"
                 )
     return problems
@@ -380,6 +429,6 @@ def _balance_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
         return [
             f"in poses.default the centre of mass is at x = {mass_x:.3f} m and the feet are at "
             f"{min(feet):.3f} to {max(feet):.3f} m, so that it tips over; expected feet below the "
-            "hips, as with hip_pitch at about minus half of knee"
+            "hips, as with the hip pitch at about minus half of the knee"
         ]
     return []

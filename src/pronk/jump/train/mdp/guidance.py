@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pronk.jump.train.mdp.jump import JumpSettings
 from pronk.jump.train.mdp.motion import standing_leg
-from pronk.robots.legged import Legged
+from pronk.robots.legged import HIP_PITCH, KNEE, Legged
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -38,7 +38,7 @@ def leg_angles(body: Legged, leg: str, length: Tensor) -> tuple[Tensor, Tensor]:
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = torch.arccos(cosine.clamp(-1.0, 1.0))
     pitch = -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos())
-    sign = 1.0 if body.leg_poses[leg]["knee"] >= 0.0 else -1.0
+    sign = 1.0 if body.leg_poses[leg][body.leg_joints[KNEE]] >= 0.0 else -1.0
     return sign * pitch, sign * knee
 
 
@@ -103,7 +103,7 @@ def foot_sweep(body: Legged, settings: JumpSettings, dt: float) -> Tensor:
     ahead = (middle - time).clamp(-0.5 * push_s, 0.5 * push_s)  # at 1 m/s [m]
     length = standing_leg(body) + settings.countermovement(time)
     angles = torch.zeros(len(time), len(body.leg_joints), dtype=torch.float64)
-    angles[:, body.leg_joints.index("hip_pitch")] = body.forward * torch.atan(ahead / length)
+    angles[:, HIP_PITCH] = body.forward * torch.atan(ahead / length)
     offsets = angles.repeat(1, len(body.legs))
     return torch.cat((offsets, torch.zeros_like(offsets[:1]))).float()
 

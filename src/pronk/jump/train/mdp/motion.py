@@ -13,7 +13,7 @@ from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
-from pronk.robots.legged import Legged
+from pronk.robots.legged import KNEE, Legged
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -115,7 +115,8 @@ def leg_length(body: Legged, knee: Tensor) -> Tensor:
 
 def standing_leg(body: Legged) -> float:
     """Compute the length of a leg in the default pose [m]."""
-    return float(leg_length(body, torch.tensor(body.default_position["knee"]).double()))
+    knee = body.default_position[body.leg_joints[KNEE]]
+    return float(leg_length(body, torch.tensor(knee).double()))
 
 
 @dataclass(kw_only=True)
@@ -211,7 +212,7 @@ def measure_motion(
     ]
     torque = state.torque
     # A free joint has seven positions; the knee has its place among the joints of each leg.
-    knees = qpos[:, 7 + body.leg_joints.index("knee") :: len(body.leg_joints)]
+    knees = qpos[:, 7 + KNEE :: len(body.leg_joints)]
     limb_contacts = state.limbs_found > 0
     return StepMotion(
         joints=JointMotion(

@@ -29,7 +29,7 @@ from pronk.errors import PronkError
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.policy.observation import ESTIMATE, MEASURED
-from pronk.robots.legged import Legged
+from pronk.robots.legged import HIP_ROLL, Legged
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: len(part) for name, part in MEASURED.items()},
@@ -72,28 +72,28 @@ def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
             f"{', '.join(GROUPS)}."
         )
     opposite = tuple(body.legs.index(body.opposite[leg]) for leg in body.legs)
-    source, sign = _mirror(group, opposite, body.leg_joints, x.device)
+    source, sign = _mirror(group, opposite, len(body.leg_joints), x.device)
     return x[..., source] * sign
 
 
 @lru_cache
 def _mirror(
-    group: str, leg_indices: tuple[int, ...], joints: tuple[str, ...], device: torch.device
+    group: str, leg_indices: tuple[int, ...], joints_per_leg: int, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Return index and sign of the original's number that each number of the image is.
 
     Args:
         group: Name of a group of `GROUPS`.
         leg_indices: Index of the leg on the other side of each leg.
-        joints: Joints of a leg.
+        joints_per_leg: Number of joints of a leg.
         device: Device of the tensors.
     """
     joint_indices = []
     joint_signs = []
     for leg_index in leg_indices:
-        for i, joint in enumerate(joints):
-            joint_indices.append(leg_index * len(joints) + i)
-            joint_signs.append(-1.0 if joint == "hip_roll" else 1.0)
+        for number in range(joints_per_leg):
+            joint_indices.append(leg_index * joints_per_leg + number)
+            joint_signs.append(-1.0 if number == HIP_ROLL else 1.0)
     sources: list[int] = []
     signs: list[float] = []
     for name, size in GROUPS[group].items():

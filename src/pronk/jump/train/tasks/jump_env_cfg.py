@@ -1,6 +1,6 @@
 """The environment of the jump task, for any quadruped: walk, run and jump on command.
 
-Legs `LEG` with joints `LEG_hip_roll`, `LEG_hip_pitch`, `LEG_knee`, foot sites `LEG_foot`, and
+Legs `LEG` with three joints `LEG_*` each (hip roll, hip pitch, knee), foot sites `LEG_foot`, and
 collision geoms `trunk_collision`, `LEG_thigh_collision`, `LEG_shank_collision`,
 `LEG_foot_collision`. A robot's `env_cfgs.py` calls `jump_env_cfg` and changes what differs.
 """

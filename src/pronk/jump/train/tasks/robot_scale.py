@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pronk.robots.legged import Legged
+from pronk.robots.legged import HIP_PITCH, KNEE, Legged
 
 STANDING_HEIGHT = 0.2989695
 """Height of the Mini Cheetah's trunk in its default pose [m]."""
@@ -37,7 +37,9 @@ def robot_scale(body: Legged) -> RobotScale:
     Args:
         body: Dimensions of the robot.
     """
-    shank_angle = body.default_position["hip_pitch"] + body.default_position["knee"]
+    hip_pitch = body.default_position[body.leg_joints[HIP_PITCH]]
+    knee = body.default_position[body.leg_joints[KNEE]]
+    shank_angle = hip_pitch + knee
     lever = body.shank_length * abs(math.sin(shank_angle))
     torque = body.total_mass * lever / (MASS * KNEE_LEVER)
     return RobotScale(
