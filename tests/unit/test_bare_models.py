@@ -20,6 +20,7 @@ from pronk.robots import load_robot
 from pronk.robots.bare import describe_model, yaml_of_model
 from pronk.robots.model import bench_inertia, bench_spec, free_spec
 from pronk.robots.source_model import MAX_DEPTH
+from quadruped_model import write_quadruped
 
 LEG = """
   <body name="{name}" pos="0 {side} 0">
@@ -563,6 +564,22 @@ def test_a_urdf_needs_no_meshes_and_its_limits_are_used(tmp_path: Path) -> None:
     problems = invoke(("robot", "check", file)).stderr
     assert "effort limit of elbow" in problems
     assert "speed of elbow" in problems
+
+
+def test_joints_with_the_same_finding_share_a_line(tmp_path: Path) -> None:
+    """Each finding is one line, with the names of its joints and the numbers of each."""
+    path = write_quadruped(tmp_path / "robot")
+    text = path.read_text()
+    text = text.replace("armature: 0.1", "armature: 0.0").replace(
+        "stall_torque: 160", "stall_torque: 50"
+    )
+    path.write_text(text)
+    lines = invoke(("robot", "check", path)).stderr.splitlines()
+    for word in ("armature", "stall torque"):
+        (line,) = [line for line in lines if word in line]
+        for joint in load_robot(path).joint_names:
+            assert line.count(joint) == 1
+    assert line.count("50 N m") == 12
 
 
 def test_an_inertia_that_no_body_has_is_replaced_and_named(tmp_path: Path) -> None:

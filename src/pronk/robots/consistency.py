@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -25,6 +27,18 @@ SAME = 0.01
 """Relative difference up to which two limits are the same."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class JointFinding:
+    """What is missing or inconsistent about one joint, as a sentence in three parts."""
+
+    beginning: str
+    """Words before the joint, the same for all joints with this finding."""
+    joint: str
+    """Name of the joint, with its numbers where there are any."""
+    ending: str
+    """Words behind the joint, the same for all joints with this finding."""
+
+
 def marked_lines(text: str) -> int:
     """Return the number of lines of a robot.yaml that are marked CHECK."""
     return sum("# CHECK" in line for line in text.splitlines())
@@ -39,7 +53,7 @@ def unchecked_lines(robot: RobotSpec) -> int:
 
 
 def problems_of(robot: RobotSpec) -> list[str]:
-    """List what is missing or inconsistent about a robot, a sentence each.
+    """List what is missing or inconsistent about a robot, a sentence for each kind of finding.
 
     Compared are each effort limit with 0.1 rad of stiffness, with the torque of gravity in the
     default pose and with the limit of the model; the speed limit with that of a URDF; the pose
@@ -58,11 +72,13 @@ def problems_of(robot: RobotSpec) -> list[str]:
     problems.extend(source.notes)
     gravity = _gravity(robot)
     servos = joint_servos(source.model, source.model.qpos0)
+    findings = []
     for joint in robot.joints:
-        problems.extend(_joint_problems(joint, gravity[joint.name]))
+        findings.extend(_joint_findings(joint, gravity[joint.name]))
         if joint.name in source.joint_names:
             servo = servos[source.joint_names.index(joint.name)]
-            problems.extend(_limit_problems(joint, source, servo))
+            findings.extend(_limit_findings(joint, source, servo))
+    problems.extend(_sentences(findings))
     by_type: dict[str, list[str]] = {}
     for joint in robot.joints:
         if joint.servo != "position":
@@ -103,59 +119,83 @@ def _gravity(robot: RobotSpec) -> dict[str, float]:
     return gravity
 
 
-def _joint_problems(joint: Joint, gravity: float) -> list[str]:
+def _sentences(findings: Iterable[JointFinding]) -> list[str]:
+    """Write each finding once, with the names of all joints that have it."""
+    joints: dict[tuple[str, str], list[str]] = {}
+    for finding in findings:
+        joints.setdefault((finding.beginning, finding.ending), []).append(finding.joint)
+    sentences = []
+    for (beginning, ending), names in joints.items():
+        sentences.append(f"{beginning} {', '.join(names)}{ending}")
+    return sentences
+
+
+def _joint_findings(joint: Joint, gravity: float) -> list[JointFinding]:
     """List what is missing or inconsistent about the numbers of a joint."""
-    problems = []
+    findings = []
+
+    def add(beginning: str, ending: str, numbers: str = "") -> None:
+        text = f"{joint.name} ({numbers})" if numbers else joint.name
+        findings.append(JointFinding(beginning=beginning, joint=text, ending=ending))
+
     drive = joint.drive
     low, high = joint.range
     pose = joint.default_position
     if pose < low - END_OF_RANGE or pose > high + END_OF_RANGE:
-        problems.append(f"poses.default of {joint.name} is outside of its range")
+        add("poses.default is outside of the range of", "")
     elif min(pose - low, high - pose) <= END_OF_RANGE:
-        problems.append(
-            f"poses.default of {joint.name} is at the end of its range; a sweep has no room there"
-        )
+        add("poses.default is at the end of its range for", "; a sweep has no room there")
     if drive.armature <= 0.0:
-        problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
+        add("the rotor inertia (armature) is 0 for", "")
     if drive.frictionloss <= 0.0:
-        problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
+        add("the dry friction (frictionloss) is 0 for", "")
     torque = joint.stiffness * SMALL_ANGLE
     if torque > drive.effort_limit:
-        problems.append(
-            f"the stiffness of {joint.name}, {joint.stiffness:.4g} N m/rad, asks for {torque:.3g} "
-            f"N m at {SMALL_ANGLE:g} rad, and its effort limit is {drive.effort_limit:.4g} N m: "
-            "the drive would be at its limit nearly always; one of the two is wrong, or of "
-            "another unit"
+        add(
+            "the stiffness of",
+            f" asks at {SMALL_ANGLE:g} rad for more than the effort limit: the drive would be at "
+            "its limit nearly always; one of the two is wrong, or of another unit",
+            f"{joint.stiffness:.4g} N m/rad, {torque:.3g} N m of {drive.effort_limit:.4g}",
         )
     if gravity > drive.effort_limit:
-        problems.append(
-            f"gravity asks for {gravity:.3g} N m of {joint.name} in the default pose, and its "
-            f"effort limit is {drive.effort_limit:.4g} N m: it cannot hold the pose"
+        add(
+            "in the default pose gravity asks for more than the effort limit of",
+            ": it cannot hold the pose",
+            f"{gravity:.3g} N m of {drive.effort_limit:.4g}",
         )
     if drive.effort_limit > drive.stall_torque * (1.0 + SAME):
-        problems.append(
-            f"the effort limit of {joint.name}, {drive.effort_limit:.4g} N m, is above its stall "
-            f"torque of {drive.stall_torque:.4g} N m"
+        add(
+            "the effort limit is above the stall torque of",
+            "",
+            f"{drive.effort_limit:.4g} N m, {drive.stall_torque:.4g} N m",
         )
-    return problems
+    return findings
 
 
-def _limit_problems(joint: Joint, source: SourceModel, servo: JointServo) -> list[str]:
+def _limit_findings(joint: Joint, source: SourceModel, servo: JointServo) -> list[JointFinding]:
     """Compare the limits of a drive with those of its model."""
-    problems = []
+    findings = []
     effort_limit = joint.drive.effort_limit
     place = "the URDF" if source.is_urdf else "the model"
     has_limit = 0.0 < servo.effort_limit < np.inf
     if has_limit and not np.isclose(effort_limit, servo.effort_limit, rtol=SAME):
-        problems.append(
-            f"the effort limit of {joint.name} is {effort_limit:.4g} N m, and {place} has "
-            f"{servo.effort_limit:.4g} N m"
+        numbers = f"{effort_limit:.4g} N m, there {servo.effort_limit:.4g}"
+        findings.append(
+            JointFinding(
+                beginning="the effort limit of",
+                joint=f"{joint.name} ({numbers})",
+                ending=f" is not that of {place}",
+            )
         )
     speed_limit = source.speed_limits.get(joint.name)
     speed = joint.drive.no_load_speed
     if speed_limit is not None and speed < speed_limit * (1.0 - SAME):
-        problems.append(
-            f"the no-load speed of {joint.name} is {speed:.4g} rad/s, below the velocity limit of "
-            f"{place}, {speed_limit:.4g} rad/s"
+        numbers = f"{speed:.4g} rad/s, there {speed_limit:.4g}"
+        findings.append(
+            JointFinding(
+                beginning="the no-load speed of",
+                joint=f"{joint.name} ({numbers})",
+                ending=f" is below the velocity limit of {place}",
+            )
         )
-    return problems
+    return findings
