@@ -189,7 +189,7 @@ def check_motion(excitation: Excitation) -> None:
         raise LogError(
             f"{excitation.source or 'log'}: {excitation.joint} did not move: its command travels "
             f"{commanded:.3g} {unit}, its position {travel:.3g}; check that its drive was enabled, "
-            "the joint free, and the columns named right."
+            "the joint free, the columns named right, and command and position of one unit."
         )
 
 

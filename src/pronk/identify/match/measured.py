@@ -396,8 +396,8 @@ def _compared_frequencies(
     if not largest_gain > 1e-3:
         raise IdentifiabilityError(
             f"{source}: {response.joint} did not move (largest gain {largest_gain:.1e} between "
-            f"{low_hz:g} and {high_hz:g} Hz); check that its drive is on and that the column is "
-            "the right one."
+            f"{low_hz:g} and {high_hz:g} Hz); check that its drive is on, that the column is "
+            "the right one, and that command and position are of one unit."
         )
     coherent = excited & response.band(low_hz, high_hz, coherence_min)
     if 2 * int(coherent.sum()) < excited_count:
