@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,7 @@ from pronk.robots.quadruped import quadruped_problems, require_quadruped
 from quadruped_model import ANYMAL, SPOT, write_quadruped
 
 GO2 = Path(pronk.robots.__file__).parent / "go2"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "trainable_quadruped.py"
 ENDS = {"front": 0.3, "rear": -0.3}
 SIDES = {"left": 0.2, "right": -0.2}
 Edit = Callable[[str], str]
@@ -151,6 +154,20 @@ def test_sides_of_a_model_of_others() -> None:
     robot = replace(robot, legs=("FR", "FL", "RR", "RL"))
     opposite = opposite_legs(robot, robot.build_spec().compile())
     assert opposite == {"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}
+
+
+def test_the_example_makes_a_urdf_trainable(tmp_path: Path) -> None:
+    pybullet_data = pytest.importorskip("pybullet_data")
+    model = Path(pybullet_data.getDataPath()) / "a1" / "a1.urdf"
+    legs = ("--legs", "FR", "FL", "RR", "RL")
+    pose = ("--pose", "0", "0.8", "-1.6")
+    folder = tmp_path / "robot"
+    subprocess.run([sys.executable, EXAMPLE, model, folder, *legs, *pose], check=True)
+    robot = load_robot(folder)
+    assert quadruped_problems(robot) == []
+    urdf = load_robot(model).build_spec().compile()
+    mass = float(urdf.body_mass.sum())
+    assert legged(folder).total_mass == pytest.approx(mass)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def _leg_problems(robot: RobotSpec) -> list[str]:
         return [
             f"the joints of its leg {robot.legs[0]} are {', '.join(first_joints)}; {rule}: {remedy}"
         ]
-    suffixes = [name.removeprefix(f"{robot.legs[0]}_") for name in first_joints]
+    suffixes = _suffixes(robot)
     expected = _leg_by_leg(robot.legs, suffixes)
     if names == expected:
         return []
@@ -152,6 +152,12 @@ def _leg_problems(robot: RobotSpec) -> list[str]:
                 f"robot.yaml says {legs}; give them in the order of the model"
             ]
     return [f"its joints are {', '.join(names)}; {rule}, as {', '.join(expected)}: {remedy}"]
+
+
+def _suffixes(robot: RobotSpec) -> list[str]:
+    """Return the names of the joints of the first leg without its prefix."""
+    leg = robot.legs[0]
+    return [name.removeprefix(f"{leg}_") for name in joints_of_leg(robot, leg)]
 
 
 def _leg_by_leg(legs: Sequence[str], suffixes: Sequence[str]) -> tuple[str, ...]:
@@ -176,10 +182,8 @@ def _group_problems(robot: RobotSpec) -> list[str]:
         groups.append(tuple(joint.name for joint in robot.group(group)))
     if groups == kinds:
         return []
-    first_joints = joints_of_leg(robot, robot.legs[0])
     patterns = []
-    for name in first_joints:
-        suffix = name.removeprefix(f"{robot.legs[0]}_")
+    for suffix in _suffixes(robot):
         patterns.append(f'{suffix}: {{joints: "*_{suffix}", ...}}')
     return [
         f"its joint groups are {', '.join(robot.groups)}; expected three, each with one joint of "
@@ -262,7 +266,8 @@ def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> li
     """
     model = data.model
     problems = []
-    signs: dict[str, dict[str, float]] = {word: {} for word in LEG_JOINTS}
+    suffixes = _suffixes(robot)
+    signs: dict[str, dict[str, float]] = {suffix: {} for suffix in suffixes}
     for leg in robot.legs:
         for number, name in enumerate(joints_of_leg(robot, leg)):
             direction = 0 if number == HIP_ROLL else 1
@@ -272,20 +277,22 @@ def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> li
                     f"{name} does not turn about the trunk's {'xy'[direction]} axis with all "
                     "joints at zero"
                 )
-            signs[LEG_JOINTS[number]][leg] = math.copysign(1.0, component)
+            signs[suffixes[number]][leg] = math.copysign(1.0, component)
     if problems:
         return [*problems, "the trunk's x axis has to point forwards and its z axis upwards"]
-    for word, sign_of_leg in signs.items():
+    for suffix, sign_of_leg in signs.items():
         if len(set(sign_of_leg.values())) > 1:
             positive = [leg for leg, sign in sign_of_leg.items() if sign > 0.0]
             negative = [leg for leg, sign in sign_of_leg.items() if sign < 0.0]
             problems.append(
-                f"the axes of the {word} differ in sign, + for {', '.join(positive)} and - for "
+                f"the axes of *_{suffix} differ in sign, + for {', '.join(positive)} and - for "
                 f"{', '.join(negative)}; expected one sign for all legs"
             )
-    if not problems and signs[LEG_JOINTS[HIP_PITCH]] != signs[LEG_JOINTS[KNEE]]:
+    pitch = suffixes[HIP_PITCH]
+    knee = suffixes[KNEE]
+    if not problems and signs[pitch] != signs[knee]:
         problems.append(
-            "the axes of hip pitch and knee have opposite signs; expected the same sign"
+            f"the axes of *_{pitch} and *_{knee} have opposite signs; expected the same sign"
         )
     return problems
 
