@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.bare import describe_model
 from pronk.robots.legged import joints_of_leg
@@ -41,9 +42,14 @@ def main() -> None:
     parser.add_argument("--legs", nargs=4, required=True, help="prefixes of the joints")
     parser.add_argument("--pose", nargs=3, type=float, required=True, help="roll pitch knee [rad]")
     arguments = parser.parse_args()
-    arguments.folder.mkdir()
-    spec = load_robot(arguments.model).build_spec()
+    if arguments.folder.exists():
+        raise SystemExit(f"{arguments.folder} exists already; give the name of a new folder.")
+    try:
+        spec = load_robot(arguments.model).build_spec()
+    except PronkError as error:
+        raise SystemExit(str(error)) from None
     base = name_parts(spec, arguments.legs)
+    arguments.folder.mkdir()
     (arguments.folder / "model.xml").write_text(spec.to_xml())
     content = robot_file(arguments.model, base, arguments.legs, arguments.pose)
     text = yaml.safe_dump(content, sort_keys=False)
@@ -63,7 +69,13 @@ def name_parts(spec: mujoco.MjSpec, legs: list[str]) -> str:
     names = [model.joint(index).name for index in range(model.njnt)]
     hips = []
     for leg in legs:
-        roll, pitch, knee = (name for name in names if name.startswith(f"{leg}_"))
+        joints = [name for name in names if name.startswith(f"{leg}_")]
+        if len(joints) != 3:
+            raise SystemExit(
+                f"{leg} has {len(joints)} joints; expected three whose names begin with {leg}_ "
+                f"among {', '.join(names)}."
+            )
+        roll, pitch, knee = joints
         hips.append(data.xanchor[model.joint(roll).id])
         thigh = spec.body(model.body(model.joint(pitch).bodyid[0]).name)
         shank_id = model.joint(knee).bodyid[0]
