@@ -241,9 +241,9 @@ def env_settings(folder: Path) -> Any:
 
 
 def test_the_reward_rises(tmp_path: Path) -> None:
-    """16 robots and a small network, phase walk, 20 iterations, in which it rises by 0.7."""
+    """8 robots, a small network, phase walk, 20 iterations: +0.47, 0.48, 0.43 with seeds 1 to 3."""
     cfg = load_env_cfg("Pronk-Walk-MiniCheetah")
-    cfg.scene.num_envs = 16
+    cfg.scene.num_envs = 8
     cfg.seed = 1
     learning = load_rl_cfg("Pronk-Walk-MiniCheetah")
     learning.seed = 1
@@ -254,7 +254,7 @@ def test_the_reward_rises(tmp_path: Path) -> None:
     runner.learn(5, init_at_random_ep_len=True)
     first_reward = statistics.mean(runner.logger.rewbuffer)
     runner.learn(15)
-    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.4
+    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.25
     env.close()
 
 
