@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from pronk.identify.match.gains import load_gains
 from pronk.report import figures, style, trial_figures, trial_page
 from pronk.report.paper import published_jumps
 from report_cases import (
@@ -92,6 +94,27 @@ def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> N
     # The map shows RMS dB: the square root of what the artefact holds.
     mapped = np.asarray(axes.collections[0].get_array()).reshape(joint.grid.error.T.shape)
     assert np.allclose(mapped, np.sqrt(joint.grid.error.T))
+
+
+def test_legs_of_another_robot_have_their_own_markers() -> None:
+    """The hind legs of a Go2 are RR and RL, those of a Mini Cheetah HR and HL."""
+    path = Path(__file__).parents[2] / "examples" / "studies" / "go2" / "gains.yaml"
+    gains = load_gains(path)
+    groups: dict[str, list[str]] = {}
+    for joint in gains.joints:
+        groups.setdefault(joint.partition("_")[2], []).append(joint)
+    figure = figures.ranges(gains, groups)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:4] == ["FR", "FL", "RR", "RL"]
+    assert not any(axes.texts for axes in figure.axes), "the legend names the legs"
+    assert len({style.leg_marker(leg) for leg in labels[:4]}) == 4
+    assert style.grid_of_joints(list(gains.joints)) == list(groups.values())
+
+
+def test_fingers_are_of_no_leg() -> None:
+    """Joints of a right hand begin with rh."""
+    assert style.leg_of("rh_FFJ1") == ""
+    assert style.leg_of("fl_knee") == "fl"
 
 
 def test_ellipse_passes_through_the_points_of_its_equation() -> None:

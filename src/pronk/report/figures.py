@@ -458,9 +458,13 @@ def _draw_range(
 
 def _range_keys(gains: MatchedGains, published: bool) -> list[Line2D | Patch]:
     """Return the legend of the training ranges."""
-    markers = {"joint, 95 %": "o"}
-    if any(style.leg_of(joint) for joint in gains.joints):
-        markers = style.LEG_MARKERS
+    markers = {}
+    for joint in gains.joints:
+        leg = style.leg_of(joint)
+        if leg:
+            markers[leg] = style.leg_marker(leg)
+    if not markers:
+        markers = {"joint, 95 %": "o"}
     keys: list[Line2D | Patch] = []
     for label, marker in markers.items():
         entry = key(label, marker=marker, color=style.MEASURED, markersize=5, linestyle="none")
@@ -506,7 +510,7 @@ def _draw_joint_gains(axes: Axes, gains: MatchedGains, joint: str) -> None:
         *point,
         xerr=bars[0],
         yerr=bars[1],
-        fmt=style.LEG_MARKERS.get(leg, "o"),
+        fmt=style.leg_marker(leg),
         color=style.MEASURED,
         markersize=5,
         elinewidth=1.0,

@@ -22,6 +22,14 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pronk.files import written_whole
+from pronk.robots.leg_names import (
+    FRONT_LEFT,
+    FRONT_RIGHT,
+    LEG_NAMES,
+    PLACES,
+    REAR_LEFT,
+    REAR_RIGHT,
+)
 
 MEASURED = "#1a1a1a"
 MEASURED_WIDE = "#909090"
@@ -37,8 +45,8 @@ PAGE_WIDTH_IN = 10.0
 _MARGINS_IN = {"left": 0.8, "right": 0.1, "bottom": 0.95, "top": 0.3}
 """Room about the axes of a figure with fixed margins, for labels of up to five characters, a title,
 and a legend of two rows below [in]."""
-LEG_MARKERS = {"FR": "o", "FL": "s", "HR": "^", "HL": "D"}
-"""Marker of each leg, in file order; joints of other robots take the first."""
+LEG_MARKERS = {FRONT_RIGHT: "o", FRONT_LEFT: "s", REAR_RIGHT: "^", REAR_LEFT: "D"}
+"""Marker of each leg by its place; joints of no leg take the first."""
 Sharing = bool | Literal["row", "col"]
 
 
@@ -93,7 +101,14 @@ def joint_words(name: str) -> str:
 def leg_of(name: str) -> str:
     """Return the leg of a joint named `LEG_JOINT`; an empty string for a robot without legs."""
     head = name.split("_", 1)[0]
-    return head if head in LEG_MARKERS else ""
+    return head if head in LEG_NAMES else ""
+
+
+def leg_marker(leg: str) -> str:
+    """Return the marker of the joints of a leg."""
+    if leg.upper() not in PLACES:
+        return "o"
+    return LEG_MARKERS[PLACES[leg.upper()]]
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import numpy as np
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
+from pronk.robots.leg_names import PLACES
 from pronk.robots.legged import (
     HIP_PITCH,
     HIP_ROLL,
@@ -47,25 +48,6 @@ SAME_POSE = 1e-3
 """Largest difference of a left and a right joint in the default pose [rad]."""
 SAME_HIP = 0.01
 """Largest distance of a hip from the mirror image of the one on the other side [m]."""
-FRONT_RIGHT = ("front", "right")
-FRONT_LEFT = ("front", "left")
-REAR_RIGHT = ("rear", "right")
-REAR_LEFT = ("rear", "left")
-PLACES = {
-    "FR": FRONT_RIGHT,
-    "RF": FRONT_RIGHT,
-    "FL": FRONT_LEFT,
-    "LF": FRONT_LEFT,
-    "HR": REAR_RIGHT,
-    "RH": REAR_RIGHT,
-    "RR": REAR_RIGHT,
-    "BR": REAR_RIGHT,
-    "HL": REAR_LEFT,
-    "LH": REAR_LEFT,
-    "RL": REAR_LEFT,
-    "BL": REAR_LEFT,
-}
-"""Places that the usual names of legs say; other names say none, and need not."""
 STEADY = 0.15
 """Smallest distance of the centre of mass from the foremost and from the hindmost foot, as a share
 of the distance between these."""
