@@ -130,13 +130,18 @@ def _sentences(findings: Iterable[JointFinding]) -> list[str]:
     return sentences
 
 
+def _finding(joint: Joint, beginning: str, ending: str, numbers: str = "") -> JointFinding:
+    """Return a finding about a joint, with its numbers where there are any."""
+    text = f"{joint.name} ({numbers})" if numbers else joint.name
+    return JointFinding(beginning=beginning, joint=text, ending=ending)
+
+
 def _joint_findings(joint: Joint, gravity: float) -> list[JointFinding]:
     """List what is missing or inconsistent about the numbers of a joint."""
     findings = []
 
     def add(beginning: str, ending: str, numbers: str = "") -> None:
-        text = f"{joint.name} ({numbers})" if numbers else joint.name
-        findings.append(JointFinding(beginning=beginning, joint=text, ending=ending))
+        findings.append(_finding(joint, beginning, ending, numbers))
 
     drive = joint.drive
     low, high = joint.range
@@ -153,13 +158,13 @@ def _joint_findings(joint: Joint, gravity: float) -> list[JointFinding]:
     if torque > drive.effort_limit:
         add(
             "the stiffness of",
-            f" asks at {SMALL_ANGLE:g} rad for more than the effort limit: the drive would be at "
+            f" gives more than the effort limit at {SMALL_ANGLE:g} rad: the drive would be at "
             "its limit nearly always; one of the two is wrong, or of another unit",
             f"{joint.stiffness:.4g} N m/rad, {torque:.3g} N m of {drive.effort_limit:.4g}",
         )
     if gravity > drive.effort_limit:
         add(
-            "in the default pose gravity asks for more than the effort limit of",
+            "in the default pose the torque of gravity is above the effort limit of",
             ": it cannot hold the pose",
             f"{gravity:.3g} N m of {drive.effort_limit:.4g}",
         )
@@ -180,22 +185,14 @@ def _limit_findings(joint: Joint, source: SourceModel, servo: JointServo) -> lis
     has_limit = 0.0 < servo.effort_limit < np.inf
     if has_limit and not np.isclose(effort_limit, servo.effort_limit, rtol=SAME):
         numbers = f"{effort_limit:.4g} N m, there {servo.effort_limit:.4g}"
-        findings.append(
-            JointFinding(
-                beginning="the effort limit of",
-                joint=f"{joint.name} ({numbers})",
-                ending=f" is not that of {place}",
-            )
-        )
+        findings.append(_finding(joint, "the effort limit of", f" is not that of {place}", numbers))
     speed_limit = source.speed_limits.get(joint.name)
     speed = joint.drive.no_load_speed
     if speed_limit is not None and speed < speed_limit * (1.0 - SAME):
         numbers = f"{speed:.4g} rad/s, there {speed_limit:.4g}"
         findings.append(
-            JointFinding(
-                beginning="the no-load speed of",
-                joint=f"{joint.name} ({numbers})",
-                ending=f" is below the velocity limit of {place}",
+            _finding(
+                joint, "the no-load speed of", f" is below the velocity limit of {place}", numbers
             )
         )
     return findings

@@ -9,7 +9,7 @@ wrong lengths, a wrong mirror image or contacts that count for nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -87,14 +87,15 @@ def quadruped_problems(robot: RobotSpec) -> list[str]:
     problems = [*_group_problems(robot), *_name_problems(robot, model)]
     if problems:
         return problems
+    opposite = opposite_legs(robot, model)
     at_zero, to_trunk = posed(robot, model, dict.fromkeys(robot.joint_names, 0.0))
     problems = [
         *_shape_problems(robot, model),
         *_axis_problems(robot, at_zero, to_trunk),
-        *_side_problems(robot, model),
+        *_side_problems(robot, model, opposite),
         *_straightness_problems(robot, at_zero, to_trunk),
         *_contact_problems(robot, model),
-        *_pose_problems(robot, model),
+        *_pose_problems(robot, opposite),
     ]
     if not problems:
         problems = _balance_problems(robot, model)
@@ -279,10 +280,11 @@ def _axis_problems(robot: RobotSpec, data: mujoco.MjData, to_trunk: Array) -> li
     return problems
 
 
-def _side_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+def _side_problems(
+    robot: RobotSpec, model: mujoco.MjModel, opposite: Mapping[str, str]
+) -> list[str]:
     """List hips that are no mirror images, and legs that are not where their names say."""
     places = hips(robot, model)
-    opposite = opposite_legs(robot, model)
     hip_texts = []
     for leg, place in places.items():
         hip_texts.append(f"{leg} at x = {place[0]:.3f}, y = {place[1]:.3f} m")
@@ -375,11 +377,10 @@ def _contact_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
     return problems
 
 
-def _pose_problems(robot: RobotSpec, model: mujoco.MjModel) -> list[str]:
+def _pose_problems(robot: RobotSpec, opposite: Mapping[str, str]) -> list[str]:
     """List straight knees, and left legs that are not the mirror image of the right ones."""
     problems = []
     position = default_pose(robot)
-    opposite = opposite_legs(robot, model)
     compared: set[str] = set()
     for leg in robot.legs:
         joints = joints_of_leg(robot, leg)

@@ -123,6 +123,6 @@ def candidate_terms() -> dict[str, RewardTermCfg]:
         "hop": _term(rewards.hop, 0.0),
         # The term orientation bounds what it adds up to.
         "roll_pitch_rate": _term(rewards.roll_pitch_rate, 0.0),
-        # The term foot_clearance asks moving feet off the ground.
+        # The term foot_clearance is a penalty of moving feet near the ground.
         "slip": _term(rewards.slip, 0.0, jump_scale=0.0),
     }
