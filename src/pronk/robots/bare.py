@@ -19,6 +19,7 @@ import yaml
 
 from pronk.arrays import Array
 from pronk.errors import RobotError
+from pronk.robots.alike_joints import SAME_ASSUMED, alike_joints, quadruped_legs
 from pronk.robots.couplings import Followers, couplings_of
 from pronk.robots.held_reasons import held_reasons
 from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, HeldPosition, RobotFile
@@ -489,8 +490,20 @@ def yaml_of_model(path: Path) -> str:
     drives = ""
     groups = ""
     pose = ""
-    for name, drive in file.drives.items():
-        group = file.groups[name]
+    assumed: dict[str, set[str]] = {name: set() for name in file.groups}
+    for (name, number), remark in description.remarks.items():
+        if remark.mark == "CHECK":
+            assumed[name].add(number)
+    alike = alike_joints(
+        file,
+        [*file.groups, *description.held_joints],
+        {name: frozenset(numbers) for name, numbers in assumed.items()},
+    )
+    for group_name, joints in alike.items():
+        # Of numbers that are assumed, those of the joint that needs the most.
+        first = max(joints, key=lambda joint: file.groups[joint].stiffness or 0.0)
+        group = file.groups[first]
+        drive = file.drives[first]
         numbers = {
             "effort_limit": drive.effort_limit,
             "stall_torque": drive.stall_torque,
@@ -501,18 +514,30 @@ def yaml_of_model(path: Path) -> str:
             "frictionloss": drive.frictionloss,
             "viscous_damping": drive.viscous_damping,
         }
-        drives += f"  {_yaml(name)}:\n"
-        drives += _lines(description, name, numbers)
-        entries: dict[str, object] = {"drive": name}
+        entries: dict[str, object] = {}
+        comment = ""
+        if len(joints) > 1:
+            entries["joints"] = f"*_{group_name}"
+            comment = f"  # of {first}; the others have the same numbers"
+            if assumed[first]:
+                comment += f", or assumed ones within {100 * SAME_ASSUMED:g} %"
+        entries["drive"] = group_name
         if group.servo not in (None, "position"):
             entries["servo"] = group.servo
         entries["stiffness"] = group.stiffness
         entries["damping"] = group.damping
         entries["band_hz"] = list(BAND_HZ)
-        groups += f"  {_yaml(name)}:\n"
-        groups += _lines(description, name, entries)
-        angle = _yaml(file.poses["default"][name])
-        pose += f"    {_yaml(name)}: {angle}{description.remarks[name, 'pose'].comment}\n"
+        drives += f"  {_yaml(group_name)}:{comment}\n"
+        drives += _lines(description, first, numbers)
+        groups += f"  {_yaml(group_name)}:\n"
+        groups += _lines(description, first, entries)
+    for name, angle in file.poses["default"].items():
+        comment = description.remarks[name, "pose"].comment
+        pose += f"    {_yaml(name)}: {_yaml(angle)}{comment}\n"
+    legs = quadruped_legs(alike)
+    legs_line = "# legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints"
+    if legs:
+        legs_line = f"legs: {_yaml(list(legs))}  # derived: four joints of the same place begin so"
     held_lines = ""
     if description.held_joints:
         held_lines = "\nheld:  # joints that stand still at these positions, and need no gains\n"
@@ -539,11 +564,11 @@ timestep_s: {_yaml(file.timestep_s)}  # {step}
 decimation: {file.decimation}
 # grid_stiffness and grid_damping, the ranges of `pronk match --method paper`, follow from the gains
 # below unless they are given here.
-# legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints
+{legs_line}
 
 drives:
 {drives}
-groups:  # joints built alike may share a group, with a pattern such as {{joints: "*_knee"}};
+groups:  # joints built alike share a group, with a pattern such as {{joints: "*_knee"}};
   # `clamped: ["*_hip"]` names joints fixed in the bench test. `servo` says what the model has in
   # place of a position servo; remove it once the gains are those of the real drive.
 {groups}{held_lines}
