@@ -42,7 +42,13 @@ def test_trainings_that_are_alike_take_their_steps_at_the_measured_rate(
 
 @pytest.mark.parametrize(
     ("trainings", "gpus", "per_gpu", "seconds"),
-    [(16, 4, 4, 1366.0), (12, 4, 3, 1150.0), (3, 1, 3, 1100.0), (1, 1, 1, 702.0)],
+    [
+        (16, 4, 4, 1366.0),
+        (12, 4, 3, 1150.0),
+        (5, 1, 5, 1527.0),
+        (3, 1, 3, 1100.0),
+        (1, 1, 1, 702.0),
+    ],
 )
 def test_what_was_measured_is_within_the_estimate(
     trainings: int, gpus: int, per_gpu: int, seconds: float
