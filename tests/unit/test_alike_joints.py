@@ -9,7 +9,7 @@ import pytest
 
 from command_line import accepted, invoke
 from pronk.robots import load_robot
-from pronk.robots.quadruped import quadruped_problems
+from pronk.robots.quadruped import PAGE, quadruped_problems
 from pronk.robots.robot import RobotSpec
 from quadruped_model import ANYMAL, SPOT, write_quadruped
 
@@ -78,6 +78,13 @@ def test_a_model_with_all_names_needs_nothing_more_to_be_trained(tmp_path: Path)
     robot, _, _ = written(tmp_path)
     assert quadruped_problems(robot) == []
     assert "not ready" not in invoke(("robot", "check", robot.source)).output
+
+
+def test_a_quadruped_without_the_names_is_told_what_training_needs(tmp_path: Path) -> None:
+    robot, _, _ = written(tmp_path, change=lambda text: text.replace('"LF_foot"', '"LF_sole"'))
+    checked = invoke(("robot", "check", robot.source)).output
+    assert "LF_foot" in checked
+    assert PAGE in checked
 
 
 def test_joints_that_the_model_tells_apart_are_not_put_together(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def _check_robot(path: Path, *, wide: bool) -> None:
     from pronk.robots import load_robot
     from pronk.robots.consistency import problems_of, unchecked_lines
     from pronk.robots.model import bench_spec
-    from pronk.robots.quadruped import quadruped_problems
+    from pronk.robots.quadruped import PAGE, quadruped_problems
 
     robot_spec = load_robot(path)
     rows = []
@@ -127,5 +127,10 @@ def _check_robot(path: Path, *, wide: bool) -> None:
     else:
         console.say("nothing is inconsistent")
     if robot_spec.legs:
-        for problem in quadruped_problems(robot_spec):
+        training_problems = quadruped_problems(robot_spec)
+        for problem in training_problems:
             console.say(f"not ready for `pronk train`: {problem}")
+        if training_problems:
+            console.say(
+                f"  {PAGE} lists what a model needs, and has a script that writes such a one."
+            )
