@@ -24,7 +24,11 @@ from pronk.jump.train.mdp.events import (
     randomize_strength,
     reset_state,
 )
-from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
+from pronk.jump.train.tasks.jump_env_cfg import (
+    draw_contact_damping,
+    draw_weak_drives,
+    without_randomization,
+)
 from pronk.robots.legged import legged
 from training_env import MANY, MATCHED, ROBOT, N, drawn
 
@@ -109,6 +113,65 @@ def test_contacts_have_the_friction_of_the_foot(env: Any) -> None:
     expected = np.hstack([friction, friction, np.full_like(friction, 0.02)])
     contact_friction = contact.friction.numpy()[:n][touching][:, :3]
     np.testing.assert_allclose(contact_friction, expected, rtol=1e-6)
+
+
+def contact_env(least: float) -> Any:
+    """Return nominal robots but for the damping of their feet on the ground."""
+    cfg = training_env.config(MANY, MATCHED)
+    without_randomization(cfg)
+    draw_contact_damping(cfg, least)
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def test_damping_of_the_contacts_is_drawn_and_stiffness_stays() -> None:
+    env = contact_env(0.4)
+    feet = [index(env, "geom", f"{leg}_foot_collision") for leg in BODY.legs]
+    time_constant, damping_ratio = env.sim.mj_model.geom_solref[feet[0]]
+    assert damping_ratio == 1.0
+    contact = np.float64(env.sim.model.geom_solref[:, feet].cpu())
+    np.testing.assert_allclose(contact[..., 0], -(time_constant**-2), rtol=1e-5)
+    share = contact[..., 1] / (-2.0 / time_constant)
+    assert_uniform(share[:, 0], 0.4, 1.0)
+    np.testing.assert_array_equal(contact[..., 1], np.repeat(contact[:, :1, 1], 4, axis=1))
+    # Robots that fall alike on their feet spring back the faster, the less they are damped.
+    training_env.fresh(env, scripted=True)
+    env.sim.data.qpos[:, 2] += 0.1
+    env.sim.data.qpos[:] = env.sim.data.qpos[:1].clone()
+    env.sim.data.qvel[:] = 0.0
+    speed = torch.zeros(MANY)
+    for _ in range(25):
+        env.step(torch.zeros(MANY, 12))
+        speed = torch.maximum(speed, env.sim.data.qvel[:, 2])
+    assert np.corrcoef(share[:, 0], speed)[0, 1] < -0.6
+    env.close()
+
+
+def test_contacts_with_all_of_their_damping_are_those_of_the_model(nominal_heights: Any) -> None:
+    env = contact_env(1.0)
+    torch.testing.assert_close(heights_after_a_fall(env), nominal_heights, rtol=0.0, atol=1e-5)
+    env.close()
+
+
+def heights_after_a_fall(env: Any) -> Any:
+    """Drop the robots from 0.1 m; returns the heights of their trunks step by step."""
+    training_env.fresh(env, scripted=True)
+    env.sim.data.qpos[:, 2] += 0.1
+    heights = []
+    for _ in range(15):
+        env.step(torch.zeros(env.num_envs, 12))
+        heights.append(float(env.sim.data.qpos[0, 2]))
+    return torch.tensor(heights)
+
+
+@pytest.fixture
+def nominal_heights() -> Any:
+    """Heights of a robot with the contacts of the model."""
+    cfg = training_env.config(2, MATCHED)
+    without_randomization(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    heights = heights_after_a_fall(env)
+    env.close()
+    return heights
 
 
 def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:

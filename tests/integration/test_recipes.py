@@ -76,6 +76,13 @@ def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
     assert cfg.actions["joint_position"].scale == 0.42 != before
 
 
+def test_the_contact_of_the_feet_is_changed_only_where_a_share_is_less(tmp_path: Path) -> None:
+    cfg = task("task: {contact_damping: 0.4}", tmp_path)
+    assert cfg.events["contact"].params["least"] == 0.4
+    for text in ("task: {contact_damping: 1}", "task: {action_scale: 0.4}"):
+        assert "contact" not in task(text, tmp_path).events
+
+
 def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1,"
     text += " backward_share: 0.5, sideways_share: 0.25}"
@@ -102,8 +109,10 @@ def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
         ("jump: {ready_s: 3}", "ready_s"),
         ("jump: {backward_share: 1.5}", "backward_share|from 0 to 1"),
         ("jump: {sideways_share: -0.5}", "sideways_share|from 0 to 1"),
-        ("task: {scale: 3}", "'scale'|action_scale"),
+        ("task: {scale: 3}", "'scale'|action_scale|contact_damping"),
         ("task: {action_scale: 0}", "action_scale|more than 0"),
+        ("task: {contact_damping: 0}", "contact_damping|more than 0"),
+        ("task: {contact_damping: 1.5}", "contact_damping|up to 1"),
     ],
 )
 def test_what_there_is_not_is_refused_with_what_there_is(
@@ -211,7 +220,7 @@ def settings_of(cfg: Any) -> str:
         for name, term in cfg.rewards.items():
             weight = phase.weights.get(name, (term.weight, term.weight))
             rewards.append((name, weight, phase.jump_scales.get(name)))
-    return repr((rewards, cfg.commands, cfg.actions))
+    return repr((rewards, cfg.commands, cfg.actions, cfg.events.get("contact")))
 
 
 MOST_TERMS = 20

@@ -8,7 +8,7 @@
       orientation: 1
     jump:                         # fields of `JumpSettings`, and `COMMAND_NUMBERS`
       late_s: 0.25
-    task:                         # `action_scale`
+    task:                         # `action_scale`, `contact_damping`
       action_scale: 0.42
 
 What a recipe does not name stays as the task has it. `pronk train --recipe FILE` applies it to the
@@ -60,6 +60,11 @@ COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE)
 ACTION_SCALE = "action_scale"
 """Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
 which a policy explores, is in units of it."""
+CONTACT_DAMPING = "contact_damping"
+"""Another one: smallest share of the damping of the feet on the ground that is drawn for a robot
+(`events.randomize_contact`)."""
+TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING)
+"""All entries of `task`."""
 
 _Value = float | dict[str, float | tuple[float, float]]
 """A number, or one by phase: a number, or its values at the beginning and at the end."""
@@ -102,7 +107,7 @@ class Recipe:
     jump: Mapping[str, float] = field(default_factory=dict)
     """Fields of `JumpSettings`, and `COMMAND_NUMBERS`."""
     task: Mapping[str, float] = field(default_factory=dict)
-    """`ACTION_SCALE`."""
+    """`TASK_NUMBERS`."""
     source: str = ""
     """The file, or all files that were merged, for messages."""
     sha256: str = ""
@@ -388,20 +393,26 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
 
 
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
-    """Change the scale of the actions."""
+    """Change the scale of the actions, and the contact of the feet."""
     from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
+    from pronk.jump.train.tasks.jump_env_cfg import draw_contact_damping
 
     action = cfg.actions[NAME]
     assert isinstance(action, DelayedJointPositionActionCfg)
     for name, value in recipe.task.items():
         source = recipe.source_of("task", name)
-        if name != ACTION_SCALE:
+        if name not in TASK_NUMBERS:
             raise ArtefactError(
-                f"{source}: task has no number {name!r}; the only one is {ACTION_SCALE}."
+                f"{source}: task has no number {name!r}; the numbers are {', '.join(TASK_NUMBERS)}."
             )
         if not value > 0.0:
-            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected more than 0 rad.")
-        action.scale = value
+            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected more than 0.")
+        if name == ACTION_SCALE:
+            action.scale = value
+        elif value > 1.0:
+            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected a share up to 1.")
+        elif value < 1.0:
+            draw_contact_damping(cfg, value)
 
 
 def _source_of_bad_jump(recipe: Recipe, settings: JumpSettings) -> str:

@@ -3,9 +3,10 @@
 What a real robot has once is drawn once for each simulated robot, when the environment is built
 (mode `startup`): friction of the feet, gains, shank lengths, mass of the trunk, battery. Gains are
 drawn by group (`randomize_gains`, the paper's box) or by joint, with dry friction
-(`randomize_drives`); weak drives (`randomize_strength`) on request. The command delay is drawn in
-each episode (`actions`), the length of the policy step in each step, noise in each observation. All
-draws are uniform, from PyTorch's generator of the device.
+(`randomize_drives`); weak drives (`randomize_strength`) and contacts of less damping
+(`randomize_contact`) on request. The command delay is drawn in each episode (`actions`), the length
+of the policy step in each step, noise in each observation. All draws are uniform, from PyTorch's
+generator of the device.
 """
 
 from __future__ import annotations
@@ -124,6 +125,29 @@ def randomize_strength(env: Any, env_ids: None, weakest: float) -> None:
         limit = drive.cfg.effort_limit * strength
         drive.set_effort_limit(slice(None), limit.expand(-1, len(drive.target_names)))
     joint_position_action(env).battery.weaken(strength)
+
+
+@requires_model_fields("geom_solref")  # type: ignore[untyped-decorator]
+def randomize_contact(env: Any, env_ids: None, least: float, feet: SceneEntityCfg) -> None:
+    """Draw by how much the feet of each robot are damped less on the ground, all of a robot alike.
+
+    With time constant T and damping ratio z MuJoCo gives a foot that is r deep in the ground, and
+    moves at v, the acceleration -(2 / T) v - r / (T z)^2, which friction follows too. The first
+    number becomes the share of it that is drawn; the second one stays.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        least: Smallest share, above 0; the largest is 1.
+        feet: Geoms of the feet, whose contacts have a time constant.
+    """
+    foot = env.scene["robot"].indexing.geom_ids[feet.geom_ids]
+    time_constant, damping_ratio = env.sim.get_default_field("geom_solref")[foot].unbind(dim=-1)
+    stiffness = (time_constant * damping_ratio) ** -2
+    damping = _uniform(env, (least, 1.0), env.num_envs, 1) * (2.0 / time_constant)
+    # Negative numbers are stiffness and damping themselves.
+    contact = torch.stack(torch.broadcast_tensors(-stiffness, -damping), dim=-1)
+    env.sim.model.geom_solref[:, foot] = contact
 
 
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:

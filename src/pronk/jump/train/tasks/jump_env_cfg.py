@@ -170,6 +170,19 @@ def draw_weak_drives(cfg: ManagerBasedRlEnvCfg, weakest: float) -> None:
     )
 
 
+def draw_contact_damping(cfg: ManagerBasedRlEnvCfg, least: float) -> None:
+    """Draw the damping of the feet of each robot on the ground from a share of it to all of it.
+
+    Args:
+        cfg: Configuration of the environment, which is changed.
+        least: The share, above 0.
+    """
+    feet = SceneEntityCfg("robot", geom_names=".*_foot_collision")
+    cfg.events["contact"] = EventTermCfg(
+        func=events.randomize_contact, mode="startup", params={"least": least, "feet": feet}
+    )
+
+
 def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     """Make the environment for mjlab's `play` of a training environment: one nominal robot."""
     without_randomization(cfg)
