@@ -97,6 +97,7 @@ def environment(
     )
     cfg = task.env_cfg(fine, gains, iterations=TASKS["all"], seed=plan.seed)
     cfg = adapter.evaluation_cfg(cfg, plan, "noise")
+    adapter.set_action_scale(cfg, subject)
     # What is drawn in physics steps of training.
     cfg.events["decimation"].params["added"] = (-2 * parts, 2 * parts)
     action: Any = cfg.actions[actions.NAME]

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -24,6 +25,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import SCHEMA, RunFolder
+from pronk.jump.train.recipe import apply_recipe, load_recipe
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import contract_for, export_policy
 from pronk.jump.train.tasks import load_task
@@ -284,6 +286,50 @@ def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
     assert evaluation.about["by_joint"] is True
     # A policy of which nothing is recorded is evaluated by group.
     assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is None
+
+
+def test_a_policy_is_evaluated_with_the_actions_and_contacts_of_its_recipe(
+    trained: tuple[Path, Any], tmp_path: Path
+) -> None:
+    """Whether checkpoint or exported; the task's own scale of the actions is another one."""
+    pytest.importorskip("onnxruntime")
+    gains = training_gains("naive", ROBOT)
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("schema: pronk/recipe/1\ntask: {action_scale: 0.42, contact_damping: 0.5}\n")
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    record = {
+        "schema": SCHEMA,
+        "settings": {"robot": "mini_cheetah"},
+        "gains": {"name": "naive"},
+        "recipe": load_recipe(recipe).record(),
+    }
+    folder.write(record)
+    shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    apply_recipe(cfg, load_recipe(recipe))
+    contract = contract_for(cfg, jump=True, provenance={"contact_damping": 0.5})
+    export_policy(trained[1], contract, tmp_path / "policy.onnx")
+    plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
+    for path in (folder.path, tmp_path / "policy.onnx"):
+        policy = adapter.load_evaluated_policy(path, "cpu")
+        assert (policy.action_scale, policy.contact_damping) == (0.42, 0.5)
+    assert adapter.run_evaluation(policy, gains, plan, device="cpu").about["action_scale"] == 0.42
+    plain = adapter.load_evaluated_policy(trained[0], "cpu")
+    evaluation = adapter.run_evaluation(plain, gains, plan, device="cpu")
+    assert evaluation.about["action_scale"] == 0.35
+
+
+def test_scales_that_differ_by_joint_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    gains = training_gains("naive", ROBOT)
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    contract = contract_for(cfg, jump=True, provenance={})
+    scales = (0.3, *contract.action_scale[1:])
+    path = tmp_path / "policy.onnx"
+    export_policy(trained[1], msgspec.structs.replace(contract, action_scale=scales), path)
+    with pytest.raises(ArtefactError, match=r"action_scale is 0\.3, 0\.35"):
+        adapter.load_evaluated_policy(path, "cpu")
 
 
 def test_the_shipped_policy_acts_for_thousands_of_robots(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
+from pronk.jump.train.recipe import CONTACT_DAMPING
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from pronk.jump.train.training_progress import TrainingProgress, write_progress
@@ -358,6 +359,8 @@ class PronkRunner(MjlabOnPolicyRunner):
             provenance["by_joint"] = True
         if "strength" in env.cfg.events:
             provenance["weakest_drive"] = env.cfg.events["strength"].params["weakest"]
+        if "contact" in env.cfg.events:
+            provenance[CONTACT_DAMPING] = env.cfg.events["contact"].params["least"]
         if env.cfg.events["gains"].params.get("shape") == "ellipsoid":
             provenance["ellipsoid"] = True
         if self.cfg.get("recipe_sha256"):

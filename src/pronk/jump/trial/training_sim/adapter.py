@@ -29,18 +29,24 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
 from pronk.jump.train.devices import device_facts
 from pronk.jump.train.gains import TrainingGains
+from pronk.jump.train.mdp.actions import NAME as ACTION
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.recipe import ACTION_SCALE, CONTACT_DAMPING
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
+from pronk.jump.train.tasks.jump_env_cfg import (
+    draw_contact_damping,
+    draw_weak_drives,
+    without_randomization,
+)
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
 from pronk.jump.train.versions import package_versions
 from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, Act, Estimate, StepListener, evaluate_policy
-from pronk.policy.contract import check, policy_robot_name
+from pronk.policy.contract import Contract, check, policy_robot_name
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.policy.runtime import Inference, Policy, load_policy
 from pronk.robots import load_robot
@@ -105,6 +111,10 @@ def run_evaluation(
     )
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
+    if policy.contact_damping is not None:
+        draw_contact_damping(cfg, policy.contact_damping)
+    set_action_scale(cfg, policy)
+    action: Any = cfg.actions[ACTION]
     _check_memory(plan, cfg.sim.mujoco.timestep, device)
     env = ManagerBasedRlEnv(cfg=evaluation_cfg(cfg, plan, randomization), device=device)
     progress("building", 1.0)
@@ -121,10 +131,18 @@ def run_evaluation(
         "gains": {"name": gains.name, "sha256": gains.sha256, "virtual": gains.virtual},
         "randomization": randomization,
         "by_joint": bool(gains.joints),
+        "action_scale": action.scale,
         "device": device_facts(device.partition(":")[0], 1),
         "versions": package_versions(),
     }
     return replace(evaluation, about=about, before=before or {})
+
+
+def set_action_scale(cfg: ManagerBasedRlEnvCfg, policy: EvaluatedPolicy) -> None:
+    """Give an environment the scale of the actions that a policy was trained with."""
+    if policy.action_scale is not None:
+        action: Any = cfg.actions[ACTION]
+        action.scale = policy.action_scale
 
 
 def _check_memory(plan: EvaluationPlan, dt: float, device: str) -> None:
@@ -174,6 +192,10 @@ class EvaluatedPolicy:
     """File, hash, and provenance."""
     draws: DrawSettings = field(default_factory=DrawSettings)
     """How it was trained to differ in its drives, as far as that is known."""
+    action_scale: float | None = None
+    """Change of a joint target with an action of 1 [rad]; None for that of the task."""
+    contact_damping: float | None = None
+    """Smallest share of the damping of the feet on the ground that was drawn; None for all."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -210,6 +232,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
     provenance = run.read() if run.provenance.is_file() else {}
     settings = provenance.get("settings", {})
     gains = provenance.get("gains", {})
+    task_numbers = (provenance.get("recipe") or {}).get("task", {})
     about = {
         "file": str(file),
         "sha256": sha256(file),
@@ -225,6 +248,8 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         robot=robot or run.robot(settings.get("robot", "mini_cheetah")),
         about=about,
         draws=_draws_of(settings),
+        action_scale=task_numbers.get(ACTION_SCALE),
+        contact_damping=_share(task_numbers.get(CONTACT_DAMPING)),
     )
 
 
@@ -272,7 +297,25 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         robot=robot,
         about=about,
         draws=_draws_of(contract.provenance),
+        action_scale=_common_scale(contract, path),
+        contact_damping=_share(contract.provenance.get(CONTACT_DAMPING)),
     )
+
+
+def _common_scale(contract: Contract, path: Path) -> float:
+    """Return the scale of the actions, which the training simulator has for all joints alike."""
+    scales = set(contract.action_scale)
+    if len(scales) > 1:
+        raise ArtefactError(
+            f"{path}: action_scale is {', '.join(f'{scale:g}' for scale in sorted(scales))} rad; "
+            "the training simulator has one scale for all joints."
+        )
+    return scales.pop()
+
+
+def _share(recorded: float | None) -> float | None:
+    """Return a share that is recorded; None for all of it, of which nothing is drawn."""
+    return None if recorded in (None, 1.0) else recorded
 
 
 def _draws_of(recorded: Mapping[str, Any]) -> DrawSettings:
