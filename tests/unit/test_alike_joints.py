@@ -125,6 +125,21 @@ def test_assumed_numbers_that_differ_by_gravity_are_the_largest(tmp_path: Path) 
     assert "assumed ones" in text
 
 
+def test_joints_in_different_poses_share_a_group(tmp_path: Path) -> None:
+    """One knee whose zero is at its stop is moved away from it, which is no other drive."""
+    robot, bare, _ = written(
+        tmp_path,
+        change=lambda text: text.replace(
+            'name="RH_KFE" axis="0 1 0" range="-2.6 0.6"',
+            'name="RH_KFE" axis="0 1 0" range="-2.6 -0.9"',
+        ),
+    )
+    assert robot.groups == ("HAA", "HFE", "KFE")
+    positions = {joint.name: joint.default_position for joint in robot.joints}
+    assert positions["LF_KFE"] == -1.0 > positions["RH_KFE"]
+    assert positions["RH_KFE"] == bare.joint("RH_KFE").default_position
+
+
 def test_left_and_right_share_groups_and_are_no_legs_of_a_quadruped(tmp_path: Path) -> None:
     path = tmp_path / "arms.xml"
     arms = ""

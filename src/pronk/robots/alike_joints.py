@@ -7,7 +7,7 @@ says nothing, what is assumed of them differs by little, as by the torque of gra
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 from pronk.robots.leg_names import LEG_NAMES
 from pronk.robots.load import DriveEntry, GroupEntry, RobotFile
@@ -29,14 +29,14 @@ def place_on_side(joint: str) -> str:
 
 
 def alike_joints(
-    file: RobotFile, joint_names: Sequence[str], assumed: Mapping[str, frozenset[str]]
+    file: RobotFile, joint_names: Sequence[str], assumed: Mapping[str, Set[str]]
 ) -> dict[str, tuple[str, ...]]:
     """Return the joints of each group of a file, by the name of the group.
 
     Args:
         file: A robot whose driven joints have a group and a drive each, of their own name.
         joint_names: All joints of the model, also those that are held.
-        assumed: The numbers of each driven joint that are assumed.
+        assumed: The numbers of each driven joint that are assumed, without its pose.
 
     Returns:
         Groups of two joints or more are called by the place of their joints, as `calf_joint`, and
@@ -78,9 +78,7 @@ def quadruped_legs(groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     return legs[0] if is_quadruped else ()
 
 
-def _is_alike(
-    file: RobotFile, first: str, second: str, assumed: Mapping[str, frozenset[str]]
-) -> bool:
+def _is_alike(file: RobotFile, first: str, second: str, assumed: Mapping[str, Set[str]]) -> bool:
     """Return whether the model says the same of two joints, and assumed numbers are close."""
     if file.groups[first].servo != file.groups[second].servo or assumed[first] != assumed[second]:
         return False

@@ -492,13 +492,9 @@ def yaml_of_model(path: Path) -> str:
     pose = ""
     assumed: dict[str, set[str]] = {name: set() for name in file.groups}
     for (name, number), remark in description.remarks.items():
-        if remark.mark == "CHECK":
+        if remark.mark == "CHECK" and number != "pose":
             assumed[name].add(number)
-    alike = alike_joints(
-        file,
-        [*file.groups, *description.held_joints],
-        {name: frozenset(numbers) for name, numbers in assumed.items()},
-    )
+    alike = alike_joints(file, [*file.groups, *description.held_joints], assumed)
     for group_name, joints in alike.items():
         # Of numbers that are assumed, those of the joint that needs the most.
         first = max(joints, key=lambda joint: file.groups[joint].stiffness or 0.0)
