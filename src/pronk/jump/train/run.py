@@ -17,9 +17,11 @@ from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.jump.train.hosts import Host, check_hosts
 from pronk.jump.train.launch import LOCAL_HOST, launch
+from pronk.jump.train.mdp.actions import NAME as ACTION
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
+    ACTION_SCALE,
     Recipe,
     apply_recipe,
     load_recipe,
@@ -135,6 +137,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     start = None
     if settings.init_checkpoint is not None:
         start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
+        _check_action_scale(settings, gains, recipe)
     folder.path.mkdir(parents=True, exist_ok=True)
     gains_file = settings.gains_file
     if gains_file is not None:
@@ -165,6 +168,30 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     }
     folder.write(record)
     return record
+
+
+def _check_action_scale(
+    settings: TrainSettings, gains: TrainingGains, recipe: Recipe | None
+) -> None:
+    """Refuse to begin with a policy whose actions are other angles than those of this training.
+
+    A checkpoint whose run has no record is taken as it is.
+    """
+    assert settings.init_checkpoint is not None
+    path = settings.init_checkpoint
+    start_folder = RunFolder(path if path.is_dir() else path.parent)
+    if not start_folder.provenance.is_file():
+        return
+    task = load_task(str(settings.robot))
+    scale = _env_cfg(task, gains, settings, recipe).actions[ACTION].scale
+    start_scale = _env_cfg(task, gains, settings, None).actions[ACTION].scale
+    start_recipe = start_folder.read().get("recipe") or {}
+    start_scale = start_recipe.get("task", {}).get(ACTION_SCALE, start_scale)
+    if scale != start_scale:
+        raise PronkError(
+            f"--init-checkpoint {path}: an action of 1 is {start_scale:g} rad there and "
+            f"{scale:g} rad here; give --recipe with task: {{action_scale: {start_scale:g}}}."
+        )
 
 
 def initial_state(path: Path, iterations: int) -> dict[str, Any]:
