@@ -332,10 +332,10 @@ def _train_session(
     if hosts:
         session["hosts"] = [host.record() for host in hosts]
     record["sessions"].append(session)
-    folder.write(record)
     first_checkpoint = checkpoint.latest_checkpoint(folder.path)
     log_dir = folder.path.resolve()
     try:
+        folder.write(record)
         if hosts:
             launch(config, log_dir, settings.devices.host_names, hosts[0].processes)
         elif processes > 1:
