@@ -183,10 +183,10 @@ def _check_action_scale(
     if not start_folder.provenance.is_file():
         return
     task = load_task(str(settings.robot))
-    scale = _env_cfg(task, gains, settings, recipe).actions[ACTION].scale
-    start_scale = _env_cfg(task, gains, settings, None).actions[ACTION].scale
+    task_scale = _env_cfg(task, gains, settings, None).actions[ACTION].scale
+    scale = task_scale if recipe is None else recipe.task.get(ACTION_SCALE, task_scale)
     start_recipe = start_folder.read().get("recipe") or {}
-    start_scale = start_recipe.get("task", {}).get(ACTION_SCALE, start_scale)
+    start_scale = start_recipe.get("task", {}).get(ACTION_SCALE, task_scale)
     if scale != start_scale:
         raise PronkError(
             f"--init-checkpoint {path}: an action of 1 is {start_scale:g} rad there and "

@@ -111,7 +111,7 @@ def run_evaluation(
     )
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
-    if policy.contact_damping is not None:
+    if policy.contact_damping not in (None, 1.0):
         draw_contact_damping(cfg, policy.contact_damping)
     set_action_scale(cfg, policy)
     action: Any = cfg.actions[ACTION]
@@ -195,7 +195,7 @@ class EvaluatedPolicy:
     action_scale: float | None = None
     """Change of a joint target with an action of 1 [rad]; None for that of the task."""
     contact_damping: float | None = None
-    """Smallest share of the damping of the feet on the ground that was drawn; None for all."""
+    """Smallest share of the damping of the feet on the ground that was drawn. None: none; 1."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -249,7 +249,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         about=about,
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
-        contact_damping=_share(task_numbers.get(CONTACT_DAMPING)),
+        contact_damping=task_numbers.get(CONTACT_DAMPING),
     )
 
 
@@ -298,7 +298,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         about=about,
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
-        contact_damping=_share(contract.provenance.get(CONTACT_DAMPING)),
+        contact_damping=contract.provenance.get(CONTACT_DAMPING),
     )
 
 
@@ -311,11 +311,6 @@ def _common_scale(contract: Contract, path: Path) -> float:
             "the training simulator has one scale for all joints."
         )
     return scales.pop()
-
-
-def _share(recorded: float | None) -> float | None:
-    """Return a share that is recorded; None for all of it, of which nothing is drawn."""
-    return None if recorded in (None, 1.0) else recorded
 
 
 def _draws_of(recorded: Mapping[str, Any]) -> DrawSettings:
