@@ -25,6 +25,7 @@ SUMMARIES = {
     "probe": "Laws, parameters and faults of simulators drawn at random, named blind.",
     "frameworks": "Gains matched for frameworks, in the engines themselves, beside the logs.",
     "profiles": "The same logs matched for every profile: errors and time.",
+    "reach": "How far a policy's jumps get by changes of its joint targets alone.",
     "transfer": "A policy in training simulators of other drive laws.",
     "fuzz": "Mutated files of every reader: tracebacks, hangs, other numbers.",
     "kills": "Processes of commands killed and stopped: files, orphans, damping.",

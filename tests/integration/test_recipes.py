@@ -93,6 +93,13 @@ def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     assert command.settings.ready_s == 0.26
 
 
+def test_the_direction_of_a_lift_off_is_changed(tmp_path: Path) -> None:
+    before = task("jump: {late_s: 0.2}", tmp_path).rewards["liftoff_angle"].params
+    after = task("jump: {angle_vertical: 1.6}", tmp_path).rewards["liftoff_angle"].params
+    assert after == {**before, "vertical": 1.6}
+    assert before["vertical"] != 1.6
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -109,6 +116,8 @@ def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
         ("jump: {ready_s: 3}", "ready_s"),
         ("jump: {backward_share: 1.5}", "backward_share|from 0 to 1"),
         ("jump: {sideways_share: -0.5}", "sideways_share|from 0 to 1"),
+        ("jump: {angle_vertical: 0}", "angle_vertical|more than 0"),
+        ("rewards: {liftoff_angle: 0}\njump: {angle_vertical: 1.6}", "angle_vertical|removed"),
         ("task: {scale: 3}", "'scale'|action_scale|contact_damping"),
         ("task: {action_scale: 0}", "action_scale|more than 0"),
         ("task: {contact_damping: 0}", "contact_damping|more than 0"),
@@ -219,7 +228,7 @@ def settings_of(cfg: Any) -> str:
     for phase in phases.values():
         for name, term in cfg.rewards.items():
             weight = phase.weights.get(name, (term.weight, term.weight))
-            rewards.append((name, weight, phase.jump_scales.get(name)))
+            rewards.append((name, weight, term.params, phase.jump_scales.get(name)))
     return repr((rewards, cfg.commands, cfg.actions, cfg.events.get("contact")))
 
 

@@ -55,8 +55,12 @@ BACKWARD_SHARE = "backward_share"
 """Another one: `MotionCommandCfg.backward_share`."""
 SIDEWAYS_SHARE = "sideways_share"
 """Another one: `MotionCommandCfg.sideways_share`."""
-COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE)
+ANGLE_VERTICAL = "angle_vertical"
+"""Another one: vertical velocity of the lift-off whose direction `rewards.liftoff_angle` asks for
+[m/s]; the lower it is, the flatter are jumps forwards."""
+COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE, ANGLE_VERTICAL)
 """All entries of `jump` that are no fields of `JumpSettings`."""
+_ANGLE_TERM = "liftoff_angle"
 ACTION_SCALE = "action_scale"
 """Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
 which a policy explores, is in units of it."""
@@ -371,6 +375,9 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     command.guidance_sweep = settings.pop(GUIDANCE_SWEEP, command.guidance_sweep)
     command.backward_share = settings.pop(BACKWARD_SHARE, command.backward_share)
     command.sideways_share = settings.pop(SIDEWAYS_SHARE, command.sideways_share)
+    angle_vertical = settings.pop(ANGLE_VERTICAL, None)
+    if angle_vertical is not None:
+        _set_angle_vertical(cfg, recipe, angle_vertical)
     for name in (BACKWARD_SHARE, SIDEWAYS_SHARE):
         share = recipe.jump.get(name, 1.0)
         if not 0.0 <= share <= 1.0:
@@ -390,6 +397,21 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     except PronkError as error:
         source = _source_of_bad_jump(recipe, command.settings)
         raise ArtefactError(f"{source}: jump: {error}") from None
+
+
+def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: float) -> None:
+    """Set the vertical velocity of the direction that the term `liftoff_angle` asks for."""
+    source = recipe.source_of("jump", ANGLE_VERTICAL)
+    if not vertical > 0.0:
+        raise ArtefactError(
+            f"{source}: jump: {ANGLE_VERTICAL} is {vertical:g}; expected more than 0 m/s."
+        )
+    if _ANGLE_TERM not in cfg.rewards:
+        raise ArtefactError(
+            f"{source}: jump: {ANGLE_VERTICAL} goes with the term {_ANGLE_TERM!r}, which is "
+            "removed; leave one of them out."
+        )
+    cfg.rewards[_ANGLE_TERM].params["vertical"] = vertical
 
 
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
