@@ -301,7 +301,7 @@ def reach(
     subjects = load_subjects([policy], setup.robot)
     first, *others = plan_jobs(subjects, plan, setup)
     values = search_offsets(Approach.of(first), evaluations, seed, jobs)
-    shares = (0.0, 0.5, 1.0)
+    shares = (0.0, 0.25, 0.5, 0.75, 1.0)
     figures: list[list[JumpFigures]] = []
     with multiprocessing.get_context("spawn").Pool(jobs) as workers:
         for share in shares:
