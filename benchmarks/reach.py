@@ -28,6 +28,7 @@ from pronk.errors import PronkError
 from pronk.jump.trial.jumps import JumpFigures
 from pronk.jump.trial.protocol import named
 from pronk.jump.trial.trial import TrialJob, TrialPlan, load_subjects, plan_jobs, setup_of
+from pronk.jump.virtual.robot import VirtualRobot
 from pronk.policy.observation import Measurement
 from pronk.policy.rollout import ticks
 from pronk.policy.runtime import Policy
@@ -112,8 +113,7 @@ class Approach:
 
     job: TrialJob
     policy: OffsetPolicy
-    machine: Any
-    """The virtual robot."""
+    machine: VirtualRobot
     began: float
     """When the policy took over, on the robot's clock [s]."""
     steps: Iterator[float]
