@@ -61,6 +61,7 @@ ANGLE_VERTICAL = "angle_vertical"
 COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE, ANGLE_VERTICAL)
 """All entries of `jump` that are no fields of `JumpSettings`."""
 _ANGLE_TERM = "liftoff_angle"
+"""The term whose direction `ANGLE_VERTICAL` changes."""
 ACTION_SCALE = "action_scale"
 """Entry of `task`: change of a joint target with an action of 1 [rad]. The noise of the actions, by
 which a policy explores, is in units of it."""
