@@ -74,8 +74,8 @@ def import_peers() -> tuple[Any, Any]:
         from mujoco import sysid
     except ImportError as error:
         raise PronkError(
-            "`python -m benchmarks known` compares with mujoco.sysid and with CMA-ES from the "
-            f"package cma, but {error.name} is not installed; `pip install pronk[bench]` brings it."
+            "this benchmark needs the extra packages mujoco.sysid and cma (CMA-ES), "
+            f"but {error.name} is not installed; `pip install pronk[bench]` brings it."
         ) from None
     return sysid, cma
 

@@ -21,18 +21,21 @@ import numpy as np
 import tyro
 from numpy.typing import ArrayLike
 
-from benchmarks.runner import finish
+from benchmarks.peers import import_peers
+from benchmarks.runner import finish, in_parallel
 from pronk.arrays import Array
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.files import require_place, write_text
 from pronk.jump.trial.jumps import JumpFigures
-from pronk.jump.trial.protocol import named
+from pronk.jump.trial.protocol import parse_case
 from pronk.jump.trial.trial import TrialJob, TrialPlan, load_subjects, plan_jobs, setup_of
 from pronk.jump.virtual.robot import VirtualRobot
 from pronk.policy.observation import Measurement
 from pronk.policy.rollout import ticks
 from pronk.policy.runtime import Policy
-from pronk.robots.legged import legged
+from pronk.robots.legged import HIP_ROLL, hips, joints_of_leg
+from pronk.robots.quadruped import LEG_JOINTS, require_quadruped
 from pronk.robots.robot import RobotSpec
 from pronk.tables import Cell, Column, Table
 
@@ -40,6 +43,8 @@ KNOTS_S = (0.0, 0.06, 0.12, 0.17, 0.21, 0.25, 0.29, 0.34, 0.40, 0.48, 0.56)
 """Times after the jump command at which offsets are chosen, with lines between them [s]."""
 END_S = 0.62
 """Time after the jump command from which on there is no offset [s]."""
+ROWS = 2 * len(LEG_JOINTS)
+"""Joints of a front and of a hind leg, each of which has offsets of its own."""
 LARGEST_RAD = 1.2
 """Largest offset at a knot [rad]."""
 FIRST_STD_RAD = 0.12
@@ -68,7 +73,7 @@ class OffsetPolicy:
         self._steps_since: int | None = None
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Begin a new run."""
         self._policy.reset()
         self._steps_since = None
 
@@ -84,25 +89,53 @@ class OffsetPolicy:
         return target
 
 
-def offset_table(values: Array, robot: RobotSpec, rate_hz: float) -> Array:
+@dataclass(frozen=True, kw_only=True)
+class OffsetLayout:
+    """Which offsets the joints of a quadruped have."""
+
+    rows: tuple[int, ...]
+    """Row of the offsets of each joint: those of a front leg, hip roll, hip pitch and knee, then
+    those of a hind leg."""
+    signs: tuple[float, ...]
+    """-1 for joints that turn the other way: the hip rolls of the left side."""
+
+    @classmethod
+    def of(cls, robot: RobotSpec) -> OffsetLayout:
+        """Read where the legs are from the robot's model.
+
+        Raises:
+            RobotError: It is no quadruped of three joints a leg with alike axes.
+        """
+        require_quadruped(robot)
+        places = hips(robot, robot.build_spec().compile())
+        middle = np.mean([place[0] for place in places.values()])
+        rows = {}
+        signs = {}
+        for leg, place in places.items():
+            first_row = 0 if place[0] > middle else len(LEG_JOINTS)
+            for number, name in enumerate(joints_of_leg(robot, leg)):
+                rows[name] = first_row + number
+                turns_other_way = number == HIP_ROLL and place[1] > 0.0
+                signs[name] = -1.0 if turns_other_way else 1.0
+        names = robot.joint_names
+        return cls(
+            rows=tuple(rows[name] for name in names), signs=tuple(signs[name] for name in names)
+        )
+
+
+def offset_table(values: Array, layout: OffsetLayout, rate_hz: float) -> Array:
     """Return the offsets of every step after the jump command [rad], (steps, joints).
 
     Args:
-        values: Offsets at the knots, of the joints of a front leg, then of a hind leg, in the
-            leg's order [rad]. (2 * joints of a leg * knots,)
-        robot: The robot; joints about the forward axis turn the other way on its left side.
+        values: Offsets at the knots, row by row of the layout [rad]. (rows * knots,)
+        layout: Which row each joint has.
         rate_hz: Rate of the policy [Hz].
     """
-    body = legged(robot.source)
-    at_knots = values.reshape(2, len(body.leg_joints), len(KNOTS_S))
+    at_knots = values.reshape(ROWS, len(KNOTS_S))
     times = np.arange(round(END_S * rate_hz)) / rate_hz
-    offsets = np.zeros((len(times), len(robot.joints)))
-    for k, joint in enumerate(robot.joints):
-        leg, name = joint.name.split("_", 1)
-        part = 0 if leg.startswith("F") else 1
-        is_roll = name == body.leg_joints[0]
-        sign = -1.0 if is_roll and leg.endswith("L") else 1.0
-        knots = [*at_knots[part, body.leg_joints.index(name)], 0.0]
+    offsets = np.zeros((len(times), len(layout.rows)))
+    for k, (row, sign) in enumerate(zip(layout.rows, layout.signs, strict=True)):
+        knots = [*at_knots[row], 0.0]
         offsets[:, k] = sign * np.interp(times, [*KNOTS_S, END_S], knots)
     return offsets
 
@@ -113,6 +146,7 @@ class Approach:
 
     job: TrialJob
     policy: OffsetPolicy
+    layout: OffsetLayout
     machine: VirtualRobot
     began: float
     """When the policy took over, on the robot's clock [s]."""
@@ -133,7 +167,14 @@ class Approach:
         for time in steps:
             if time > last:
                 break
-        return cls(job=job, policy=policy, machine=machine, began=began, steps=steps)
+        return cls(
+            job=job,
+            policy=policy,
+            layout=OffsetLayout.of(job.setup.robot),
+            machine=machine,
+            began=began,
+            steps=steps,
+        )
 
     def jump(self, values: Array, watched_s: float = math.inf) -> JumpFigures:
         """Go on with offsets and return the figures of the jump; the approach is used up.
@@ -142,14 +183,13 @@ class Approach:
             values: Offsets as of `offset_table` [rad].
             watched_s: Time after the jump command for which the run is simulated [s].
         """
-        robot = self.job.setup.robot
         script = self.job.row.script
-        self.policy.offsets = offset_table(values, robot, self.policy.contract.policy_rate_hz)
+        self.policy.offsets = offset_table(values, self.layout, self.policy.contract.policy_rate_hz)
         for time in self.steps:
             if time >= script.on + watched_s:
                 break
         figures: JumpFigures = self.job.run_kind.measure(
-            self.machine.capture(), script, robot, began=self.began
+            self.machine.capture(), script, self.job.setup.robot, began=self.began
         )
         return figures
 
@@ -190,10 +230,8 @@ def search_offsets(approach: Approach, evaluations: int, seed: int, jobs: int) -
         seed: Seed of the candidates, 0 or more.
         jobs: Processes, a jump each.
     """
-    import cma
-
-    body = legged(approach.job.setup.robot.source)
-    start = np.zeros(2 * len(body.leg_joints) * len(KNOTS_S))
+    _, cma = import_peers()
+    start = np.zeros(ROWS * len(KNOTS_S))
     options = {
         # A covariance without correlations is learned in far fewer jumps.
         "CMA_diagonal": True,
@@ -272,7 +310,7 @@ def _jump_with(work: tuple[TrialJob, Array]) -> JumpFigures:
 
 def reach(
     policy: tyro.conf.Positional[Path],
-    command: str = "forward 2",
+    command: str = "2,0",
     evaluations: int = 1600,
     jumps: int = 10,
     seed: int = 0,
@@ -283,7 +321,7 @@ def reach(
 
     Args:
         policy: The policy.onnx.
-        command: Name of a command of a trial.
+        command: Forward and left velocity in m/s, and a yaw rate in rad/s if there is one.
         evaluations: Jumps of the search, all from one approach.
         jumps: Other jumps, in which the offsets are then added.
         seed: Seed of the trial and of the search.
@@ -295,7 +333,13 @@ def reach(
             f"--evaluations {evaluations} --jumps {jumps} --jobs {jobs} --seed {seed}; expected "
             f"{POPULATION} or more, 1 or more, 1 or more, and 0 or more."
         )
-    [case] = named(command)
+    case = parse_case(command)
+    if not any(case.command[:2]):
+        raise PronkError(
+            f"--command {command}: a jump on the spot has no length; give a velocity, as 2,0."
+        )
+    if out is not None:
+        require_place(out)
     setup = setup_of(policy, Path(), processes=1)
     plan = TrialPlan(cases=(case,), jumps=jumps + 1, rates=0, seed=seed)
     subjects = load_subjects([policy], setup.robot)
@@ -303,10 +347,10 @@ def reach(
     values = search_offsets(Approach.of(first), evaluations, seed, jobs)
     shares = (0.0, 0.25, 0.5, 0.75, 1.0)
     figures: list[list[JumpFigures]] = []
-    with multiprocessing.get_context("spawn").Pool(jobs) as workers:
-        for share in shares:
-            figures.append(workers.map(_jump_with, [(job, share * values) for job in others]))
-    title = f"{policy}, {command}, offsets of {evaluations} tried jumps; virtual robot"
+    for share in shares:
+        work = [(job, share * values) for job in others]
+        figures.append(list(in_parallel(_jump_with, work, jobs)))
+    title = f"{policy}, {case.name}, offsets of {evaluations} tried jumps; virtual robot"
     table = reach_table(shares, figures, title)
     record: dict[str, Any] = {
         "virtual": True,
@@ -319,5 +363,5 @@ def reach(
         "table": table,
     }
     if out is not None:
-        out.write_text(json.dumps({**record, "table": table.rows}, indent=1), encoding="utf-8")
+        write_text(out, json.dumps({**record, "table": table.rows}, indent=1))
     return finish(record, table)

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.reach import END_S, KNOTS_S, Approach, cost, offset_table, reach, search_offsets
+from benchmarks.reach import (
+    END_S,
+    KNOTS_S,
+    Approach,
+    OffsetLayout,
+    cost,
+    offset_table,
+    reach,
+    search_offsets,
+)
 from pronk.errors import PronkError
 from pronk.jump.trial.jumps import FlightFigures, JumpFigures
 from pronk.jump.trial.protocol import named
@@ -40,7 +50,7 @@ def test_offsets_are_those_of_the_knots_and_alike_on_both_sides() -> None:
     values = np.random.default_rng(0).normal(0.0, 0.3, SIZE)
     at_knots = values.reshape(2, 3, len(KNOTS_S))
     rate_hz = 100.0  # a step at every knot
-    offsets = offset_table(values, ROBOT, rate_hz)
+    offsets = offset_table(values, OffsetLayout.of(ROBOT), rate_hz)
     assert offsets.shape == (round(END_S * rate_hz), 12)
     steps = [round(time * rate_hz) for time in KNOTS_S]
     for k, joint in enumerate(ROBOT.joints):
@@ -52,6 +62,15 @@ def test_offsets_are_those_of_the_knots_and_alike_on_both_sides() -> None:
     # After the last knot they go down to nothing.
     last = np.abs(offsets[steps[-1] :])
     assert np.all(np.diff(last, axis=0) <= 0.0)
+
+
+def test_front_and_left_of_another_robot_follow_from_its_hips() -> None:
+    robot = load_robot("go2")
+    layout = OffsetLayout.of(robot)
+    for name, row, sign in zip(robot.joint_names, layout.rows, layout.signs, strict=True):
+        kind = ("hip_roll", "hip_pitch", "knee").index(name.split("_", 1)[1])
+        assert row == kind + (0 if name.startswith("F") else 3)
+        assert sign == (-1.0 if kind == 0 and name[1] == "L" else 1.0)
 
 
 def test_without_offsets_the_jump_is_that_of_a_trial(job: TrialJob) -> None:
@@ -93,7 +112,18 @@ def test_a_search_makes_a_jump_longer(job: TrialJob) -> None:
     assert longer.flight.along > plain.flight.along + 0.02
 
 
-@pytest.mark.parametrize("numbers", [{"evaluations": 3}, {"jumps": 0}, {"jobs": 0}, {"seed": -1}])
-def test_impossible_options_are_refused(numbers: dict[str, int]) -> None:
-    with pytest.raises(PronkError, match="expected"):
-        reach(POLICY, **numbers)
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"evaluations": 3}, "expected"),
+        ({"jumps": 0}, "expected"),
+        ({"jobs": 0}, "expected"),
+        ({"seed": -1}, "expected"),
+        ({"command": "0,0,1"}, "2,0"),
+        ({"command": "forward 2"}, "1,0,0"),
+        ({"out": Path(__file__) / "figures.json"}, "not a folder"),
+    ],
+)
+def test_impossible_options_are_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(PronkError, match=words):
+        reach(POLICY, **options)

@@ -56,8 +56,8 @@ BACKWARD_SHARE = "backward_share"
 SIDEWAYS_SHARE = "sideways_share"
 """Another one: `MotionCommandCfg.sideways_share`."""
 ANGLE_VERTICAL = "angle_vertical"
-"""Another one: vertical velocity of the lift-off whose direction `rewards.liftoff_angle` asks for
-[m/s]; the lower it is, the flatter are jumps forwards."""
+"""Another one: vertical velocity of the desired lift-off, whose direction `rewards.liftoff_angle`
+rewards [m/s]; the lower it is, the flatter are the lift-offs forwards that earn most."""
 COMMAND_NUMBERS = (SPEED_ADDED, GUIDANCE_SWEEP, BACKWARD_SHARE, SIDEWAYS_SHARE, ANGLE_VERTICAL)
 """All entries of `jump` that are no fields of `JumpSettings`."""
 _ANGLE_TERM = "liftoff_angle"
@@ -401,7 +401,7 @@ def _change_jump(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
 
 
 def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: float) -> None:
-    """Set the vertical velocity of the direction that the term `liftoff_angle` asks for."""
+    """Set the vertical velocity of the desired lift-off of the term `liftoff_angle`."""
     source = recipe.source_of("jump", ANGLE_VERTICAL)
     if not vertical > 0.0:
         raise ArtefactError(
