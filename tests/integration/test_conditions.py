@@ -155,6 +155,20 @@ def test_the_virtual_robot_applies_the_scale_to_the_gains_alone() -> None:
 # --- Files --------------------------------------------------------------------------------------
 
 
+def test_the_example_of_a_battery_changes_its_resistance_alone() -> None:
+    path = Path(__file__).parents[2] / "examples" / "battery.yaml"
+    conditions = load_conditions(str(path), SIM_PARAMS, ROBOT)
+    assumed = SIM_PARAMS.machine.bus_resistance
+    resistances = []
+    for condition in conditions:
+        changed = changed_params(condition, SIM_PARAMS, ROBOT)
+        resistances.append(changed.machine.bus_resistance)
+        machine = replace(changed.machine, bus_resistance=assumed)
+        assert replace(changed, machine=machine) == SIM_PARAMS
+    assert resistances == sorted(set(resistances))
+    assert assumed in resistances
+
+
 def test_the_tolerance_is_four_series_about_the_nominal_robot() -> None:
     conditions = load_conditions("tolerance", SIM_PARAMS, ROBOT)
     series: dict[str, list[float]] = {}
