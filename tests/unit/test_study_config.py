@@ -253,7 +253,13 @@ def test_the_study_of_the_examples_is_as_large_as_it_says() -> None:
 
 @pytest.mark.parametrize(
     ("name", "trainings"),
-    [("recipes.yaml", 16), ("go2/study.yaml", 16), ("contact.yaml", 10), ("flat.yaml", 10)],
+    [
+        ("recipes.yaml", 16),
+        ("go2/study.yaml", 16),
+        ("contact.yaml", 10),
+        ("flat.yaml", 10),
+        ("back.yaml", 10),
+    ],
 )
 def test_a_study_of_recipes_is_balanced(name: str, trainings: int) -> None:
     """A comparison has all trainings, half on each side."""
