@@ -31,6 +31,10 @@ from pronk.jump.virtual.capture import load_capture
 
 pytest.importorskip("onnxruntime")
 
+LATE = (Reason.NO_STATE, Reason.STATE_LOST, Reason.EXPIRED, Reason.LAG, Reason.HELD, Reason.ENDED)
+STOPPED_TOO_LONG = tuple(reason.text for reason in LATE)
+"""Faults that a process which the operating system stops for a moment causes."""
+
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -237,8 +241,18 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
     figures = tmp_path / "run.json"
     words = ["deploy", str(policy), "--script", "0,0", "--seconds", "0.6", "--ignore-latency-check"]
     files = ["--log", str(log), "--capture", str(capture), "--json", str(figures)]
-    done = invoke(words + files)
-    assert done.exit_code == 0, done.stdout + done.stderr
+    # On a busy computer a run may end with a fault, because a process was stopped for too long.
+    for _ in range(5):
+        done = invoke(words + files)
+        if done.exit_code == 0:
+            break
+        faults = json.loads(figures.read_text())["faults"]
+        assert faults, done.output
+        for fault in faults:
+            assert fault.startswith(STOPPED_TOO_LONG), done.output
+        for path in (log, capture, figures):
+            path.unlink()
+    assert done.exit_code == 0, done.output
     assert "the virtual robot" in done.stdout
     run_log = read_deploy_log(log)
     assert run_log.complete
