@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,15 @@ from pronk.jump.train.mdp.events import (
     randomize_strength,
     reset_state,
 )
+from pronk.jump.train.mdp.observations import (
+    joint_position,
+    joint_velocity,
+    measured_joint_position,
+    measured_joint_velocity,
+)
 from pronk.jump.train.tasks.jump_env_cfg import (
     draw_contact_damping,
+    draw_rotor_frequency,
     draw_weak_drives,
     without_randomization,
 )
@@ -144,6 +152,59 @@ def test_damping_of_the_contacts_is_drawn_and_stiffness_stays() -> None:
         speed = torch.maximum(speed, env.sim.data.qvel[:, 2])
     assert np.corrcoef(share[:, 0], speed)[0, 1] < -0.6
     env.close()
+
+
+@pytest.fixture
+def rotor_env() -> Iterator[Any]:
+    """Nominal robots without noise, whose joints are measured on rotors of 40 to 160 Hz."""
+    cfg = training_env.config(MANY, MATCHED)
+    without_randomization(cfg)
+    draw_rotor_frequency(cfg, 40.0)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    yield training_env.fresh(env, scripted=True)
+    env.close()
+
+
+def test_frequencies_of_the_rotors_are_drawn_for_each_joint(rotor_env: Any) -> None:
+    frequency = joint_position_action(rotor_env).rotors.frequency_hz
+    assert frequency.shape == (MANY, 12)
+    assert_uniform(np.log(frequency.numpy()), math.log(40.0), math.log(160.0))
+
+
+def test_joints_are_measured_on_the_rotors(rotor_env: Any) -> None:
+    """At rest a belt is wound up by the torque that it carries; in motion its rotor swings."""
+    rotors = joint_position_action(rotor_env).rotors
+    for _ in range(100):
+        rotor_env.step(torch.zeros(MANY, 12))
+    offset = measured_joint_position(rotor_env) - joint_position(rotor_env)
+    torque = rotor_env.scene["robot"].data.qfrc_actuator
+    armatures = torch.tensor([joint.drive.armature for joint in ROBOT.joints])
+    stiffness = armatures * (2.0 * math.pi * rotors.frequency_hz).square()
+    knees = [index for index, joint in enumerate(ROBOT.joints) if joint.group == "knee"]
+    expected = (torque / stiffness)[:, knees]
+    assert torque[:, knees].abs().mean() > 3.0
+    largest = float(expected.abs().max())
+    np.testing.assert_allclose(offset[:, knees], expected, atol=0.05 * largest)
+    swings = []
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        rotor_env.step(torch.randn(MANY, 12, generator=generator))
+        swings.append(measured_joint_velocity(rotor_env) - joint_velocity(rotor_env))
+        torch.testing.assert_close(swings[-1], rotors.speed, rtol=0.0, atol=1e-4)
+    size = torch.stack(swings).square().mean(dim=0).sqrt()
+    stiffest = rotors.frequency_hz > 120.0
+    softest = rotors.frequency_hz < 50.0
+    assert size[softest].mean() > 2.0 * size[stiffest].mean()
+    # New episodes begin with rotors at rest.
+    rotor_env.reset()
+    assert not rotors.offset.any()
+    assert not rotors.speed.any()
+
+
+def test_joints_are_measured_on_the_links_unless_rotors_are_drawn(env: Any) -> None:
+    env.step(torch.ones(MANY, 12))
+    assert torch.equal(measured_joint_position(env), joint_position(env))
+    assert torch.equal(measured_joint_velocity(env), joint_velocity(env))
 
 
 def test_contacts_with_all_of_their_damping_are_those_of_the_model(nominal_heights: Any) -> None:

@@ -83,6 +83,12 @@ def test_the_contact_of_the_feet_is_changed_only_where_a_share_is_less(tmp_path:
         assert "contact" not in task(text, tmp_path).events
 
 
+def test_joints_are_measured_on_rotors(tmp_path: Path) -> None:
+    cfg = task("task: {rotor_frequency: 40}", tmp_path)
+    assert cfg.events["rotors"].params["lowest_hz"] == 40.0
+    assert "rotors" not in task("task: {action_scale: 0.4}", tmp_path).events
+
+
 def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1,"
     text += " backward_share: 0.5, sideways_share: 0.25}"
@@ -122,6 +128,7 @@ def test_the_direction_of_a_lift_off_is_changed(tmp_path: Path) -> None:
         ("task: {action_scale: 0}", "action_scale|more than 0"),
         ("task: {contact_damping: 0}", "contact_damping|more than 0"),
         ("task: {contact_damping: 1.5}", "contact_damping|up to 1"),
+        ("task: {rotor_frequency: -40}", "rotor_frequency|more than 0"),
     ],
 )
 def test_what_there_is_not_is_refused_with_what_there_is(
@@ -229,7 +236,8 @@ def settings_of(cfg: Any) -> str:
         for name, term in cfg.rewards.items():
             weight = phase.weights.get(name, (term.weight, term.weight))
             rewards.append((name, weight, term.params, phase.jump_scales.get(name)))
-    return repr((rewards, cfg.commands, cfg.actions, cfg.events.get("contact")))
+    drawn = (cfg.events.get("contact"), cfg.events.get("rotors"))
+    return repr((rewards, cfg.commands, cfg.actions, drawn))
 
 
 MOST_TERMS = 20

@@ -288,14 +288,15 @@ def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
     assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is None
 
 
-def test_a_policy_is_evaluated_with_the_actions_and_contacts_of_its_recipe(
+def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recipe(
     trained: tuple[Path, Any], tmp_path: Path
 ) -> None:
     """Whether checkpoint or exported; the task's own scale of the actions is another one."""
     pytest.importorskip("onnxruntime")
     gains = training_gains("naive", ROBOT)
     recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("schema: pronk/recipe/1\ntask: {action_scale: 0.42, contact_damping: 0.5}\n")
+    numbers = "{action_scale: 0.42, contact_damping: 0.5, rotor_frequency: 40}"
+    recipe.write_text(f"schema: pronk/recipe/1\ntask: {numbers}\n")
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
     record = {
@@ -308,12 +309,14 @@ def test_a_policy_is_evaluated_with_the_actions_and_contacts_of_its_recipe(
     shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
     cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
     apply_recipe(cfg, load_recipe(recipe))
-    contract = contract_for(cfg, jump=True, provenance={"contact_damping": 0.5})
+    drawn = {"contact_damping": 0.5, "rotor_frequency": 40.0}
+    contract = contract_for(cfg, jump=True, provenance=drawn)
     export_policy(trained[1], contract, tmp_path / "policy.onnx")
     plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
     for path in (folder.path, tmp_path / "policy.onnx"):
         policy = adapter.load_evaluated_policy(path, "cpu")
         assert (policy.action_scale, policy.contact_damping) == (0.42, 0.5)
+        assert policy.rotor_frequency == 40.0
     assert adapter.run_evaluation(policy, gains, plan, device="cpu").about["action_scale"] == 0.42
     plain = adapter.load_evaluated_policy(trained[0], "cpu")
     evaluation = adapter.run_evaluation(plain, gains, plan, device="cpu")

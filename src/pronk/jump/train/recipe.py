@@ -8,7 +8,7 @@
       orientation: 1
     jump:                         # fields of `JumpSettings`, and `COMMAND_NUMBERS`
       late_s: 0.25
-    task:                         # `action_scale`, `contact_damping`
+    task:                         # `action_scale`, `contact_damping`, `rotor_frequency`
       action_scale: 0.42
 
 What a recipe does not name stays as the task has it. `pronk train --recipe FILE` applies it to the
@@ -68,7 +68,11 @@ which a policy explores, is in units of it."""
 CONTACT_DAMPING = "contact_damping"
 """Another one: smallest share of the damping of the feet on the ground that is drawn for a robot
 (`events.randomize_contact`)."""
-TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING)
+ROTOR_FREQUENCY = "rotor_frequency"
+"""Another one: joints are measured on rotors behind belts or gears that give way. It is the lowest
+natural frequency of a rotor while its link is held that is drawn (`events.randomize_rotors`)
+[Hz]."""
+TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY)
 """All entries of `task`."""
 
 _Value = float | dict[str, float | tuple[float, float]]
@@ -416,9 +420,9 @@ def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: flo
 
 
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
-    """Change the scale of the actions, and the contact of the feet."""
+    """Change the scale of the actions, the contact of the feet, and what encoders measure."""
     from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
-    from pronk.jump.train.tasks.jump_env_cfg import draw_contact_damping
+    from pronk.jump.train.tasks.jump_env_cfg import draw_contact_damping, draw_rotor_frequency
 
     action = cfg.actions[NAME]
     assert isinstance(action, DelayedJointPositionActionCfg)
@@ -432,6 +436,8 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
             raise ArtefactError(f"{source}: task: {name} is {value:g}; expected more than 0.")
         if name == ACTION_SCALE:
             action.scale = value
+        elif name == ROTOR_FREQUENCY:
+            draw_rotor_frequency(cfg, value)
         elif value > 1.0:
             raise ArtefactError(f"{source}: task: {name} is {value:g}; expected a share up to 1.")
         elif value < 1.0:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.actuators import Battery
+from pronk.jump.train.mdp.rotors import Rotors
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -71,6 +72,9 @@ class DelayedJointPositionAction(JointPositionAction):
         self.lag = torch.full((self.num_envs, 1), low, device=self.device)
         """Delay in this episode [physics steps]. (N, 1)"""
         self.battery = Battery(self._entity)
+        self.rotors = Rotors(self._armatures(), env.physics_dt)
+        """Rotors of the joints, as of the last `finish_step`."""
+        self._is_step_open = False
         self.guidance: Tensor | None = None
         """Added to the coming targets, if not None [rad]. (N, joints)"""
         all_joints = list(range(self._entity.num_joints))
@@ -100,6 +104,7 @@ class DelayedJointPositionAction(JointPositionAction):
 
     def apply_actions(self) -> None:
         """Give the drives the targets that are in force in the coming physics step."""
+        self.finish_step()
         low, high = self.cfg.delay_steps
         # A reset clears the drives' targets: the first physics step writes them in any case.
         changes = self._ages[0] == 0
@@ -109,6 +114,20 @@ class DelayedJointPositionAction(JointPositionAction):
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
         self.battery.advance()
+        self._is_step_open = True
+
+    def finish_step(self) -> None:
+        """Advance the rotors by the last physics step, if that has not been done."""
+        if self._is_step_open and not self.rotors.rigid:
+            self.rotors.advance(self._entity.data.qfrc_actuator, self._entity.data.joint_acc)
+        self._is_step_open = False
+
+    def _armatures(self) -> Tensor:
+        """Return the armatures of all joints [kg m^2], (N, joints)."""
+        armatures = torch.ones_like(self._entity.data.joint_pos)
+        for drive in self._entity.actuators:
+            armatures[:, drive.target_ids] = drive.cfg.armature
+        return armatures
 
     def _in_force(self) -> Tensor:
         """Return of each robot the newest target that is at least as old as its delay."""
@@ -130,6 +149,8 @@ class DelayedJointPositionAction(JointPositionAction):
         super().reset(env_ids)
         robots = slice(None) if env_ids is None else env_ids
         self.battery.reset(robots)
+        self.finish_step()
+        self.rotors.reset(robots)
         if self.guidance is not None:
             self.guidance[robots] = 0.0
         low, high = self.cfg.delay_steps

@@ -150,6 +150,31 @@ def randomize_contact(env: Any, env_ids: None, least: float, feet: SceneEntityCf
     env.sim.model.geom_solref[:, foot] = contact
 
 
+ROTOR_FREQUENCIES = 4.0
+"""Highest natural frequency of a rotor over the lowest one that is drawn [1]."""
+ROTOR_DAMPING = (0.1, 0.3)
+"""Damping ratios of rotors on their belts. The drive's damping of some 0.5 N m s/rad is 0.15 of the
+critical one for a knee of the Mini Cheetah at 45 Hz; friction adds to it."""
+
+
+def randomize_rotors(env: Any, env_ids: None, lowest_hz: float) -> None:
+    """Draw the natural frequency and damping of the rotor of each joint on its belt or gears.
+
+    Frequencies are drawn uniformly in their logarithm. A frequency f is a stiffness of
+    I (2 pi f)^2 between rotor and link, with the armature I.
+
+    Args:
+        env: The environment.
+        env_ids: All robots.
+        lowest_hz: Lowest frequency while the link is held, above 0 [Hz]; the highest is
+            `ROTOR_FREQUENCIES` times as much.
+    """
+    rotors = joint_position_action(env).rotors
+    size = rotors.offset.shape
+    factor = ROTOR_FREQUENCIES ** _uniform(env, (0.0, 1.0), *size)
+    rotors.draw(lowest_hz * factor, _uniform(env, ROTOR_DAMPING, *size))
+
+
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:
     """Draw pairs of gains.
 

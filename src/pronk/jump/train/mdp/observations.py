@@ -84,6 +84,24 @@ def joint_velocity(env: ManagerBasedRlEnv) -> Tensor:
     return env.sim.data.qvel[:, 6:]
 
 
+def measured_joint_position(env: ManagerBasedRlEnv) -> Tensor:
+    """Return the joint angles as encoders on the rotors measure them, likewise. (N, 12)."""
+    action = joint_position_action(env)
+    if action.rotors.rigid:
+        return joint_position(env)
+    action.finish_step()
+    return joint_position(env) + action.rotors.offset
+
+
+def measured_joint_velocity(env: ManagerBasedRlEnv) -> Tensor:
+    """Return the joint speeds as encoders on the rotors measure them [rad/s]. (N, 12)."""
+    action = joint_position_action(env)
+    if action.rotors.rigid:
+        return joint_velocity(env)
+    action.finish_step()
+    return joint_velocity(env) + action.rotors.speed
+
+
 def last_action(env: ManagerBasedRlEnv) -> Tensor:
     """Return the network's last actions. (N, 12)."""
     return env.action_manager.action

@@ -30,7 +30,7 @@ from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
-from pronk.jump.train.recipe import CONTACT_DAMPING
+from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from pronk.jump.train.training_progress import TrainingProgress, write_progress
@@ -361,6 +361,8 @@ class PronkRunner(MjlabOnPolicyRunner):
             provenance["weakest_drive"] = env.cfg.events["strength"].params["weakest"]
         if "contact" in env.cfg.events:
             provenance[CONTACT_DAMPING] = env.cfg.events["contact"].params["least"]
+        if "rotors" in env.cfg.events:
+            provenance[ROTOR_FREQUENCY] = env.cfg.events["rotors"].params["lowest_hz"]
         if env.cfg.events["gains"].params.get("shape") == "ellipsoid":
             provenance["ellipsoid"] = True
         if self.cfg.get("recipe_sha256"):

@@ -183,6 +183,18 @@ def draw_contact_damping(cfg: ManagerBasedRlEnvCfg, least: float) -> None:
     )
 
 
+def draw_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
+    """Measure joints on rotors behind belts whose stiffness is drawn for each joint.
+
+    Args:
+        cfg: Configuration of the environment, which is changed.
+        lowest_hz: Lowest natural frequency of a rotor while its link is held [Hz].
+    """
+    cfg.events["rotors"] = EventTermCfg(
+        func=events.randomize_rotors, mode="startup", params={"lowest_hz": lowest_hz}
+    )
+
+
 def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     """Make the environment for mjlab's `play` of a training environment: one nominal robot."""
     without_randomization(cfg)
@@ -277,8 +289,8 @@ def _observations() -> dict[str, ObservationGroupCfg]:
             terms={
                 "angular_velocity": _measured(observations.angular_velocity, 0.2),
                 "projected_gravity": _measured(observations.gravity_direction, 0.05),
-                "joint_position": _measured(observations.joint_position, 0.05, HISTORY),
-                "joint_velocity": _measured(observations.joint_velocity, 0.5, HISTORY),
+                "joint_position": _measured(observations.measured_joint_position, 0.05, HISTORY),
+                "joint_velocity": _measured(observations.measured_joint_velocity, 0.5, HISTORY),
                 "action": ObservationTermCfg(func=observations.last_action, history_length=ACTIONS),
                 "command": ObservationTermCfg(func=observations.velocity_command),
             },

@@ -32,13 +32,14 @@ from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import NAME as ACTION
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
-from pronk.jump.train.recipe import ACTION_SCALE, CONTACT_DAMPING
+from pronk.jump.train.recipe import ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import (
     draw_contact_damping,
+    draw_rotor_frequency,
     draw_weak_drives,
     without_randomization,
 )
@@ -113,6 +114,8 @@ def run_evaluation(
         draw_weak_drives(cfg, draws.weakest_drive)
     if policy.contact_damping not in (None, 1.0):
         draw_contact_damping(cfg, policy.contact_damping)
+    if policy.rotor_frequency is not None:
+        draw_rotor_frequency(cfg, policy.rotor_frequency)
     set_action_scale(cfg, policy)
     action: Any = cfg.actions[ACTION]
     _check_memory(plan, cfg.sim.mujoco.timestep, device)
@@ -196,6 +199,9 @@ class EvaluatedPolicy:
     """Change of a joint target with an action of 1 [rad]; None for that of the task."""
     contact_damping: float | None = None
     """Smallest share of the damping of the feet on the ground that was drawn. None: none; 1."""
+    rotor_frequency: float | None = None
+    """Lowest natural frequency of the rotors that its joints were measured on [Hz]. None: they were
+    measured on the links."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -250,6 +256,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
         contact_damping=task_numbers.get(CONTACT_DAMPING),
+        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY),
     )
 
 
@@ -299,6 +306,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
         contact_damping=contract.provenance.get(CONTACT_DAMPING),
+        rotor_frequency=contract.provenance.get(ROTOR_FREQUENCY),
     )
 
 
