@@ -89,6 +89,19 @@ def test_joints_are_measured_on_rotors(tmp_path: Path) -> None:
     assert "rotors" not in task("task: {action_scale: 0.4}", tmp_path).events
 
 
+def test_rotors_without_inertia_are_refused(tmp_path: Path) -> None:
+    cfg = config(8, training_gains("naive", ROBOT))
+    path = tmp_path / "recipe.yaml"
+    path.write_text("schema: pronk/recipe/1\ntask: {rotor_frequency: 40}\n")
+    knees = cfg.scene.entities["robot"].articulation.actuators[2]
+    knees.armature = 0.0
+    with pytest.raises(PronkError, match=r"FR_knee.* is 0") as refusal:
+        apply_recipe(cfg, load_recipe(path))
+    assert str(path) in str(refusal.value)
+    assert "rotor_inertia" in str(refusal.value)
+    assert "rotors" not in cfg.events
+
+
 def test_the_definition_of_a_jump_is_changed(tmp_path: Path) -> None:
     text = "jump: {liftoff_velocity: 2.2, late_s: 0.2, speed_added: 0.9, guidance_sweep: 1,"
     text += " backward_share: 0.5, sideways_share: 0.25}"
@@ -129,6 +142,7 @@ def test_the_direction_of_a_lift_off_is_changed(tmp_path: Path) -> None:
         ("task: {contact_damping: 0}", "contact_damping|more than 0"),
         ("task: {contact_damping: 1.5}", "contact_damping|up to 1"),
         ("task: {rotor_frequency: -40}", "rotor_frequency|more than 0"),
+        ("task: {rotor_frequency: 4}", "rotor_frequency|10 Hz or more"),
     ],
 )
 def test_what_there_is_not_is_refused_with_what_there_is(

@@ -72,6 +72,9 @@ ROTOR_FREQUENCY = "rotor_frequency"
 """Another one: joints are measured on rotors behind belts or gears that give way. It is the lowest
 natural frequency of a rotor while its link is held that is drawn (`events.randomize_rotors`)
 [Hz]."""
+SOFTEST_HZ = 10.0
+"""Least `ROTOR_FREQUENCY`: at 10 Hz the belt of a knee of the Mini Cheetah is as soft as its drive,
+25 N m/rad, and does not hold the robot up [Hz]."""
 TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY)
 """All entries of `task`."""
 
@@ -437,7 +440,14 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
         if name == ACTION_SCALE:
             action.scale = value
         elif name == ROTOR_FREQUENCY:
-            draw_rotor_frequency(cfg, value)
+            if value < SOFTEST_HZ:
+                raise ArtefactError(
+                    f"{source}: task: {name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more."
+                )
+            try:
+                draw_rotor_frequency(cfg, value)
+            except PronkError as error:
+                raise ArtefactError(f"{source}: task: {name}: {error}") from None
         elif value > 1.0:
             raise ArtefactError(f"{source}: task: {name} is {value:g}; expected a share up to 1.")
         elif value < 1.0:

@@ -158,9 +158,10 @@ critical one for a knee of the Mini Cheetah at 45 Hz; friction adds to it."""
 
 
 def randomize_rotors(env: Any, env_ids: None, lowest_hz: float) -> None:
-    """Draw the natural frequency and damping of the rotor of each joint on its belt or gears.
+    """Draw the natural frequency and damping of the rotors of each joint group on belts or gears.
 
-    Frequencies are drawn uniformly in their logarithm. A frequency f is a stiffness of
+    The joints of a group are built alike: a robot has one frequency and one damping ratio for each
+    group. Frequencies are drawn uniformly in their logarithm. A frequency f is a stiffness of
     I (2 pi f)^2 between rotor and link, with the armature I.
 
     Args:
@@ -170,9 +171,13 @@ def randomize_rotors(env: Any, env_ids: None, lowest_hz: float) -> None:
             `ROTOR_FREQUENCIES` times as much.
     """
     rotors = joint_position_action(env).rotors
-    size = rotors.offset.shape
-    factor = ROTOR_FREQUENCIES ** _uniform(env, (0.0, 1.0), *size)
-    rotors.draw(lowest_hz * factor, _uniform(env, ROTOR_DAMPING, *size))
+    frequency_hz = torch.empty_like(rotors.offset)
+    damping_ratio = torch.empty_like(rotors.offset)
+    for drive in env.scene["robot"].actuators:
+        factor = ROTOR_FREQUENCIES ** _uniform(env, (0.0, 1.0), env.num_envs, 1)
+        frequency_hz[:, drive.target_ids] = lowest_hz * factor
+        damping_ratio[:, drive.target_ids] = _uniform(env, ROTOR_DAMPING, env.num_envs, 1)
+    rotors.draw(frequency_hz, damping_ratio)
 
 
 def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor:

@@ -31,6 +31,7 @@ from mjlab.terrains import TerrainEntityCfg
 from mjlab.viewer import ViewerConfig
 from torch import Tensor
 
+from pronk.errors import PronkError
 from pronk.jump.train import phases
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp import actions, commands, events, observations, terminations
@@ -184,12 +185,26 @@ def draw_contact_damping(cfg: ManagerBasedRlEnvCfg, least: float) -> None:
 
 
 def draw_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
-    """Measure joints on rotors behind belts whose stiffness is drawn for each joint.
+    """Measure joints on rotors behind belts whose stiffness is drawn for each joint group.
 
     Args:
         cfg: Configuration of the environment, which is changed.
         lowest_hz: Lowest natural frequency of a rotor while its link is held [Hz].
+
+    Raises:
+        PronkError: Joints without rotor inertia, whose rotors cannot swing on belts.
     """
+    articulation = cfg.scene.entities["robot"].articulation
+    assert articulation is not None
+    joints = []
+    for drive in articulation.actuators:
+        if not drive.armature:
+            joints += drive.target_names_expr
+    if joints:
+        raise PronkError(
+            f"the rotor inertia of {', '.join(joints)} is 0, so that a rotor has no natural "
+            "frequency; give rotor_inertia or armature of these joints in the robot's robot.yaml."
+        )
     cfg.events["rotors"] = EventTermCfg(
         func=events.randomize_rotors, mode="startup", params={"lowest_hz": lowest_hz}
     )
