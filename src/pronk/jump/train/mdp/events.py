@@ -152,9 +152,10 @@ def randomize_contact(env: Any, env_ids: None, least: float, feet: SceneEntityCf
 
 ROTOR_FREQUENCIES = 4.0
 """Highest natural frequency of a rotor over the lowest one that is drawn [1]."""
-ROTOR_DAMPING = (0.1, 0.3)
+ROTOR_DAMPING = (0.05, 0.2)
 """Damping ratios of rotors on their belts. The drive's damping of some 0.5 N m s/rad is 0.15 of the
-critical one for a knee of the Mini Cheetah at 45 Hz; friction adds to it."""
+critical one for a knee of the Mini Cheetah at 45 Hz; the drive's lag takes some of it away, and
+friction adds to it."""
 
 
 def randomize_rotors(env: Any, env_ids: None, lowest_hz: float) -> None:
