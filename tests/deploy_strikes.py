@@ -52,8 +52,12 @@ PROCESSES = {
     "servo-killed": ("servo", signal.SIGKILL),
 }
 """Process of a `Deployment`, and the signal that it gets."""
-BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK", "STANDBY")
-"""Reasons of a computer that is too busy."""
+BUSY = (
+    *("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK", "STANDBY"),
+    # The robot's program stood still for some tenths of a second, or again and again for a moment.
+    *("ROBOT_CLOCK", "INTERRUPTED"),
+)
+"""Reasons of a computer that is too busy, but for faults of a clock."""
 FOUND_S = 3.0
 """Time for which a fault is waited for [s]."""
 REFUSED = "refused"
