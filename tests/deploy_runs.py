@@ -15,12 +15,15 @@ from pronk.deploy.links.link import Freshness
 from pronk.deploy.runtime.limits import AgeLimits
 from pronk.deploy.runtime.modes import Mode, OperatorRequest
 from pronk.deploy.runtime.poses import RunTiming
+from pronk.deploy.runtime.reasons import Reason
 from pronk.deploy.runtime.run import Deployment
 from pronk.deploy.runtime.teleop import OperatorCommand
 
 QUICK = RunTiming(
     damp_s=0.05, fold_s=0.3, check_s=0.0, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3
 )
+LATE = (Reason.NO_STATE, Reason.STATE_LOST, Reason.EXPIRED, Reason.LAG, Reason.HELD, Reason.ENDED)
+"""Reasons of a process that the operating system stops for a moment."""
 PATIENT = AgeLimits(held_s=100.0, damp_s=2.0, latch_s=4.0, expiry_s=2.0, lag=2000.0)
 """A busy computer must not look like a fault."""
 FRESH = Freshness(share=0.02, longest_gap_s=10.0)

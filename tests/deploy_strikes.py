@@ -41,6 +41,7 @@ from pronk.processes import die_with_parent
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from tests.dds_domain import own_domain
+from tests.deploy_runs import LATE
 from tests.linear_policy import stiff_go2, write_swaying
 
 WALKING_ROBOT = "mini_cheetah"
@@ -53,7 +54,8 @@ PROCESSES = {
 }
 """Process of a `Deployment`, and the signal that it gets."""
 BUSY = (
-    *("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK", "STANDBY"),
+    *(reason.name for reason in LATE),
+    *("CLOCK", "LINK", "STANDBY"),
     # The robot's program stood still for some tenths of a second, or again and again for a moment.
     *("ROBOT_CLOCK", "INTERRUPTED"),
 )

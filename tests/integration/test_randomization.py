@@ -154,15 +154,20 @@ def test_damping_of_the_contacts_is_drawn_and_stiffness_stays() -> None:
     env.close()
 
 
-@pytest.fixture
-def rotor_env() -> Iterator[Any]:
+@pytest.fixture(scope="module")
+def rotor_robots() -> Iterator[Any]:
     """Nominal robots without noise, whose joints are measured on rotors of 40 to 160 Hz."""
     cfg = training_env.config(MANY, MATCHED)
     without_randomization(cfg)
     draw_rotor_frequency(cfg, 40.0)
     env = ManagerBasedRlEnv(cfg, device="cpu")
-    yield training_env.fresh(env, scripted=True)
+    yield env
     env.close()
+
+
+@pytest.fixture
+def rotor_env(rotor_robots: Any) -> Any:
+    return training_env.fresh(rotor_robots, scripted=True)
 
 
 def test_frequencies_of_the_rotors_are_drawn_for_each_joint_group(rotor_env: Any) -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from command_line import invoke
 from deploy_faults import FaultyLink, writes
-from deploy_runs import DAMPED_S, PATIENT, QUICK, hold, met, notified
+from deploy_runs import DAMPED_S, LATE, PATIENT, QUICK, hold, met, notified
 from hopper import write_hopper
 
 # Reading a log for the first time would keep this process from holding the stick.
@@ -30,10 +30,6 @@ from pronk.errors import ArtefactError, HardwareError
 from pronk.jump.virtual.capture import load_capture
 
 pytest.importorskip("onnxruntime")
-
-LATE = (Reason.NO_STATE, Reason.STATE_LOST, Reason.EXPIRED, Reason.LAG, Reason.HELD, Reason.ENDED)
-STOPPED_TOO_LONG = tuple(reason.text for reason in LATE)
-"""Faults that a process which the operating system stops for a moment causes."""
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +245,7 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
         faults = json.loads(figures.read_text())["faults"]
         assert faults, done.output
         for fault in faults:
-            assert fault.startswith(STOPPED_TOO_LONG), done.output
+            assert fault.startswith(tuple(reason.text for reason in LATE)), done.output
         for path in (log, capture, figures):
             path.unlink()
     assert done.exit_code == 0, done.output

@@ -116,11 +116,12 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery.advance()
         self._is_step_open = True
 
-    def finish_step(self) -> None:
-        """Advance the rotors by the last physics step, if that has not been done."""
+    def finish_step(self) -> Rotors:
+        """Advance the rotors by the last physics step, if that has not been done; return them."""
         if self._is_step_open and not self.rotors.rigid:
             self.rotors.advance(self._entity.data.qfrc_actuator, self._entity.data.joint_acc)
         self._is_step_open = False
+        return self.rotors
 
     def _armatures(self) -> Tensor:
         """Return the armatures of all joints [kg m^2], (N, joints)."""

@@ -86,20 +86,12 @@ def joint_velocity(env: ManagerBasedRlEnv) -> Tensor:
 
 def measured_joint_position(env: ManagerBasedRlEnv) -> Tensor:
     """Return the joint angles as encoders on the rotors measure them, likewise. (N, 12)."""
-    action = joint_position_action(env)
-    if action.rotors.rigid:
-        return joint_position(env)
-    action.finish_step()
-    return joint_position(env) + action.rotors.offset
+    return joint_position(env) + joint_position_action(env).finish_step().offset
 
 
 def measured_joint_velocity(env: ManagerBasedRlEnv) -> Tensor:
     """Return the joint speeds as encoders on the rotors measure them [rad/s]. (N, 12)."""
-    action = joint_position_action(env)
-    if action.rotors.rigid:
-        return joint_velocity(env)
-    action.finish_step()
-    return joint_velocity(env) + action.rotors.speed
+    return joint_velocity(env) + joint_position_action(env).finish_step().speed
 
 
 def last_action(env: ManagerBasedRlEnv) -> Tensor:
