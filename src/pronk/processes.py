@@ -116,6 +116,10 @@ def pool(
     executor = ProcessPoolExecutor(
         processes, mp_context=context, initializer=_begin_process, initargs=(marks, begun)
     )
+    # Have the executor start all processes before the thread that watches them, as it does if they
+    # are forked. It else starts one with each job, and fails in several ways where one of them is
+    # killed meanwhile: a queue is closed, or a dictionary changes while that thread reads it.
+    executor._safe_to_dynamically_spawn_children = False  # type: ignore[attr-defined]
     with executor:
         try:
             yield executor
@@ -228,9 +232,6 @@ def results_in_order(
         numbers = range(1, len(jobs) + 1)
         try:
             results = executor.map(partial(_do_job, work), numbers, jobs)
-            # The executor looks which processes to watch as a job is submitted, before it starts
-            # another process: without one more job the end of the last would not be noticed.
-            executor.submit(os.getpid)
         except BrokenPipeError:
             # A process was killed while it was started.
             raise BrokenProcessPool from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import resource
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from command_line import refused
+from process_tree import children_of
 from pronk.errors import PronkError
 from pronk.exit_status import ExitStatus
 from pronk.files import locked_folder
@@ -151,14 +151,13 @@ def test_a_killed_process_of_a_trial_is_no_defect(tmp_path: Path) -> None:
     words = [*COMMAND, "trial", policy, "--commands=1,0", "--jumps", "500", "--no-video"]
     words += ["--processes", "2", "--out", tmp_path / "out"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    worker = ""
+    worker = 0
     while not worker and process.poll() is None:
-        for number in children.read_text().split():
-            with contextlib.suppress(OSError):
-                if b"spawn_main" in Path(f"/proc/{number}/cmdline").read_bytes():
-                    worker = number
-    os.kill(int(worker), signal.SIGKILL)
+        for pid, command in children_of(process.pid).items():
+            if "spawn_main" in command:
+                worker = pid
+    assert worker
+    os.kill(worker, signal.SIGKILL)
     _, stderr = process.communicate()
     assert process.returncode == ExitStatus.REFUSED
     (sentence,) = sentences(stderr)

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from hopper import write_hopper
+from process_tree import children_of
 from pronk.exit_status import ExitStatus
 
 pytestmark = pytest.mark.live
@@ -67,13 +68,12 @@ def test_the_processes_of_a_killed_sweep_end_too(tmp_path: Path) -> None:
     running = subprocess.Popen(
         [sys.executable, "-m", "pronk.cli.main", *words], stdout=subprocess.DEVNULL
     )
-    family = Path(f"/proc/{running.pid}/task/{running.pid}/children")
     until = time.monotonic() + 120.0
-    children: list[int] = []
+    children: dict[int, str] = {}
     # Two that sweep, and the tracker of what they share.
     while len(children) < 3 and time.monotonic() < until:
         time.sleep(0.05)
-        children = [int(word) for word in family.read_text().split()]
+        children = children_of(running.pid)
     time.sleep(1.0)
     running.kill()
     running.wait()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from process_tree import children_of
 from pronk.errors import PronkError
 from pronk.processes import exit_words, in_processes, pool
 
@@ -87,3 +90,23 @@ def test_an_exit_status_and_a_signal_without_a_name() -> None:
     assert "3" in exit_words(3, WAY_OUT)
     assert "signal" not in exit_words(3, WAY_OUT)
     assert str(signal.SIGRTMIN + 3) in exit_words(-(signal.SIGRTMIN + 3), WAY_OUT)
+
+
+def kill_first_child() -> None:
+    """Kill the first process that this one spawns, as soon as it is there."""
+    until = time.monotonic() + 60.0
+    while time.monotonic() < until:
+        for pid, command in children_of(os.getpid()).items():
+            if "spawn_main" in command:
+                os.kill(pid, signal.SIGKILL)
+                return
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is of Linux")
+@pytest.mark.parametrize("attempt", range(3))
+def test_a_process_that_is_killed_while_others_start_is_no_defect(attempt: int) -> None:
+    killer = threading.Thread(target=kill_first_child)
+    killer.start()
+    with pytest.raises(PronkError, match="SIGKILL"):
+        in_processes(time.sleep, [60.0] * 6, processes=6)
+    killer.join()
