@@ -323,6 +323,22 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     assert evaluation.about["action_scale"] == 0.35
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("rotor_frequency", -40.5), ("rotor_frequency", "soft"), ("contact_damping", 1.5)],
+)
+def test_impossible_numbers_that_a_policy_records_are_refused(
+    trained: tuple[Path, Any], tmp_path: Path, name: str, value: object
+) -> None:
+    pytest.importorskip("onnxruntime")
+    gains = training_gains("naive", ROBOT)
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    contract = contract_for(cfg, jump=True, provenance={name: value})
+    export_policy(trained[1], contract, tmp_path / "policy.onnx")
+    with pytest.raises(ArtefactError, match=f"policy.onnx.*{name}.*{value}"):
+        adapter.load_evaluated_policy(tmp_path / "policy.onnx", "cpu")
+
+
 def test_scales_that_differ_by_joint_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     gains = training_gains("naive", ROBOT)

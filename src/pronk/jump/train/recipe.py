@@ -431,27 +431,41 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     assert isinstance(action, DelayedJointPositionActionCfg)
     for name, value in recipe.task.items():
         source = recipe.source_of("task", name)
-        if name not in TASK_NUMBERS:
-            raise ArtefactError(
-                f"{source}: task has no number {name!r}; the numbers are {', '.join(TASK_NUMBERS)}."
-            )
-        if not value > 0.0:
-            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected more than 0.")
+        try:
+            check_task_number(name, value)
+        except PronkError as error:
+            raise ArtefactError(f"{source}: task: {error}") from None
         if name == ACTION_SCALE:
             action.scale = value
         elif name == ROTOR_FREQUENCY:
-            if value < SOFTEST_HZ:
-                raise ArtefactError(
-                    f"{source}: task: {name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more."
-                )
             try:
                 draw_rotor_frequency(cfg, value)
             except PronkError as error:
                 raise ArtefactError(f"{source}: task: {name}: {error}") from None
-        elif value > 1.0:
-            raise ArtefactError(f"{source}: task: {name} is {value:g}; expected a share up to 1.")
         elif value < 1.0:
             draw_contact_damping(cfg, value)
+
+
+def check_task_number(name: str, value: object) -> None:
+    """Refuse a number of `task` that is impossible, or a name that is none of them.
+
+    Args:
+        name: Its name.
+        value: What a recipe has for it, or what a policy or a run has recorded.
+
+    Raises:
+        PronkError: No such number, or it is out of its range.
+    """
+    if name not in TASK_NUMBERS:
+        raise PronkError(f"no number {name!r}; the numbers are {', '.join(TASK_NUMBERS)}.")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise PronkError(f"{name} is {value!r}; expected a number.")
+    if not 0.0 < value < math.inf:
+        raise PronkError(f"{name} is {value:g}; expected more than 0, and finite.")
+    if name == ROTOR_FREQUENCY and value < SOFTEST_HZ:
+        raise PronkError(f"{name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more.")
+    if name == CONTACT_DAMPING and value > 1.0:
+        raise PronkError(f"{name} is {value:g}; expected a share up to 1.")
 
 
 def _source_of_bad_jump(recipe: Recipe, settings: JumpSettings) -> str:

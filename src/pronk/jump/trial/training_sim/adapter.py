@@ -32,7 +32,13 @@ from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import NAME as ACTION
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
-from pronk.jump.train.recipe import ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY
+from pronk.jump.train.recipe import (
+    ACTION_SCALE,
+    CONTACT_DAMPING,
+    ROTOR_FREQUENCY,
+    TASK_NUMBERS,
+    check_task_number,
+)
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
@@ -238,7 +244,8 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
     provenance = run.read() if run.provenance.is_file() else {}
     settings = provenance.get("settings", {})
     gains = provenance.get("gains", {})
-    task_numbers = (provenance.get("recipe") or {}).get("task", {})
+    recipe = provenance.get("recipe") or {}
+    task_numbers = _task_numbers(recipe.get("task", {}), run.provenance)
     about = {
         "file": str(file),
         "sha256": sha256(file),
@@ -296,6 +303,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         "provenance": dict(contract.provenance),
         "versions": dict(contract.versions),
     }
+    task_numbers = _task_numbers(contract.provenance, path)
     runner = _ParallelPolicy(policy, device)
     return EvaluatedPolicy(
         act=runner.act,
@@ -305,9 +313,32 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         about=about,
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
-        contact_damping=contract.provenance.get(CONTACT_DAMPING),
-        rotor_frequency=contract.provenance.get(ROTOR_FREQUENCY),
+        contact_damping=task_numbers.get(CONTACT_DAMPING),
+        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY),
     )
+
+
+def _task_numbers(recorded: Mapping[str, Any], source: Path) -> dict[str, float]:
+    """Return the numbers of a recipe's `task` that are recorded of a training.
+
+    Args:
+        recorded: What is recorded; other entries and those that are None are left out.
+        source: File that has it, for messages.
+
+    Raises:
+        ArtefactError: A number is impossible.
+    """
+    numbers = {}
+    for name in TASK_NUMBERS:
+        value = recorded.get(name)
+        if value is None:
+            continue
+        try:
+            check_task_number(name, value)
+        except PronkError as error:
+            raise ArtefactError(f"{source}: {error} Train again.") from None
+        numbers[name] = value
+    return numbers
 
 
 def _common_scale(contract: Contract, path: Path) -> float:
