@@ -15,9 +15,12 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/bytecode
 # A module in one process, in the order of tests/conftest.py.
 DEAL := --dist loadscope --no-loadscope-reorder
+# Which live tests have failed; the other tests have a cache of their own.
+LIVE_CACHE := -o cache_dir=build/live-tests
+LIVE_FAILED := build/live-tests/failed
 WHEN_IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 
-.PHONY: demo test test-slow check docs lint ci ci-live ci-idle ci-others clean
+.PHONY: demo test test-slow check docs lint ci ci-live ci-live-again ci-idle ci-others clean
 
 demo: $(VENV)/.core
 	$(BIN)/pronk demo --out out/demo
@@ -40,11 +43,21 @@ test-slow: $(VENV)/.dev
 # All else runs beside them, but only while a core is idle: SCHED_IDLE, in the same session, for
 # which anything else that wants to run takes the core at once. Types and the site are checked
 # there too, so that live tests, which take longest, begin as soon as all is installed.
+#
+# Live tests that fail are run again when all else has ended, and have to pass then: programs in real
+# time do fail where the machine stands still for 50 to 200 ms, which virtual machines do.
 ci: $(VENV)/.dev
+	rm -rf $(LIVE_FAILED)
 	$(MAKE) -j 4 --output-sync=target ci-live ci-idle
+	if [ -e $(LIVE_FAILED) ]; then $(MAKE) ci-live-again; fi
 
+# Status 1 of pytest: tests have failed, and nothing else has.
 ci-live: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live $(LIVE_CACHE) --durations=10 \
+		|| { test $$? -eq 1 && touch $(LIVE_FAILED); }
+
+ci-live-again: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/live $(LIVE_CACHE) --last-failed -v
 
 # Its jobs are some of the four of `ci`.
 ci-idle: $(VENV)/.dev
