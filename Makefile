@@ -47,7 +47,7 @@ test-slow: $(VENV)/.dev
 # Live tests that fail are run again when all else has ended, and have to pass then: programs in real
 # time do fail where the machine stands still for 50 to 200 ms, which virtual machines do.
 ci: $(VENV)/.dev
-	rm -rf $(LIVE_FAILED)
+	rm -f $(LIVE_FAILED)
 	$(MAKE) -j 4 --output-sync=target ci-live ci-idle
 	if [ -e $(LIVE_FAILED) ]; then $(MAKE) ci-live-again; fi
 

@@ -55,9 +55,12 @@ PROCESSES = {
 """Process of a `Deployment`, and the signal that it gets."""
 BUSY = (
     *(reason.name for reason in LATE),
-    *("CLOCK", "LINK", "STANDBY"),
+    "CLOCK",
+    "LINK",
+    "STANDBY",
     # The robot's program stood still for some tenths of a second, or again and again for a moment.
-    *("ROBOT_CLOCK", "INTERRUPTED"),
+    "ROBOT_CLOCK",
+    "INTERRUPTED",
 )
 """Reasons of a computer that is too busy, but for faults of a clock."""
 FOUND_S = 3.0
