@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare, kstest
 
 pytest.importorskip("mjlab")
@@ -317,6 +318,41 @@ def test_episodes_begin_about_the_initial_state(env: Any) -> None:
     before = data.qpos.clone()
     reset_state(env, ALL[::2], **spread)
     assert (data.qpos == before).all(dim=1).tolist() == [False, True] * (MANY // 2)
+
+
+def test_pushes_change_the_velocity_at_intervals(env: Any) -> None:
+    """Every 5 to 10 s, in the world's frame, whatever the attitude of the trunk."""
+    term = env.event_manager.get_term_cfg("push")
+    assert dict(term.params) == {"interval_s": (5.0, 10.0), "speed": 0.3, "yaw_rate": 0.3}
+    data = env.sim.data
+    # Turned so that each axis of the trunk is another axis of the world.
+    attitude = torch.tensor([0.5, 0.5, 0.5, 0.5])
+    data.qpos[:, 3:7] = attitude
+    env.sim.forward()
+    data.qvel[:] = 0.0
+    pushed_at: list[list[float]] = [[] for _ in range(MANY)]
+    velocities = []
+    for step in range(2000):
+        term.func(env, None, **term.params)
+        for robot in (data.qvel[:, :6] != 0.0).any(dim=1).nonzero().flatten().tolist():
+            pushed_at[robot].append(step * env.step_dt)
+            velocities.append(data.qvel[robot].tolist())
+        data.qvel[:] = 0.0
+    intervals = np.concatenate([np.diff(times) for times in pushed_at])
+    # A push waits for the end of a step.
+    assert intervals.min() >= 5.0 - 1e-6
+    assert intervals.max() <= 10.0 + env.step_dt + 1e-6
+    jitter = np.random.default_rng(0).uniform(0.0, env.step_dt, intervals.shape)
+    assert kstest(intervals - jitter, "uniform", args=(5.0, 5.0)).pvalue > 1e-3
+    pushes = np.array(velocities)
+    np.testing.assert_array_equal(pushes[:, 6:], 0.0)
+    np.testing.assert_array_equal(pushes[:, 2], 0.0)
+    assert_uniform(pushes[:, 0], -0.3, 0.3)
+    assert_uniform(pushes[:, 1], -0.3, 0.3)
+    rotation = Rotation.from_quat(attitude[[1, 2, 3, 0]].numpy())
+    turns = rotation.apply(pushes[:, 3:6])  # in the world's frame
+    np.testing.assert_allclose(turns[:, :2], 0.0, atol=1e-6)
+    assert_uniform(turns[:, 2], -0.3, 0.3)
 
 
 def test_length_of_the_policy_step_is_drawn_each_step(env: Any) -> None:

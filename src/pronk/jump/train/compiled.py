@@ -3,15 +3,19 @@
 On a GPU a policy step is bound by the number of operations; compiled, hundreds of them become a few
 kernels. Results differ by rounding alone. What changes in training must be a tensor: a function is
 compiled again for every other value of a number that it reads.
+
+Learning takes the same step for many mini-batches. `RecordedStep` records it as a CUDA graph, whose
+kernels are launched together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch import Tensor
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,3 +53,77 @@ def prepare(device: str) -> None:
     """
     if device != "cpu":
         torch.set_float32_matmul_precision("high")
+
+
+class RecordedStep:
+    """A step of learning that is recorded as a CUDA graph once an update, and replayed.
+
+    The mini-batches of an update differ in their tensors alone. Between updates everything may
+    change: weights of losses, learning rates, the state of an optimizer. So each update records the
+    step anew. Its memory is used again by the next recording.
+    """
+
+    def __init__(self, function: Callable[[Mapping[str, Tensor]], Tensor], device: str) -> None:
+        """Prepare to record a function.
+
+        Args:
+            function: Takes a step for a mini-batch and returns a tensor for the log. It must not
+                wait for the device nor draw random numbers, and must keep on the device what one
+                mini-batch leaves to the next.
+            device: Device of the tensors. On a CPU the function is called as it is.
+        """
+        self.records = device != "cpu"
+        """Whether anything is recorded; on a CPU it is not."""
+        self._function = function
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._inputs: dict[str, Tensor] = {}
+        if self.records:
+            self._stream = torch.cuda.Stream(device)
+            self._pool = torch.cuda.graph_pool_handle()
+
+    def begin(self) -> None:
+        """Begin an update: what was recorded is not replayed any more."""
+        self._calls = 0
+        self._inputs = {}
+
+    def __call__(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Take the step for a mini-batch.
+
+        The first step of an update is taken as it is, since an optimizer makes its state in it, and
+        functions are compiled; neither can be recorded. The second one is recorded.
+
+        Args:
+            batch: Tensors by name. Those of other sizes than what was recorded are not replayed,
+                but computed.
+
+        Returns:
+            What the function returns, as a copy.
+        """
+        self._calls += 1
+        if self._calls == 1 or not self.records:
+            return self._function(batch)
+        if not self._inputs:
+            self._inputs = {name: tensor.clone() for name, tensor in batch.items()}
+            self._record()
+        for name, stored in self._inputs.items():
+            if stored.shape != batch[name].shape:
+                return self._function(batch)
+            stored.copy_(batch[name])
+        assert self._graph is not None
+        self._graph.replay()
+        return self._output.clone()
+
+    def _record(self) -> None:
+        """Record the function for the stored tensors; nothing is computed."""
+        graph = torch.cuda.CUDAGraph()
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            # `torch.cuda.graph` would also empty PyTorch's cache of memory, in every update.
+            graph.capture_begin(pool=self._pool)
+            try:
+                self._output = self._function(self._inputs)
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream().wait_stream(self._stream)
+        self._graph = graph

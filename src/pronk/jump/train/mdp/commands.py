@@ -324,7 +324,7 @@ class MotionCommand(CommandTerm):
         velocity, time, _, off = self._draw(len(env_ids))
         self.velocity[env_ids] = velocity
         self.time_left[env_ids] = time
-        self.jump[env_ids] = False
+        self.jump.index_fill_(0, env_ids, False)
         self._jump_left[env_ids] = off
         return {}
 

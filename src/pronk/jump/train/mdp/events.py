@@ -5,8 +5,8 @@ What a real robot has once is drawn once for each simulated robot, when the envi
 drawn by group (`randomize_gains`, the paper's box) or by joint, with dry friction
 (`randomize_drives`); weak drives (`randomize_strength`) and contacts of less damping
 (`randomize_contact`) on request. The command delay is drawn in each episode (`actions`), the length
-of the policy step in each step, noise in each observation. All draws are uniform, from PyTorch's
-generator of the device.
+of the policy step in each step, pushes at intervals (`Pushes`), noise in each observation. All
+draws are uniform, from PyTorch's generator of the device.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
-from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
+from mjlab.managers.event_manager import EventTermCfg, RecomputeLevel, requires_model_fields
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.noise import UniformNoiseCfg
 from torch import Tensor
@@ -24,6 +24,7 @@ from torch import Tensor
 from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
 from pronk.jump.train.mdp.actions import joint_position_action
+from pronk.jump.train.mdp.observations import gravity_direction
 
 Range = tuple[float, float]
 Shape = Literal["box", "ellipsoid"]
@@ -309,6 +310,44 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
             "more in a policy step."
         )
     env.cfg.decimation = nominal + random.Random(env.common_step_counter).randint(*added)
+
+
+class Pushes:
+    """Sudden changes of the velocity of each robot's trunk, at intervals.
+
+    mjlab's event for this asks the device in every step which robots it is due for. Here all robots
+    are computed, and the others are left as they are.
+    """
+
+    def __init__(self, cfg: EventTermCfg, env: Any) -> None:
+        """Draw the time of each robot's first push; mjlab gives configuration and environment."""
+        self._time_left = _uniform(env, cfg.params["interval_s"], env.num_envs)
+
+    def __call__(
+        self, env: Any, env_ids: None, interval_s: Range, speed: float, yaw_rate: float
+    ) -> None:
+        """Push the robots whose interval is over, and draw the next one.
+
+        Args:
+            env: The environment.
+            env_ids: All robots.
+            interval_s: Shortest and longest time from one push to the next [s].
+            speed: Half-width of what is added to the velocity along world x and y [m/s].
+            yaw_rate: Half-width of what is added to the angular velocity about world z [rad/s].
+        """
+        self._time_left -= env.step_dt
+        due = self._time_left <= 0.0
+        interval = _uniform(env, interval_s, env.num_envs)
+        self._time_left = torch.where(due, interval, self._time_left)
+        uniform = _uniform(env, (-1.0, 1.0), env.num_envs, 3) * due[:, None]
+        velocity = env.sim.data.qvel
+        velocity[:, :2] += speed * uniform[:, :2]
+        # The angular velocity of a free joint is in the trunk's frame. Its attitude is that of the
+        # last physics step.
+        velocity[:, 3:6] -= gravity_direction(env) * (yaw_rate * uniform[:, 2:])
+
+    def reset(self, env_ids: Tensor) -> None:
+        """Let the intervals run on when episodes end."""
 
 
 def reset_state(

@@ -215,7 +215,8 @@ class JumpState:
             self.gap_gain,
             self.similarity,
         ):
-            value[env_ids] = 0
+            # Assigned to an index, the zero would be copied to the device for each of them.
+            value.index_fill_(0, env_ids, 0)
 
     def advance(self, inputs: JumpInputs, dt: float | Tensor) -> None:
         """Advance by one policy step.

@@ -88,8 +88,8 @@ class StepMotion:
 
     def reset(self, env_ids: Tensor) -> None:
         """Leave robots that start a new episode, env_ids (n,), without a step before."""
-        self.legs.foot_velocity[env_ids] = 0.0
-        self.joints.torque[env_ids] = 0.0
+        self.legs.foot_velocity.index_fill_(0, env_ids, 0.0)
+        self.joints.torque.index_fill_(0, env_ids, 0.0)
 
 
 def mirror_joints(body: Legged) -> dict[str, str]:

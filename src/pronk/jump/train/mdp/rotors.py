@@ -82,5 +82,7 @@ class Rotors:
 
     def reset(self, robots: Tensor | slice) -> None:
         """Put the rotors of some robots at rest on their links."""
+        if self.rigid:
+            return
         self.offset[robots] = 0.0
         self.speed[robots] = 0.0

@@ -8,7 +8,8 @@ changes before PPO has used them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
-from pronk.jump.train.compiled import compiled, compiled_step
+from pronk.jump.train.compiled import RecordedStep, compiled, compiled_step
 from pronk.jump.train.rl.networks import JUMP_WEIGHT, EstimatorActor, JumpCritic, average
 
 TARGET_GROUP = "estimator_target"
@@ -88,6 +89,8 @@ class EstimatorPPO(PPO):
     _compiled_policy: Callable[..., tuple[Tensor, ...]] | None = None
     _compiled_losses: Callable[..., tuple[Tensor, ...]] | None = None
     _compiled_estimator_losses: Callable[..., tuple[Tensor, Tensor]] | None = None
+    _recorded_step: RecordedStep | None = None
+    _recorded_estimator_step: RecordedStep | None = None
 
     @staticmethod
     def construct_algorithm(
@@ -171,6 +174,10 @@ class EstimatorPPO(PPO):
         self._compiled_policy = compiled_step(self._policy_step)
         self._compiled_losses = compiled(self._losses)
         self._compiled_estimator_losses = compiled(self._raw_actor.estimator.losses)
+        if self.gpu_world_size == 1:
+            # Processes exchange gradients in a step, which is not recorded.
+            self._recorded_step = RecordedStep(self._step, self.device)
+            self._recorded_estimator_step = RecordedStep(self._estimator_step, self.device)
 
     @property
     def is_compiled(self) -> bool:
@@ -221,26 +228,24 @@ class EstimatorPPO(PPO):
         std = actor.distribution.std_param.clamp(*actor.distribution.std_range)
         return mean, std.expand_as(mean)
 
-    def _losses(
-        self, obs: Mapping[str, Tensor], batch: Mapping[str, Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _losses(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Compute PPO's losses of a mini-batch.
 
         Args:
-            obs: Observations by group, (M, size) each: samples and, behind them, mirror images.
-            batch: `actions`, (M, 12); `log_prob`, `advantages`, `returns`, (M, 1); of the n samples
-                alone `mean` and `std`, (n, 12).
+            batch: Of M samples and, behind them, mirror images: observations by group, (M, size)
+                each, `actions`, (M, 12), `log_prob`, `advantages`, `returns`, (M, 1); of the n
+                samples alone `mean` and `std`, (n, 12).
 
         Returns:
             Surrogate loss, value loss, and of the samples alone entropy [nat] and divergence [nat].
         """
-        mean, std = self._action_distribution(obs)
+        mean, std = self._action_distribution(batch)
         log_prob = _log_prob(batch["actions"], mean, std)
         ratio = torch.exp(log_prob - batch["log_prob"].squeeze(-1))
         advantages = batch["advantages"].squeeze(-1)
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.maximum(-advantages * ratio, -advantages * clipped_ratio).mean()
-        value = (batch["returns"] - self._raw_critic(obs)).square().mean()
+        value = (batch["returns"] - self._raw_critic(batch)).square().mean()
         count = len(batch["mean"])
         new_std = std[:count]
         entropy = (0.5 + 0.5 * math.log(2.0 * math.pi) + new_std.log()).sum(dim=-1).mean()
@@ -248,6 +253,33 @@ class EstimatorPPO(PPO):
             batch["mean"], batch["std"], mean[:count].detach(), new_std.detach()
         )
         return surrogate, value, entropy, divergence.mean()
+
+    def _step(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Take PPO's step for a mini-batch; the learning rate is a tensor, which follows.
+
+        Args:
+            batch: As `_losses` has it.
+
+        Returns:
+            Value loss, surrogate loss and entropy [nat]. (3,)
+        """
+        assert self._compiled_losses is not None
+        assert self.desired_kl is not None
+        surrogate, value, entropy, divergence = self._compiled_losses(batch)
+        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+        self.optimizer.zero_grad()
+        loss.backward()
+        divergence = average(divergence.detach(), self.gpu_world_size)
+        slower = divergence > 2.0 * self.desired_kl
+        faster = (divergence < 0.5 * self.desired_kl) & (divergence > 0.0)
+        factor = torch.where(slower, 1.0 / 1.5, torch.where(faster, 1.5, 1.0))
+        self.optimizer.param_groups[0]["lr"].mul_(factor).clamp_(1e-5, 1e-2)
+        if self.gpu_world_size > 1:
+            self.reduce_parameters()
+        for model in (self._raw_actor, self._raw_critic):
+            nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        return torch.stack((value, surrogate, entropy)).detach()
 
     def _update_networks(self) -> dict[str, float]:
         """Take PPO's steps as rsl_rl does, without waiting for the device.
@@ -257,43 +289,25 @@ class EstimatorPPO(PPO):
         Returns:
             Mean losses by name.
         """
-        assert self._compiled_losses is not None
-        assert self.desired_kl is not None
         (group,) = self.optimizer.param_groups
-        rate = torch.tensor(self.learning_rate, device=self.device)
-        group["lr"] = rate
+        group["lr"] = torch.tensor(self.learning_rate, device=self.device)
         history = []
         batches = self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)
-        for samples in batches:
-            old_mean, old_std = samples.old_distribution_params
-            if self.symmetry is not None:
-                self.symmetry.augment_batch(samples, len(old_mean))
-            batch = {
-                "actions": samples.actions,
-                "log_prob": samples.old_actions_log_prob,
-                "advantages": samples.advantages,
-                "returns": samples.returns,
-                "mean": old_mean,
-                "std": old_std,
-            }
-            losses = self._compiled_losses(_tensors(samples.observations), batch)
-            surrogate, value, entropy, divergence = losses
-            loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
-            self.optimizer.zero_grad()
-            loss.backward()
-            divergence = average(divergence.detach(), self.gpu_world_size)
-            slower = divergence > 2.0 * self.desired_kl
-            faster = (divergence < 0.5 * self.desired_kl) & (divergence > 0.0)
-            factor = torch.where(slower, 1.0 / 1.5, torch.where(faster, 1.5, 1.0))
-            rate.mul_(factor).clamp_(1e-5, 1e-2)
-            if self.gpu_world_size > 1:
-                self.reduce_parameters()
-            for model in (self._raw_actor, self._raw_critic):
-                nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
-            self.optimizer.step()
-            history.append(torch.stack((value, surrogate, entropy)).detach())
+        with recorded(self._recorded_step, self._step, self.optimizer) as step:
+            for samples in batches:
+                old_mean, old_std = samples.old_distribution_params
+                if self.symmetry is not None:
+                    self.symmetry.augment_batch(samples, len(old_mean))
+                batch = _tensors(samples.observations)
+                batch["actions"] = samples.actions
+                batch["log_prob"] = samples.old_actions_log_prob
+                batch["advantages"] = samples.advantages
+                batch["returns"] = samples.returns
+                batch["mean"] = old_mean
+                batch["std"] = old_std
+                history.append(step(batch))
         means = torch.stack(history).mean(dim=0).tolist()
-        self.learning_rate = float(rate)
+        self.learning_rate = float(group["lr"])
         group["lr"] = self.learning_rate
         self.storage.clear()
         return dict(zip(("value", "surrogate", "entropy"), means, strict=True))
@@ -321,39 +335,55 @@ class EstimatorPPO(PPO):
     def _update_estimator(self) -> dict[str, float]:
         """Take the supervised steps of an iteration; returns the mean losses by name."""
         cfg = self.estimator_cfg
-        estimator = self._raw_actor.estimator
-        optimizer = self.estimator_optimizer
-        parameters = list(estimator.parameters())
         observations = self.storage.observations
         with torch.no_grad():
             inputs = self._raw_actor.estimator_input(observations).flatten(0, 1)
         targets = observations[TARGET_GROUP].flatten(0, 1)
-        coefficients = torch.tensor(
-            [cfg.contact_coef, cfg.velocity_coef], device=self.device
-        ).unbind()
-        losses = self._compiled_estimator_losses or estimator.losses
+        coefficients = torch.tensor([cfg.contact_coef, cfg.velocity_coef], device=self.device)
         history: list[Tensor] = []
-        for _ in range(cfg.epochs):
-            order = torch.randperm(len(inputs), device=inputs.device)
-            for rows in order.tensor_split(cfg.mini_batches):
-                contact_loss, velocity_loss = losses(inputs[rows], targets[rows])
-                optimizer.zero_grad()
-                torch.autograd.backward((contact_loss, velocity_loss), coefficients)
-                if self.gpu_world_size > 1:
-                    gradients = [p.grad for p in parameters if p.grad is not None]
-                    gradient_vector = nn.utils.parameters_to_vector(gradients)
-                    average(gradient_vector, self.gpu_world_size)
-                    nn.utils.vector_to_parameters(gradient_vector, gradients)
-                nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-                optimizer.step()
-                history.append(torch.stack((contact_loss, velocity_loss)).detach())
+        with recorded(
+            self._recorded_estimator_step, self._estimator_step, self.estimator_optimizer
+        ) as step:
+            for _ in range(cfg.epochs):
+                order = torch.randperm(len(inputs), device=inputs.device)
+                for rows in order.tensor_split(cfg.mini_batches):
+                    batch = {
+                        "input": inputs[rows],
+                        "target": targets[rows],
+                        "coefficients": coefficients,
+                    }
+                    history.append(step(batch))
         # PPO clips and reduces the gradients that it finds in the actor: leave none.
-        optimizer.zero_grad()
+        self.estimator_optimizer.zero_grad()
         mean_contact_loss, mean_velocity_loss = torch.stack(history).mean(dim=0).tolist()
         return {
             "estimator_contact": mean_contact_loss,
             "estimator_velocity": mean_velocity_loss,
         }
+
+    def _estimator_step(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Take a supervised step of the estimator.
+
+        Args:
+            batch: `input`, (M, size), `target`, (M, 7), and `coefficients` of both losses, (2,).
+
+        Returns:
+            Contact loss [nat] and velocity loss [m^2/s^2]. (2,)
+        """
+        estimator = self._raw_actor.estimator
+        parameters = list(estimator.parameters())
+        losses = self._compiled_estimator_losses or estimator.losses
+        contact_loss, velocity_loss = losses(batch["input"], batch["target"])
+        self.estimator_optimizer.zero_grad()
+        torch.autograd.backward((contact_loss, velocity_loss), batch["coefficients"].unbind())
+        if self.gpu_world_size > 1:
+            gradients = [p.grad for p in parameters if p.grad is not None]
+            gradient_vector = nn.utils.parameters_to_vector(gradients)
+            average(gradient_vector, self.gpu_world_size)
+            nn.utils.vector_to_parameters(gradient_vector, gradients)
+        nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.estimator_optimizer.step()
+        return torch.stack((contact_loss, velocity_loss)).detach()
 
     def set_estimator_rate(self, rate: float) -> None:
         """Set the learning rate of the estimator."""
@@ -435,6 +465,32 @@ class EstimatorPPO(PPO):
             moments[place_of[number]] = moment
         wide_group = {**group, "params": list(range(len(parameters)))}
         return {"state": moments, "param_groups": [wide_group]}
+
+
+@contextmanager
+def recorded(
+    recorded_step: RecordedStep | None,
+    step: Callable[[Mapping[str, Tensor]], Tensor],
+    optimizer: torch.optim.Optimizer,
+) -> Iterator[Callable[[Mapping[str, Tensor]], Tensor]]:
+    """Give the step of an update: as it is recorded, or as it is where nothing is recorded.
+
+    Args:
+        recorded_step: The recorded step, or None.
+        step: The step as it is.
+        optimizer: The step's optimizer, which has to know inside the block that it is recorded.
+    """
+    if recorded_step is None or not recorded_step.records:
+        yield step
+        return
+    (group,) = optimizer.param_groups
+    recorded_step.begin()
+    group["capturable"] = True
+    try:
+        yield recorded_step
+    finally:
+        # Adam refuses it on a CPU, where a checkpoint may be loaded.
+        group["capturable"] = False
 
 
 def _tensors(obs: TensorDict) -> dict[str, Tensor]:
