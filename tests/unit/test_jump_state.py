@@ -565,7 +565,7 @@ def test_robots_are_independent_and_reset_alone(seed: int) -> None:
         first_steps.append(steps[:30])
         later_steps.append(steps[30:])
     first_halves = play(first_steps, state)
-    state.reset(torch.tensor([1]))
+    state.reset(torch.tensor([False, True, False]))
     second_halves = play(later_steps, state)
     for i, steps in enumerate(robots):
         if i == 1:

@@ -4,8 +4,8 @@ On a GPU a policy step is bound by the number of operations; compiled, hundreds 
 kernels. Results differ by rounding alone. What changes in training must be a tensor: a function is
 compiled again for every other value of a number that it reads.
 
-Learning takes the same step for many mini-batches. `RecordedStep` records it as a CUDA graph, whose
-kernels are launched together.
+What is computed alike many times in an iteration is recorded as a CUDA graph, whose kernels are
+launched together (`RecordedFunction`): the steps of learning, of the policy, and of the drives.
 """
 
 from __future__ import annotations
@@ -55,22 +55,28 @@ def prepare(device: str) -> None:
         torch.set_float32_matmul_precision("high")
 
 
-class RecordedStep:
-    """A step of learning that is recorded as a CUDA graph once an update, and replayed.
+class RecordedFunction:
+    """A function of tensors that is recorded as a CUDA graph once an iteration, and replayed.
 
-    The mini-batches of an update differ in their tensors alone. Between updates everything may
-    change: weights of losses, learning rates, the state of an optimizer. So each update records the
-    step anew. Its memory is used again by the next recording.
+    Calls in an iteration differ in their tensors alone. Between iterations everything may change:
+    weights of losses, learning rates, the state of an optimizer. So each iteration records the
+    function anew. Its memory is used again by the next recording.
     """
 
-    def __init__(self, function: Callable[[Mapping[str, Tensor]], Tensor], device: str) -> None:
+    def __init__(
+        self,
+        function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
+        device: str,
+        stream: torch.cuda.Stream | None = None,
+    ) -> None:
         """Prepare to record a function.
 
         Args:
-            function: Takes a step for a mini-batch and returns a tensor for the log. It must not
-                wait for the device nor draw random numbers, and must keep on the device what one
-                mini-batch leaves to the next.
+            function: Computes tensors from tensors by name. It must not wait for the device nor
+                draw random numbers, and must keep on the device, in the same memory, what one call
+                leaves to the next.
             device: Device of the tensors. On a CPU the function is called as it is.
+            stream: The stream to record on, if the function names one; None for a new one.
         """
         self.records = device != "cpu"
         """Whether anything is recorded; on a CPU it is not."""
@@ -78,51 +84,52 @@ class RecordedStep:
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._inputs: dict[str, Tensor] = {}
+        self._outputs: tuple[Tensor, ...] = ()
         if self.records:
-            self._stream = torch.cuda.Stream(device)
+            self._stream = stream or torch.cuda.Stream(device)
             self._pool = torch.cuda.graph_pool_handle()
 
     def begin(self) -> None:
-        """Begin an update: what was recorded is not replayed any more."""
+        """Begin an iteration: what was recorded is not replayed any more."""
         self._calls = 0
         self._inputs = {}
 
-    def __call__(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Take the step for a mini-batch.
+    def __call__(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Compute the function.
 
-        The first step of an update is taken as it is, since an optimizer makes its state in it, and
-        functions are compiled; neither can be recorded. The second one is recorded.
+        The first call of an iteration is computed as it is, since optimizers make their state in
+        it, and functions are compiled; neither can be recorded. The second one is recorded.
 
         Args:
-            batch: Tensors by name. Those of other sizes than what was recorded are not replayed,
+            inputs: Tensors by name. Those of other sizes than what was recorded are not replayed,
                 but computed.
 
         Returns:
-            What the function returns, as a copy.
+            What the function returns, as copies.
         """
         self._calls += 1
         if self._calls == 1 or not self.records:
-            return self._function(batch)
-        if not self._inputs:
-            self._inputs = {name: tensor.clone() for name, tensor in batch.items()}
+            return self._function(inputs)
+        if self._calls == 2:
+            self._inputs = {name: tensor.clone() for name, tensor in inputs.items()}
             self._record()
         for name, stored in self._inputs.items():
-            if stored.shape != batch[name].shape:
-                return self._function(batch)
-            stored.copy_(batch[name])
+            if stored.shape != inputs[name].shape:
+                return self._function(inputs)
+            stored.copy_(inputs[name])
         assert self._graph is not None
         self._graph.replay()
-        return self._output.clone()
+        return tuple(output.clone() for output in self._outputs)
 
     def _record(self) -> None:
         """Record the function for the stored tensors; nothing is computed."""
         graph = torch.cuda.CUDAGraph()
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream):
-            # `torch.cuda.graph` would also empty PyTorch's cache of memory, in every update.
+            # `torch.cuda.graph` would also empty PyTorch's cache of memory, in every iteration.
             graph.capture_begin(pool=self._pool)
             try:
-                self._output = self._function(self._inputs)
+                self._outputs = self._function(self._inputs)
             finally:
                 graph.capture_end()
         torch.cuda.current_stream().wait_stream(self._stream)

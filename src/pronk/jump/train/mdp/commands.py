@@ -266,6 +266,7 @@ class MotionCommand(CommandTerm):
         self._is_compiled = True
         self.state.liftoff_std = torch.tensor(self.state.liftoff_std, device=self.device)
         self._compiled_measure = compiled_step(self._measure)
+        self._compiled_clear = compiled_step(self._clear)
 
     def scaled_in_jump_mode(self, value: Tensor, scale: float | Tensor) -> Tensor:
         """Multiply a reward of each robot, (N,), by `scale`, (), where it is in jump mode."""
@@ -316,9 +317,13 @@ class MotionCommand(CommandTerm):
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
         """Draw commands for robots that start a new episode, and clear their jumps."""
         assert isinstance(env_ids, Tensor)
-        self.state.reset(env_ids)
-        if self._motion is not None:
-            self._motion.reset(env_ids)
+        robots = torch.zeros_like(self.jump).index_fill_(0, env_ids, True)
+        if self._motion is None:
+            self.state.reset(robots)
+        elif self._is_compiled:
+            self._compiled_clear(robots, self._motion)
+        else:
+            self._clear(robots, self._motion)
         if self.scripted:
             return {}
         velocity, time, _, off = self._draw(len(env_ids))
@@ -327,6 +332,11 @@ class MotionCommand(CommandTerm):
         self.jump.index_fill_(0, env_ids, False)
         self._jump_left[env_ids] = off
         return {}
+
+    def _clear(self, robots: Tensor, motion: StepMotion) -> None:
+        """Clear jumps and motion of the robots that start a new episode, bool (N,)."""
+        self.state.reset(robots)
+        motion.reset(robots)
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
         """Advance the time by `dt`; draw anew where an interval is over."""

@@ -366,16 +366,20 @@ def reset_state(
         heading: Half-width of the yaw angle [rad].
         joints: Half-width of the joint positions about the default pose [rad].
     """
-    robot = env.scene["robot"]
-    root = robot.data.default_root_state[env_ids]
-    pose = robot.data.default_joint_pos[env_ids]
-    uniform = _uniform(env, (-1.0, 1.0), len(env_ids), 5 + pose.shape[1])
+    robot = env.scene["robot"].data
+    root = robot.default_root_state[env_ids]
+    joint_position = robot.default_joint_pos[env_ids]
+    uniform = _uniform(env, (-1.0, 1.0), len(env_ids), 5 + joint_position.shape[1])
     root[:, :3] += env.scene.env_origins[env_ids]
     root[:, :2].add_(uniform[:, :2], alpha=place)
     half_angle = uniform[:, 2] * (heading / 2)
     root[:, 3] = half_angle.cos()
     root[:, 6] = half_angle.sin()
     root[:, 7:9].add_(uniform[:, 3:5], alpha=speed)
-    pose.add_(uniform[:, 5:], alpha=joints)
-    robot.write_root_state_to_sim(root, env_ids=env_ids)
-    robot.write_joint_state_to_sim(pose, torch.zeros_like(pose), env_ids=env_ids)
+    joint_position.add_(uniform[:, 5:], alpha=joints)
+    # An index makes mjlab's arrays tensors without a copy. The robot is all that is simulated.
+    positions = torch.cat([root[:, :7], joint_position], dim=1)
+    env.sim.data.qpos[:].index_copy_(0, env_ids, positions)
+    at_rest = torch.zeros_like(uniform[:, 2:])  # all but the velocity of the trunk
+    velocities = torch.cat([root[:, 7:10], at_rest], dim=1)
+    env.sim.data.qvel[:].index_copy_(0, env_ids, velocities)

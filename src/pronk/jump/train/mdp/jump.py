@@ -186,8 +186,8 @@ class JumpState:
         else:
             self.liftoff_std = std
 
-    def reset(self, env_ids: Tensor) -> None:
-        """Clear the state of some robots, env_ids (n,)."""
+    def reset(self, robots: Tensor) -> None:
+        """Clear the state of some robots, bool (N,)."""
         for value in (
             self.commanded,
             self.airborne,
@@ -215,8 +215,7 @@ class JumpState:
             self.gap_gain,
             self.similarity,
         ):
-            # Assigned to an index, the zero would be copied to the device for each of them.
-            value.index_fill_(0, env_ids, 0)
+            value.masked_fill_(robots.view(-1, *[1] * (value.ndim - 1)), 0)
 
     def advance(self, inputs: JumpInputs, dt: float | Tensor) -> None:
         """Advance by one policy step.

@@ -86,10 +86,10 @@ class StepMotion:
     non_foot_contacts: Tensor
     """Number of parts other than feet on the ground. (N,)"""
 
-    def reset(self, env_ids: Tensor) -> None:
-        """Leave robots that start a new episode, env_ids (n,), without a step before."""
-        self.legs.foot_velocity.index_fill_(0, env_ids, 0.0)
-        self.joints.torque.index_fill_(0, env_ids, 0.0)
+    def reset(self, robots: Tensor) -> None:
+        """Leave robots that start a new episode, bool (N,), without a step before."""
+        self.legs.foot_velocity.masked_fill_(robots[:, None, None], 0.0)
+        self.joints.torque.masked_fill_(robots[:, None], 0.0)
 
 
 def mirror_joints(body: Legged) -> dict[str, str]:

@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
-from pronk.jump.train.compiled import RecordedStep, compiled, compiled_step
+from pronk.jump.train.compiled import RecordedFunction, compiled, compiled_step
 from pronk.jump.train.rl.networks import JUMP_WEIGHT, EstimatorActor, JumpCritic, average
 
 TARGET_GROUP = "estimator_target"
@@ -86,11 +86,11 @@ class EstimatorPPO(PPO):
     learning_rate: float
     estimator_cfg: EstimatorTrainingCfg
     estimator_optimizer: torch.optim.Optimizer
-    _compiled_policy: Callable[..., tuple[Tensor, ...]] | None = None
     _compiled_losses: Callable[..., tuple[Tensor, ...]] | None = None
     _compiled_estimator_losses: Callable[..., tuple[Tensor, Tensor]] | None = None
-    _recorded_step: RecordedStep | None = None
-    _recorded_estimator_step: RecordedStep | None = None
+    _recorded_policy: RecordedFunction | None = None
+    _recorded_step: RecordedFunction | None = None
+    _recorded_estimator_step: RecordedFunction | None = None
 
     @staticmethod
     def construct_algorithm(
@@ -171,18 +171,19 @@ class EstimatorPPO(PPO):
         )
         if mode is None or not is_known:
             return
-        self._compiled_policy = compiled_step(self._policy_step)
+        policy_step = compiled_step(self._policy_step)
+        self._recorded_policy = RecordedFunction(policy_step, self.device)
         self._compiled_losses = compiled(self._losses)
         self._compiled_estimator_losses = compiled(self._raw_actor.estimator.losses)
         if self.gpu_world_size == 1:
             # Processes exchange gradients in a step, which is not recorded.
-            self._recorded_step = RecordedStep(self._step, self.device)
-            self._recorded_estimator_step = RecordedStep(self._estimator_step, self.device)
+            self._recorded_step = RecordedFunction(self._step, self.device)
+            self._recorded_estimator_step = RecordedFunction(self._estimator_step, self.device)
 
     @property
     def is_compiled(self) -> bool:
         """Whether `compile` has compiled the policy's step and the losses."""
-        return self._compiled_policy is not None
+        return self._recorded_policy is not None
 
     def act(self, obs: TensorDict) -> Tensor:
         """Draw actions, (N, 12), and remember what PPO needs of the step.
@@ -190,12 +191,15 @@ class EstimatorPPO(PPO):
         Args:
             obs: Observations by group.
         """
-        if self._compiled_policy is None:
+        if self._recorded_policy is None:
             actions: Tensor = super().act(obs)
             return actions
+        if self.storage.step == 0:
+            self._recorded_policy.begin()
         groups = _tensors(obs)
-        noise = torch.randn(len(obs), self.storage.actions.shape[-1], device=self.device)
-        actions, values, log_prob, mean, std = self._compiled_policy(groups, noise)
+        size = self.storage.actions.shape[-1]
+        groups["noise"] = torch.randn(len(obs), size, device=self.device)
+        actions, values, log_prob, mean, std = self._recorded_policy(groups)
         transition = self.transition
         transition.actions = actions
         transition.values = values
@@ -206,19 +210,19 @@ class EstimatorPPO(PPO):
         self._raw_actor.distribution.update(mean)
         return actions
 
-    def _policy_step(self, obs: Mapping[str, Tensor], noise: Tensor) -> tuple[Tensor, ...]:
+    def _policy_step(self, obs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Compute a step of actor and critic.
 
         Args:
-            obs: Observations by group, (N, size) each.
-            noise: Numbers drawn from the normal distribution, (N, 12).
+            obs: Observations by group, (N, size) each, and `noise`, numbers drawn from the normal
+                distribution, (N, 12).
 
         Returns:
             Actions (N, 12), values (N, 1), log-probabilities of the actions (N,), mean and standard
             deviation of the distribution (N, 12).
         """
         mean, std = self._action_distribution(obs)
-        actions = mean + std * noise
+        actions = mean + std * obs["noise"]
         return actions, self._raw_critic(obs), _log_prob(actions, mean, std), mean, std
 
     def _action_distribution(self, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -254,14 +258,14 @@ class EstimatorPPO(PPO):
         )
         return surrogate, value, entropy, divergence.mean()
 
-    def _step(self, batch: Mapping[str, Tensor]) -> Tensor:
+    def _step(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Take PPO's step for a mini-batch; the learning rate is a tensor, which follows.
 
         Args:
             batch: As `_losses` has it.
 
         Returns:
-            Value loss, surrogate loss and entropy [nat]. (3,)
+            Value loss, surrogate loss and entropy [nat].
         """
         assert self._compiled_losses is not None
         assert self.desired_kl is not None
@@ -279,7 +283,7 @@ class EstimatorPPO(PPO):
         for model in (self._raw_actor, self._raw_critic):
             nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        return torch.stack((value, surrogate, entropy)).detach()
+        return value.detach(), surrogate.detach(), entropy.detach()
 
     def _update_networks(self) -> dict[str, float]:
         """Take PPO's steps as rsl_rl does, without waiting for the device.
@@ -305,7 +309,7 @@ class EstimatorPPO(PPO):
                 batch["returns"] = samples.returns
                 batch["mean"] = old_mean
                 batch["std"] = old_std
-                history.append(step(batch))
+                history.append(torch.stack(step(batch)))
         means = torch.stack(history).mean(dim=0).tolist()
         self.learning_rate = float(group["lr"])
         group["lr"] = self.learning_rate
@@ -352,7 +356,7 @@ class EstimatorPPO(PPO):
                         "target": targets[rows],
                         "coefficients": coefficients,
                     }
-                    history.append(step(batch))
+                    history.append(torch.stack(step(batch)))
         # PPO clips and reduces the gradients that it finds in the actor: leave none.
         self.estimator_optimizer.zero_grad()
         mean_contact_loss, mean_velocity_loss = torch.stack(history).mean(dim=0).tolist()
@@ -361,14 +365,14 @@ class EstimatorPPO(PPO):
             "estimator_velocity": mean_velocity_loss,
         }
 
-    def _estimator_step(self, batch: Mapping[str, Tensor]) -> Tensor:
+    def _estimator_step(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Take a supervised step of the estimator.
 
         Args:
             batch: `input`, (M, size), `target`, (M, 7), and `coefficients` of both losses, (2,).
 
         Returns:
-            Contact loss [nat] and velocity loss [m^2/s^2]. (2,)
+            Contact loss [nat] and velocity loss [m^2/s^2].
         """
         estimator = self._raw_actor.estimator
         parameters = list(estimator.parameters())
@@ -383,7 +387,7 @@ class EstimatorPPO(PPO):
             nn.utils.vector_to_parameters(gradient_vector, gradients)
         nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         self.estimator_optimizer.step()
-        return torch.stack((contact_loss, velocity_loss)).detach()
+        return contact_loss.detach(), velocity_loss.detach()
 
     def set_estimator_rate(self, rate: float) -> None:
         """Set the learning rate of the estimator."""
@@ -469,10 +473,10 @@ class EstimatorPPO(PPO):
 
 @contextmanager
 def recorded(
-    recorded_step: RecordedStep | None,
-    step: Callable[[Mapping[str, Tensor]], Tensor],
+    recorded_step: RecordedFunction | None,
+    step: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
     optimizer: torch.optim.Optimizer,
-) -> Iterator[Callable[[Mapping[str, Tensor]], Tensor]]:
+) -> Iterator[Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]]]:
     """Give the step of an update: as it is recorded, or as it is where nothing is recorded.
 
     Args:

@@ -13,7 +13,7 @@ import statistics
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -27,6 +27,8 @@ from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train import compiled
 from pronk.jump.train.devices import check_cuda_graphs
+from pronk.jump.train.mdp.actions import joint_position_action
+from pronk.jump.train.mdp.actuators import RecordedDrives
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
@@ -92,12 +94,14 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
         compiles = train_cfg.get("torch_compile_mode") is not None
+        self._recorded_drives: RecordedDrives | None = None
         if compiles:
             compiled.prepare(device)
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
             motion_command(env.unwrapped).compile()
             env.unwrapped.reward_manager.compile()
+            self._recorded_drives = joint_position_action(env.unwrapped).record_drives()
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
@@ -186,8 +190,11 @@ class PronkRunner(MjlabOnPolicyRunner):
                             steps.append((rewards, dones, dict(extras)))
                         # The logger waits for the device three times a step, and keeps it from
                         # being given the next step meanwhile; after the rollout it waits once.
+                        logs = []
                         for rewards, dones, extras in steps:
+                            logs.append(extras.pop("log"))
                             self.logger.process_env_step(rewards, dones, extras)
+                        self.logger.ep_extras.append(mean_log(logs))
                         collect_time = time.time() - start
                         self.alg.compute_returns(obs)
                     losses = self.alg.update()
@@ -220,6 +227,8 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _begin_iteration(self) -> None:
         """Set the phase of the iteration that begins."""
+        if self._recorded_drives is not None:
+            self._recorded_drives.begin()
         self.env.unwrapped.curriculum_manager.compute()
         name, done = phase_at(self.curriculum.iterations, self.iteration)
         phase = PHASES[name]
@@ -480,6 +489,28 @@ class PronkRunner(MjlabOnPolicyRunner):
         if good_checkpoint is not None:
             text += f"; {good_checkpoint} is the last good checkpoint"
         return PronkError(f"{text}.")
+
+
+def mean_log(logs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Average what the steps of a rollout log, which the logger does with a copy for each step.
+
+    Args:
+        logs: Numbers or tensors, (), by name, of each step; a name may be missing in some.
+
+    Returns:
+        Mean over the steps that have it, by name.
+    """
+    values_of: dict[str, list[Any]] = {}
+    for log in logs:
+        for name, value in log.items():
+            values_of.setdefault(name, []).append(value)
+    means: dict[str, Any] = {}
+    for name, values in values_of.items():
+        if isinstance(values[0], torch.Tensor):
+            means[name] = torch.stack(values).float().mean()
+        else:
+            means[name] = statistics.fmean(values)
+    return means
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from pronk.jump.train.compiled import RecordedStep
+from pronk.jump.train.compiled import RecordedFunction
 
 pytestmark = pytest.mark.train
 
@@ -35,13 +35,13 @@ class Learner:
         for group in self.optimizer.param_groups:
             group["capturable"] = device != "cpu"
 
-    def step(self, batch: Mapping[str, Any]) -> Any:
+    def step(self, batch: Mapping[str, Any]) -> tuple[Any, ...]:
         loss = self.weight * (self.network(batch["x"]) - batch["y"]).square().mean()
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
-        return loss.detach()
+        return (loss.detach(),)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -49,7 +49,7 @@ def test_recorded_steps_are_those_without_a_recording(device: str) -> None:
     """In several updates, with what changes between them and a mini-batch that is shorter."""
     plain = Learner(device)
     fast = Learner(device)
-    recorded = RecordedStep(fast.step, device)
+    recorded = RecordedFunction(fast.step, device)
     assert recorded.records == (device != "cpu")
     generator = torch.Generator().manual_seed(1)
     for update, (weight, rate) in enumerate([(1.0, 1e-2), (3.0, 1e-3), (0.5, 3e-2)]):
@@ -62,8 +62,8 @@ def test_recorded_steps_are_those_without_a_recording(device: str) -> None:
                 "x": torch.randn(rows, 6, generator=generator).to(device),
                 "y": torch.randn(rows, 2, generator=generator).to(device),
             }
-            expected = plain.step(batch)
-            loss = recorded(batch)
+            (expected,) = plain.step(batch)
+            (loss,) = recorded(batch)
             torch.testing.assert_close(loss, expected, rtol=1e-5, atol=1e-6)
         if update == 1:
             # A phase may reset the optimizer's moments.
