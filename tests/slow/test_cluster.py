@@ -40,7 +40,7 @@ SETTINGS = TrainSettings(
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Two nodes of one core each, the first of them the head; the last test kills the other one."""
+    """A head without cores, and two nodes of one core each; the last test kills one of them."""
     source = str(Path(pronk.__file__).resolve().parents[1])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
@@ -48,10 +48,11 @@ def cluster() -> Iterator[Any]:
         patch.setenv("RAY_DISABLE_IMPORT_WARNING", "1")
         nodes = Cluster(
             initialize_head=True,
-            head_node_args={"num_cpus": 1, "include_dashboard": False},
+            head_node_args={"num_cpus": 0, "include_dashboard": False},
         )
-        nodes.second = nodes.add_node(num_cpus=1)
         try:
+            for _ in range(2):
+                nodes.add_node(num_cpus=1)
             yield nodes
         finally:
             ray.shutdown()
@@ -59,7 +60,7 @@ def cluster() -> Iterator[Any]:
 
 
 class NodeKiller:
-    """Kills the second node while it trains and a checkpoint of that training is at home."""
+    """Kills a node that trains as soon as a checkpoint of that training is at home."""
 
     def __init__(self, root: Path, cluster: Any) -> None:
         self.root = root
@@ -67,19 +68,24 @@ class NodeKiller:
         self.lost = ""
         """Folder of the training that ran on the node; empty until it is killed."""
         self.attempts = 0
+        self.seen: set[str] = set()
+        """Commands of all processes that ran below the nodes, for the message of a failure."""
 
     def __call__(self, progress: StudyProgress) -> None:
         for status in progress.tasks:
             self.attempts = max(self.attempts, status.attempts)
         if self.lost:
             return
-        raylet = self.cluster.second.all_processes["raylet"][0].process.pid
-        commands = [f"{command} " for command in descendants_of(raylet).values()]
-        for folder in {path.parent.name for path in self.root.rglob("model_*.pt")}:
-            if any(f"/{folder} " in command for command in commands):
-                self.lost = folder
-                self.cluster.remove_node(self.cluster.second, allow_graceful=False)
-                return
+        saved = {path.parent.name for path in self.root.rglob("model_*.pt")}
+        for node in self.cluster.worker_nodes:
+            raylet = node.all_processes["raylet"][0].process.pid
+            commands = descendants_of(raylet).values()
+            self.seen.update(commands)
+            for folder in saved:
+                if any(f"/{folder} " in f"{command} " for command in commands):
+                    self.lost = folder
+                    self.cluster.remove_node(node, allow_graceful=False)
+                    return
 
 
 def test_failures_on_nodes_are_named_with_their_log(cluster: Any, tmp_path: Path) -> None:
@@ -105,7 +111,7 @@ def test_a_study_survives_the_loss_of_a_node(cluster: Any, tmp_path: Path) -> No
     killer = NodeKiller(root, cluster)
     with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
         statuses = run_tasks(tasks, executor, root, report=killer)
-    assert killer.lost, "the node was not killed in flight"
+    assert killer.lost, f"no node was killed in flight; processes: {sorted(killer.seen)}"
     assert killer.attempts == 2
     assert {status.state for status in statuses.values()} == {"done"}
     sessions = {}

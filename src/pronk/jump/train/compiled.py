@@ -5,7 +5,7 @@ kernels. Results differ by rounding alone. What changes in training must be a te
 compiled again for every other value of a number that it reads.
 
 What is computed alike many times in an iteration is recorded as a CUDA graph, whose kernels are
-launched together (`RecordedFunction`): the steps of learning, of the policy, and of the drives.
+launched together (`RecordedFunction`): the steps of learning and of the policy.
 """
 
 from __future__ import annotations
@@ -67,7 +67,6 @@ class RecordedFunction:
         self,
         function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
         device: str,
-        stream: torch.cuda.Stream | None = None,
     ) -> None:
         """Prepare to record a function.
 
@@ -76,7 +75,6 @@ class RecordedFunction:
                 draw random numbers, and must keep on the device, in the same memory, what one call
                 leaves to the next.
             device: Device of the tensors. On a CPU the function is called as it is.
-            stream: The stream to record on, if the function names one; None for a new one.
         """
         self.records = device != "cpu"
         """Whether anything is recorded; on a CPU it is not."""
@@ -86,7 +84,7 @@ class RecordedFunction:
         self._inputs: dict[str, Tensor] = {}
         self._outputs: tuple[Tensor, ...] = ()
         if self.records:
-            self._stream = stream or torch.cuda.Stream(device)
+            self._stream = torch.cuda.Stream(device)
             self._pool = torch.cuda.graph_pool_handle()
 
     def begin(self) -> None:

@@ -19,7 +19,7 @@ from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 from torch import Tensor
 
 from pronk.errors import PronkError
-from pronk.jump.train.mdp.actuators import Battery, RecordedDrives
+from pronk.jump.train.mdp.actuators import Battery
 from pronk.jump.train.mdp.rotors import Rotors
 
 if TYPE_CHECKING:
@@ -74,7 +74,6 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery = Battery(self._entity)
         self.rotors = Rotors(self._armatures(), env.physics_dt)
         """Rotors of the joints, as of the last `finish_step`."""
-        self._recorded_drives: RecordedDrives | None = None
         self._is_step_open = False
         self.guidance: Tensor | None = None
         """Added to the coming targets, if not None [rad]. (N, joints)"""
@@ -91,11 +90,6 @@ class DelayedJointPositionAction(JointPositionAction):
         self._newest = 0
         self._ages = [high] * count
         """Physics steps since each target was issued, newest first."""
-
-    def record_drives(self) -> RecordedDrives:
-        """Record batteries and drives from now on; returns what each iteration has to begin."""
-        self._recorded_drives = RecordedDrives(self._env, self.battery)
-        return self._recorded_drives
 
     def process_actions(self, actions: Tensor) -> None:
         """Issue the targets of a policy step, of the network's actions (N, joints)."""
@@ -119,10 +113,7 @@ class DelayedJointPositionAction(JointPositionAction):
         if changes:
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
-        if self._recorded_drives is None:
-            self.battery.advance()
-        else:
-            self._recorded_drives.advance_battery()
+        self.battery.advance()
         self._is_step_open = True
 
     def finish_step(self) -> Rotors:
@@ -161,8 +152,8 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery.reset(robots)
         self.finish_step()
         self.rotors.reset(robots)
-        if self.guidance is not None and isinstance(robots, Tensor):
-            self.guidance.index_fill_(0, robots, 0.0)
+        if self.guidance is not None:
+            self.guidance[robots] = 0.0
         low, high = self.cfg.delay_steps
         if high == 0:
             return

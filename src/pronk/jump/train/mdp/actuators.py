@@ -23,22 +23,18 @@ change in proportion to V. V follows over a few steps, since power and voltage d
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
-import warp
 from mjlab.actuator import DcMotorActuator, DcMotorActuatorCfg
 from torch import Tensor
 
 from pronk.errors import PronkError, RobotError
-from pronk.jump.train.compiled import RecordedFunction
 from pronk.jump.train.gains import TrainingGains
 from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
-    from mjlab.envs import ManagerBasedRlEnv
 
 _VOLTAGE_STEP = 0.3
 """Fraction of the way to its new value that the voltage covers in a physics step."""
@@ -84,53 +80,6 @@ def drive_cfgs(robot: RobotSpec, gains: TrainingGains) -> tuple[DcMotorActuatorC
             )
         )
     return tuple(cfgs)
-
-
-class RecordedDrives:
-    """Batteries and drives of an environment, each recorded as a CUDA graph once an iteration.
-
-    They are computed in every physics step, with fifty kernels that take less time to compute than
-    to launch. On a CPU they are computed as they are.
-    """
-
-    def __init__(self, env: ManagerBasedRlEnv, battery: Battery) -> None:
-        """Put a recording in the place of mjlab's step of the drives.
-
-        Args:
-            env: The environment.
-            battery: Its batteries.
-        """
-        self._write_torques = env.scene.write_data_to_sim
-        self._battery = battery
-        stream = None
-        if env.device != "cpu":
-            # mjlab writes to the simulator on the simulator's stream.
-            physics_stream = warp.get_stream(env.sim.wp_device)
-            stream = torch.cuda.ExternalStream(physics_stream.cuda_stream)
-        self._recorded_battery = RecordedFunction(self._step_battery, env.device, stream)
-        self._recorded_torques = RecordedFunction(self._step_torques, env.device, stream)
-        env.scene.write_data_to_sim = self.write_torques
-
-    def begin(self) -> None:
-        """Begin an iteration: what was recorded is not replayed any more."""
-        self._recorded_battery.begin()
-        self._recorded_torques.begin()
-
-    def advance_battery(self) -> None:
-        """Do what `Battery.advance` does."""
-        self._recorded_battery({})
-
-    def write_torques(self) -> None:
-        """Compute the torques of the drives and give them to the simulator."""
-        self._recorded_torques({})
-
-    def _step_battery(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-        self._battery.advance()
-        return ()
-
-    def _step_torques(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-        self._write_torques()
-        return ()
 
 
 class Battery:

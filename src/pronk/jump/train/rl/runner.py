@@ -27,8 +27,6 @@ from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train import compiled
 from pronk.jump.train.devices import check_cuda_graphs
-from pronk.jump.train.mdp.actions import joint_position_action
-from pronk.jump.train.mdp.actuators import RecordedDrives
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
@@ -94,14 +92,12 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
         compiles = train_cfg.get("torch_compile_mode") is not None
-        self._recorded_drives: RecordedDrives | None = None
         if compiles:
             compiled.prepare(device)
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
             motion_command(env.unwrapped).compile()
             env.unwrapped.reward_manager.compile()
-            self._recorded_drives = joint_position_action(env.unwrapped).record_drives()
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
@@ -227,8 +223,6 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _begin_iteration(self) -> None:
         """Set the phase of the iteration that begins."""
-        if self._recorded_drives is not None:
-            self._recorded_drives.begin()
         self.env.unwrapped.curriculum_manager.compute()
         name, done = phase_at(self.curriculum.iterations, self.iteration)
         phase = PHASES[name]
