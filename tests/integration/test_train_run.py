@@ -26,7 +26,7 @@ from pronk.files import sha256
 from pronk.jump.train.phases import PHASES, TASKS
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.rl import checkpoint
-from pronk.jump.train.rl.runner import PronkRunner
+from pronk.jump.train.rl.runner import PronkRunner, mean_log
 from pronk.policy.runtime import load_policy
 from termination import terminated
 
@@ -263,9 +263,9 @@ def env_settings(folder: Path) -> Any:
 
 
 def test_the_reward_rises(tmp_path: Path) -> None:
-    """8 robots, a small network, phase walk, 20 iterations: +0.47, 0.48, 0.43 with seeds 1 to 3."""
+    """16 robots, a small network, phase walk, 30 iterations: +0.93 to 1.32 with four seeds."""
     cfg = load_env_cfg("Pronk-Walk-MiniCheetah")
-    cfg.scene.num_envs = 8
+    cfg.scene.num_envs = 16
     cfg.seed = 1
     learning = load_rl_cfg("Pronk-Walk-MiniCheetah")
     learning.seed = 1
@@ -273,11 +273,22 @@ def test_the_reward_rises(tmp_path: Path) -> None:
     learning.critic.hidden_dims = (64, 64)
     env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
     runner = PronkRunner(env, asdict(learning), str(tmp_path), "cpu")
-    runner.learn(5, init_at_random_ep_len=True)
+    runner.learn(4, init_at_random_ep_len=True)
     first_reward = statistics.mean(runner.logger.rewbuffer)
-    runner.learn(15)
-    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.25
+    runner.learn(26)
+    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.5
     env.close()
+
+
+def test_the_log_of_a_rollout_is_the_mean_over_the_steps_that_have_it() -> None:
+    logs = [
+        {"reward": torch.tensor(1.0), "falls": 3},
+        {},
+        {"reward": torch.tensor(4.0), "falls": 0, "time_outs": torch.tensor(2)},
+    ]
+    means = {name: float(mean) for name, mean in mean_log(logs).items()}
+    assert means == {"reward": 2.5, "falls": 1.5, "time_outs": 2.0}
+    assert mean_log([{}, {}]) == {}
 
 
 def test_the_first_iteration_has_the_weights_of_its_phase(tmp_path: Path) -> None:
