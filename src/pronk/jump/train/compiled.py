@@ -64,9 +64,7 @@ class RecordedFunction:
     """
 
     def __init__(
-        self,
-        function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
-        device: str,
+        self, function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]], device: str
     ) -> None:
         """Prepare to record a function.
 

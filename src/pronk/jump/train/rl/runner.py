@@ -190,7 +190,8 @@ class PronkRunner(MjlabOnPolicyRunner):
                         for rewards, dones, extras in steps:
                             logs.append(extras.pop("log"))
                             self.logger.process_env_step(rewards, dones, extras)
-                        self.logger.ep_extras.append(mean_log(logs))
+                        if self.logger.writer is not None:
+                            self.logger.ep_extras.append(mean_log(logs))
                         collect_time = time.time() - start
                         self.alg.compute_returns(obs)
                     losses = self.alg.update()
