@@ -263,7 +263,7 @@ def env_settings(folder: Path) -> Any:
 
 
 def test_the_reward_rises(tmp_path: Path) -> None:
-    """16 robots, a small network, phase walk, 30 iterations: +0.93 to 1.32 with four seeds."""
+    """16 robots, a small network, phase walk, 20 iterations: +0.39 to 0.68 with four seeds."""
     cfg = load_env_cfg("Pronk-Walk-MiniCheetah")
     cfg.scene.num_envs = 16
     cfg.seed = 1
@@ -275,8 +275,8 @@ def test_the_reward_rises(tmp_path: Path) -> None:
     runner = PronkRunner(env, asdict(learning), str(tmp_path), "cpu")
     runner.learn(4, init_at_random_ep_len=True)
     first_reward = statistics.mean(runner.logger.rewbuffer)
-    runner.learn(26)
-    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.5
+    runner.learn(16)
+    assert statistics.mean(runner.logger.rewbuffer) > first_reward + 0.3
     env.close()
 
 
