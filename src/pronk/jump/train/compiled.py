@@ -59,8 +59,8 @@ class RecordedFunction:
     """A function of tensors that is recorded as a CUDA graph once an iteration, and replayed.
 
     Calls in an iteration differ in their tensors alone. Between iterations everything may change:
-    weights of losses, learning rates, the state of an optimizer. So each iteration records the
-    function anew. Its memory is used again by the next recording.
+    weights of losses, learning rates, the state of an optimizer. So the function is recorded in
+    each iteration. A recording uses the memory of the one before.
     """
 
     def __init__(

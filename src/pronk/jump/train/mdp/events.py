@@ -315,8 +315,9 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
 class Pushes:
     """Sudden changes of the velocity of each robot's trunk, at intervals.
 
-    mjlab's event for this asks the device in every step which robots it is due for. Here all robots
-    are computed, and the others are left as they are.
+    mjlab's event waits for the device in every step, to learn which robots are due. Here a push is
+    computed for all robots and is zero for those that are not due. Intervals run on when episodes
+    end.
     """
 
     def __init__(self, cfg: EventTermCfg, env: Any) -> None:
@@ -345,9 +346,6 @@ class Pushes:
         # The angular velocity of a free joint is in the trunk's frame. Its attitude is that of the
         # last physics step.
         velocity[:, 3:6] -= gravity_direction(env) * (yaw_rate * uniform[:, 2:])
-
-    def reset(self, env_ids: Tensor) -> None:
-        """Let the intervals run on when episodes end."""
 
 
 def reset_state(

@@ -210,12 +210,12 @@ class JumpState:
             self.overspeed_distance,
             self.best_flight,
             self.flight_gain,
-            self.stance,
             self.best_gap,
             self.gap_gain,
             self.similarity,
         ):
-            value.masked_fill_(robots.view(-1, *[1] * (value.ndim - 1)), 0)
+            value.masked_fill_(robots, 0)
+        self.stance.masked_fill_(robots[:, None, None], 0.0)
 
     def advance(self, inputs: JumpInputs, dt: float | Tensor) -> None:
         """Advance by one policy step.

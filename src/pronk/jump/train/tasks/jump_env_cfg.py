@@ -287,8 +287,8 @@ def _simulation(robot: RobotSpec) -> SimulationCfg:
             # with the 3.0 of D2 a standing robot sinks 2 cm into the floor.
             cone="elliptic",
             impratio=10.0,
-            # All robots wait for the one that needs the most. With eight in place of the ten of
-            # mjlab's quadrupeds joint speeds differ by 0.002 rad/s (RMS); evidence/training.md.
+            # All robots wait for the one that needs the most. mjlab's quadrupeds have ten; how far
+            # eight are from the solution is in docs/evidence/training.md.
             iterations=8,
             ls_iterations=20,
         ),
