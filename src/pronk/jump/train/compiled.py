@@ -5,17 +5,22 @@ kernels. Results differ by rounding alone. What changes in training must be a te
 compiled again for every other value of a number that it reads.
 
 What is computed alike many times in an iteration is recorded as a CUDA graph, whose kernels are
-launched together (`RecordedFunction`): the steps of learning and of the policy.
+launched together (`RecordedFunction`): the steps of learning and of the policy, and what
+`pronk.jump.train.mdp.recordings` lists of the robots' step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+
+NO_TENSORS: Mapping[str, Tensor] = MappingProxyType({})
+"""For functions without inputs."""
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,6 +60,53 @@ def prepare(device: str) -> None:
         torch.set_float32_matmul_precision("high")
 
 
+class DeviceGraph:
+    """A CUDA graph: kernels on given memory, which are launched together."""
+
+    @staticmethod
+    def records(device: str) -> bool:
+        """Return whether there are graphs on a device."""
+        return device != "cpu"
+
+    def __init__(self, device: str, stream: torch.cuda.Stream | None = None) -> None:
+        """Prepare to record.
+
+        Args:
+            device: Device of the tensors.
+            stream: Stream to record on, if the function names one; None for a new one.
+        """
+        self._stream = stream or torch.cuda.Stream(device)
+        self._pool = torch.cuda.graph_pool_handle()
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def record(self, function: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """Record a function; nothing is computed.
+
+        Args:
+            function: Launches kernels alone.
+
+        Returns:
+            What the function returns: tensors that `replay` fills.
+        """
+        graph = torch.cuda.CUDAGraph()
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            # `torch.cuda.graph` would also empty PyTorch's cache of memory, in every iteration.
+            graph.capture_begin(pool=self._pool)
+            try:
+                outputs = function()
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream().wait_stream(self._stream)
+        self._graph = graph
+        return outputs
+
+    def replay(self) -> None:
+        """Compute what was recorded, on the memory of then."""
+        assert self._graph is not None
+        self._graph.replay()
+
+
 class RecordedFunction:
     """A function of tensors that is recorded as a CUDA graph once an iteration, and replayed.
 
@@ -63,34 +115,39 @@ class RecordedFunction:
     each iteration. A recording uses the memory of the one before.
     """
 
+    graph_type: ClassVar[type[DeviceGraph]] = DeviceGraph
+    """What records and replays."""
+
     def __init__(
-        self, function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]], device: str
+        self,
+        function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
+        device: str,
+        stream: torch.cuda.Stream | None = None,
     ) -> None:
         """Prepare to record a function.
 
         Args:
-            function: Computes tensors from tensors by name. It must not wait for the device nor
-                draw random numbers, and must keep on the device, in the same memory, what one call
-                leaves to the next.
+            function: Computes tensors from tensors by name. It must not wait for the device, and
+                must keep on the device, in the same memory, what one call leaves to the next.
+                Numbers may be drawn from PyTorch's generator of the device.
             device: Device of the tensors. On a CPU the function is called as it is.
+            stream: Stream to record on, if the function names one; None for a new one.
         """
-        self.records = device != "cpu"
+        self.records = self.graph_type.records(device)
         """Whether anything is recorded; on a CPU it is not."""
         self._function = function
         self._calls = 0
-        self._graph: torch.cuda.CUDAGraph | None = None
         self._inputs: dict[str, Tensor] = {}
         self._outputs: tuple[Tensor, ...] = ()
         if self.records:
-            self._stream = torch.cuda.Stream(device)
-            self._pool = torch.cuda.graph_pool_handle()
+            self._graph = self.graph_type(device, stream)
 
     def begin(self) -> None:
         """Begin an iteration: what was recorded is not replayed any more."""
         self._calls = 0
         self._inputs = {}
 
-    def __call__(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+    def __call__(self, inputs: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
         """Compute the function.
 
         The first call of an iteration is computed as it is, since optimizers make their state in
@@ -108,25 +165,28 @@ class RecordedFunction:
             return self._function(inputs)
         if self._calls == 2:
             self._inputs = {name: tensor.clone() for name, tensor in inputs.items()}
-            self._record()
+            self._outputs = self._graph.record(lambda: self._function(self._inputs))
         for name, stored in self._inputs.items():
             if stored.shape != inputs[name].shape:
                 return self._function(inputs)
             stored.copy_(inputs[name])
-        assert self._graph is not None
         self._graph.replay()
         return tuple(output.clone() for output in self._outputs)
 
-    def _record(self) -> None:
-        """Record the function for the stored tensors; nothing is computed."""
-        graph = torch.cuda.CUDAGraph()
-        self._stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._stream):
-            # `torch.cuda.graph` would also empty PyTorch's cache of memory, in every iteration.
-            graph.capture_begin(pool=self._pool)
-            try:
-                self._outputs = self._function(self._inputs)
-            finally:
-                graph.capture_end()
-        torch.cuda.current_stream().wait_stream(self._stream)
-        self._graph = graph
+
+Recorder = Callable[[Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]]], RecordedFunction]
+"""What prepares a function to be recorded."""
+
+
+def keep_in_place(owner: object, before: Mapping[str, Any]) -> None:
+    """Put tensors that were replaced back into their memory, with the new numbers.
+
+    Args:
+        owner: The object that has the tensors.
+        before: Its attributes as they were before.
+    """
+    for name, kept in before.items():
+        new = getattr(owner, name)
+        if isinstance(kept, Tensor) and new is not kept:
+            kept.copy_(new)
+            setattr(owner, name, kept)

@@ -74,6 +74,8 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery = Battery(self._entity)
         self.rotors = Rotors(self._armatures(), env.physics_dt)
         """Rotors of the joints, as of the last `finish_step`."""
+        self.position_target = torch.zeros_like(self._processed_actions)
+        """Joint position targets of the policy step under way [rad]. (N, joints)"""
         self._is_step_open = False
         self.guidance: Tensor | None = None
         """Added to the coming targets, if not None [rad]. (N, joints)"""
@@ -96,6 +98,7 @@ class DelayedJointPositionAction(JointPositionAction):
         super().process_actions(actions)
         if self.guidance is not None:
             self._processed_actions += self.guidance
+        self.position_target.copy_(self._processed_actions)
         count = len(self._ages)
         self._newest = (self._newest + 1) % count
         self._ages = [0, *self._ages[:-1]]

@@ -6,7 +6,7 @@ last step, and the ranges of the velocities. Masks are used, so that no step wai
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,13 @@ import tyro
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.jump.train.compiled import compiled_step, ordinary_tensors
+from pronk.jump.train.compiled import (
+    NO_TENSORS,
+    Recorder,
+    compiled_step,
+    keep_in_place,
+    ordinary_tensors,
+)
 from pronk.jump.train.gains import TrainingGains
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import foot_sweep, guidance
@@ -177,6 +183,8 @@ class MotionCommand(CommandTerm):
         )
         """What is needed of the robot's model to measure motion."""
         self._step_s = torch.tensor(env.step_dt, device=device)
+        self._next_step_s = self._step_s.clone()
+        self._elapsed_s = torch.zeros(count, device=device)
         self._motion: StepMotion | None = None
         self._motion_step = -1
         self._jump_scales: dict[float, Tensor] = {}
@@ -231,7 +239,7 @@ class MotionCommand(CommandTerm):
     @property
     def position_target(self) -> Tensor:
         """Joint position targets of this step [rad]. (N, 12)."""
-        return joint_position_action(self._env)._processed_actions
+        return joint_position_action(self._env).position_target
 
     @property
     def step_s(self) -> float | Tensor:
@@ -249,24 +257,32 @@ class MotionCommand(CommandTerm):
         if self._motion is None or self._motion_step != step:
             self._motion_step = step
             self._jump_scales.clear()
-            state = simulator_state(self._env)
             if not self._is_compiled:
-                self._motion = self._measure(state, self._motion)
+                self._motion = self._measure(simulator_state(self._env), self._motion)
                 return self._motion
             self._step_s.fill_(self._env.step_dt)
             if self._motion is not None:
-                self._motion = self._compiled_measure(state, self._motion)
+                self._recorded_measure()
             else:
                 with ordinary_tensors():
-                    self._motion = self._measure(state, None)
+                    self._motion = self._measure(simulator_state(self._env), None)
         return self._motion
 
-    def compile(self) -> None:
-        """Compile what is computed in every step, with tensors for the numbers that change."""
+    def compile(self, record: Recorder) -> None:
+        """Compile and record what is computed in every step.
+
+        Numbers that change become tensors.
+
+        Args:
+            record: Prepares a function to be recorded.
+        """
         self._is_compiled = True
         self.state.liftoff_std = torch.tensor(self.state.liftoff_std, device=self.device)
         self._compiled_measure = compiled_step(self._measure)
         self._compiled_clear = compiled_step(self._clear)
+        self._recorded_measure = record(self._measure_in_place)
+        self._recorded_advance = record(self._advance_in_place)
+        self._recorded_reset = record(self._reset_in_place)
 
     def scaled_in_jump_mode(self, value: Tensor, scale: float | Tensor) -> Tensor:
         """Multiply a reward of each robot, (N,), by `scale`, (), where it is in jump mode."""
@@ -277,6 +293,16 @@ class MotionCommand(CommandTerm):
         if scale not in self._jump_scales:
             self._jump_scales[scale] = torch.where(self.state.mode, scale, 1.0)
         return value * self._jump_scales[scale]
+
+    def _measure_in_place(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+        """Measure the motion in a step, and keep it and the jumps in the memory that they have."""
+        assert self._motion is not None
+        jumps_before = dict(vars(self.state))
+        motion = self._compiled_measure(simulator_state(self._env), self._motion)
+        keep_in_place(self.state, jumps_before)
+        for kept, measured in zip(self._motion.tensors(), motion.tensors(), strict=True):
+            kept.copy_(measured)
+        return ()
 
     def _measure(self, state: SimulatorState, before: StepMotion | None) -> StepMotion:
         """Measure the motion in a step; advance the jumps and the ranges of the velocities."""
@@ -320,23 +346,34 @@ class MotionCommand(CommandTerm):
         robots = torch.zeros_like(self.jump).index_fill_(0, env_ids, True)
         if self._motion is None:
             self.state.reset(robots)
+            self._redraw(robots)
         elif self._is_compiled:
-            self._compiled_clear(robots, self._motion)
+            self._recorded_reset({"robots": robots})
         else:
             self._clear(robots, self._motion)
-        if self.scripted:
-            return {}
-        velocity, time, _, off = self._draw(len(env_ids))
-        self.velocity[env_ids] = velocity
-        self.time_left[env_ids] = time
-        self.jump.index_fill_(0, env_ids, False)
-        self._jump_left[env_ids] = off
+            self._redraw(robots)
         return {}
+
+    def _reset_in_place(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Do what `reset` does for `robots`, bool (N,)."""
+        self._compiled_clear(inputs["robots"], self._motion)
+        self._redraw(inputs["robots"])
+        return ()
 
     def _clear(self, robots: Tensor, motion: StepMotion) -> None:
         """Clear jumps and motion of the robots that start a new episode, bool (N,)."""
         self.state.reset(robots)
         motion.reset(robots)
+
+    def _redraw(self, robots: Tensor) -> None:
+        """Draw commands for some robots, bool (N,), with the jump input off."""
+        if self.scripted:
+            return
+        velocity, time, _, off = self._draw()
+        torch.where(robots[:, None], velocity, self.velocity, out=self.velocity)
+        torch.where(robots, time, self.time_left, out=self.time_left)
+        torch.where(robots, off, self._jump_left, out=self._jump_left)
+        self.jump &= ~robots
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
         """Advance the time by `dt`; draw anew where an interval is over."""
@@ -345,25 +382,39 @@ class MotionCommand(CommandTerm):
         self._env.scene["feet"].update(0.0)
         if env_ids is not None:
             return
-        with ordinary_tensors() if self._is_compiled else nullcontext():
+        if not self._is_compiled:
             self._advance_commands(dt)
+            return
+        self._next_step_s.fill_(self._env.step_dt)
+        if isinstance(dt, Tensor):
+            self._elapsed_s.copy_(dt)
+        else:
+            self._elapsed_s.fill_(dt)
+        with ordinary_tensors():
+            self._recorded_advance()
+
+    def _advance_in_place(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+        """Advance the commands by the time that is stored."""
+        self._advance_commands(self._elapsed_s)
+        return ()
 
     def _advance_commands(self, dt: float | Tensor) -> None:
         """Draw commands anew where an interval is over, and set the guidance."""
         if not self.scripted:
             self.time_left -= dt
             due = self.time_left <= 0.0
-            velocity, time, on, off = self._draw(self.num_envs)
-            self.velocity = torch.where(due[:, None], velocity, self.velocity)
-            self.time_left = torch.where(due, time, self.time_left)
+            velocity, time, on, off = self._draw()
+            # In place: what is recorded stays where it is.
+            torch.where(due[:, None], velocity, self.velocity, out=self.velocity)
+            torch.where(due, time, self.time_left, out=self.time_left)
             if self.cfg.jump_fraction <= 0.0:
                 self.jump.zero_()
             else:
                 self._jump_left -= dt
                 turn = (self._jump_left <= 0.0) & self.jumper
-                self.jump = self.jump ^ turn
+                self.jump ^= turn
                 change = torch.where(self.jump, on, off)
-                self._jump_left = torch.where(turn, change, self._jump_left)
+                torch.where(turn, change, self._jump_left, out=self._jump_left)
         self._set_guidance()
 
     def _set_guidance(self) -> None:
@@ -376,7 +427,8 @@ class MotionCommand(CommandTerm):
         last_step = len(self._guidance) - 1
         # The jump state learns of a new command at the end of the step that begins with it.
         begins = self.jump & ~state.commanded
-        steps = (state.since / self._env.step_dt).round().long().clamp_max(last_step)
+        step_s = self._next_step_s if self._is_compiled else self._env.step_dt
+        steps = (state.since / step_s).round().long().clamp_max(last_step)
         on_the_ground = state.mode & (state.liftoffs == 0.0)
         steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last_step))
         offsets = self._guidance[steps]
@@ -385,9 +437,9 @@ class MotionCommand(CommandTerm):
             offsets = offsets + speed * self._sweep[steps]
         action.guidance = self.guidance_scale * offsets
 
-    def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Draw velocities (count, 3), and times until the next, with jump and without it [s]."""
-        uniform = torch.rand(7, count, device=self.device)
+    def _draw(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Draw velocities (N, 3), and times until the next, with jump and without it [s]."""
+        uniform = torch.rand(7, self.num_envs, device=self.device)
         axes = self._axes[torch.bucketize(uniform[3], self._draw_ends)]
         widths = 2.0 * self.ranges.fraction * self._limits
         # The first factor decides how the product lies in memory.

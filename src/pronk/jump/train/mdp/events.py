@@ -12,7 +12,8 @@ draws are uniform, from PyTorch's generator of the device.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
+from pronk.jump.train.compiled import NO_TENSORS, Recorder
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.observations import gravity_direction
 
@@ -312,6 +314,18 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
     env.cfg.decimation = nominal + random.Random(env.common_step_counter).randint(*added)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PushSettings:
+    """Parameters of `Pushes`."""
+
+    interval_s: Range
+    """Shortest and longest time from one push to the next [s]."""
+    speed: float
+    """Half-width of what is added to the velocity along world x and y [m/s]."""
+    yaw_rate: float
+    """Half-width of what is added to the angular velocity about world z [rad/s]."""
+
+
 class Pushes:
     """Sudden changes of the velocity of each robot's trunk, at intervals.
 
@@ -322,7 +336,15 @@ class Pushes:
 
     def __init__(self, cfg: EventTermCfg, env: Any) -> None:
         """Draw the time of each robot's first push; mjlab gives configuration and environment."""
+        self._env = env
         self._time_left = _uniform(env, cfg.params["interval_s"], env.num_envs)
+        self._step_s = torch.zeros((), device=env.device)
+        self._push: Callable[[], tuple[Tensor, ...]] = self._push_robots
+        self._settings = PushSettings(**cfg.params)
+
+    def record(self, record: Recorder) -> None:
+        """Record what is computed in every step; `record` prepares a function for it."""
+        self._push = record(self._push_robots)
 
     def __call__(
         self, env: Any, env_ids: None, interval_s: Range, speed: float, yaw_rate: float
@@ -336,16 +358,25 @@ class Pushes:
             speed: Half-width of what is added to the velocity along world x and y [m/s].
             yaw_rate: Half-width of what is added to the angular velocity about world z [rad/s].
         """
-        self._time_left -= env.step_dt
+        self._settings = PushSettings(interval_s=interval_s, speed=speed, yaw_rate=yaw_rate)
+        self._step_s.fill_(env.step_dt)
+        self._push()
+
+    def _push_robots(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+        """Push the robots whose interval is over after the time that is stored."""
+        env = self._env
+        settings = self._settings
+        self._time_left -= self._step_s
         due = self._time_left <= 0.0
-        interval = _uniform(env, interval_s, env.num_envs)
-        self._time_left = torch.where(due, interval, self._time_left)
+        interval = _uniform(env, settings.interval_s, env.num_envs)
+        torch.where(due, interval, self._time_left, out=self._time_left)
         uniform = _uniform(env, (-1.0, 1.0), env.num_envs, 3) * due[:, None]
-        velocity = env.sim.data.qvel
-        velocity[:, :2] += speed * uniform[:, :2]
+        velocity = env.sim.data.qvel[:]
+        velocity[:, :2] += settings.speed * uniform[:, :2]
         # The angular velocity of a free joint is in the trunk's frame. Its attitude is that of the
         # last physics step.
-        velocity[:, 3:6] -= gravity_direction(env) * (yaw_rate * uniform[:, 2:])
+        velocity[:, 3:6] -= gravity_direction(env) * (settings.yaw_rate * uniform[:, 2:])
+        return ()
 
 
 def reset_state(

@@ -86,6 +86,13 @@ class StepMotion:
     non_foot_contacts: Tensor
     """Number of parts other than feet on the ground. (N,)"""
 
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors, always in the same order."""
+        tensors = [self.non_foot_contacts]
+        for part in (self.joints, self.trunk, self.legs):
+            tensors += vars(part).values()
+        return tensors
+
     def reset(self, robots: Tensor) -> None:
         """Leave robots that start a new episode, bool (N,), without a step before."""
         self.legs.foot_velocity.masked_fill_(robots[:, None, None], 0.0)

@@ -8,7 +8,7 @@ that pronk makes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,7 +16,7 @@ from mjlab.managers import RewardTermCfg
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
 
-from pronk.jump.train.compiled import compiled_step
+from pronk.jump.train.compiled import NO_TENSORS, RecordedFunction, Recorder, compiled_step
 from pronk.jump.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
@@ -43,17 +43,23 @@ class StackedRewardManager(RewardManager):
         """Sum of each term and robot in this episode. (terms, N)"""
         self._zero = torch.zeros(self.num_envs, device=self.device)
         self._weights: list[float] = []
+        self._weight_tensor = torch.zeros(len(self._term_names), 1, device=self.device)
         self._scales: list[float] = []
+        self._scale_tensor = torch.ones(len(self._term_names), device=self.device)
         self._calls: list[tuple[Callable[..., Tensor], dict[str, Any], bool]] = []
-        self._compiled_rates: Callable[..., Tensor] | None = None
+        self._recorded_step: RecordedFunction | None = None
 
-    def compile(self) -> None:
-        """Compile the terms together.
+    def compile(self, record: Recorder) -> None:
+        """Compile the terms together, and record them with their sums.
 
         Weights and factors in jump mode, which phases change, become tensors; all terms are
         computed, also those without a weight, so that no phase changes what is compiled.
+
+        Args:
+            record: Prepares a function to be recorded.
         """
         self._compiled_rates = compiled_step(self._rates)
+        self._recorded_step = record(self._step)
 
     def compute(self, dt: float) -> Tensor:
         """Compute the reward of a step.
@@ -67,24 +73,33 @@ class StackedRewardManager(RewardManager):
         weights = [term.weight for term in self._term_cfgs]
         if weights != self._weights:
             self._weights = weights
-            self._weight_tensor = torch.tensor(weights, device=self.device)[:, None]
-        values = []
-        if self._compiled_rates is None:
-            for term in self._term_cfgs:
-                value = term.func(self._env, **term.params) if term.weight else self._zero
-                values.append(value)
-            rates = _finite_rates(values, self._weight_tensor)
-        else:
+            self._weight_tensor.copy_(torch.tensor(weights)[:, None])
+        if self._recorded_step is not None:
             _ = motion_command(self._env).motion  # measured before, in a function of its own
-            rates = self._compiled_rates(self._weight_tensor, self._scale_tensor())
+            self._set_scale_tensor()
+            (self._reward_buf,) = self._recorded_step()
+            return self._reward_buf
+        values = []
+        for term in self._term_cfgs:
+            value = term.func(self._env, **term.params) if term.weight else self._zero
+            values.append(value)
+        rates = _finite_rates(values, self._weight_tensor)
         scale = dt if self._scale_by_dt else 1.0
         self._sums.add_(rates, alpha=scale)
         self._step_reward = rates.T
         self._reward_buf = rates.sum(dim=0) * scale
         return self._reward_buf
 
-    def _scale_tensor(self) -> Tensor:
-        """Return the terms' factors in jump mode, (terms,); 1 where a term has none."""
+    def _step(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+        """Compute the reward of each robot, (N,), by compiled terms, and add up the terms."""
+        rates = self._compiled_rates(self._weight_tensor, self._scale_tensor)
+        scale = motion_command(self._env).step_s if self._scale_by_dt else 1.0
+        self._sums.add_(rates * scale)
+        self._step_reward = rates.T
+        return (rates.sum(dim=0) * scale,)
+
+    def _set_scale_tensor(self) -> None:
+        """Set the terms' factors in jump mode, (terms,); 1 where a term has none."""
         scales = [term.params.get("jump_scale", 1.0) for term in self._term_cfgs]
         if scales != self._scales:
             self._scales = scales
@@ -92,8 +107,7 @@ class StackedRewardManager(RewardManager):
             for term in self._term_cfgs:
                 constants = {name: x for name, x in term.params.items() if name != "jump_scale"}
                 self._calls.append((term.func, constants, "jump_scale" in term.params))
-            self._stored_scales = torch.tensor(scales, device=self.device)
-        return self._stored_scales
+            self._scale_tensor.copy_(torch.tensor(scales))
 
     def _rates(self, weights: Tensor, scales: Tensor) -> Tensor:
         """Compute all terms, weighed, with factors in jump mode that are tensors. (terms, N)."""

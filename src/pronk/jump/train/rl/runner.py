@@ -28,6 +28,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train import compiled
 from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.recordings import StepRecordings
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
 from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY
@@ -92,12 +93,12 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
         compiles = train_cfg.get("torch_compile_mode") is not None
+        self._recordings: StepRecordings | None = None
         if compiles:
             compiled.prepare(device)
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
-            motion_command(env.unwrapped).compile()
-            env.unwrapped.reward_manager.compile()
+            self._recordings = StepRecordings(env.unwrapped)
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
@@ -224,6 +225,8 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _begin_iteration(self) -> None:
         """Set the phase of the iteration that begins."""
+        if self._recordings is not None:
+            self._recordings.begin()
         self.env.unwrapped.curriculum_manager.compute()
         name, done = phase_at(self.curriculum.iterations, self.iteration)
         phase = PHASES[name]

@@ -1,0 +1,105 @@
+"""What is recorded of a step gives the numbers that it gives without a recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+from mjlab.envs import ManagerBasedRlEnv
+
+import training_env
+from pronk.jump.train import compiled
+from pronk.jump.train.gains import training_gains
+from pronk.jump.train.mdp import commands, reward_manager
+from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.recordings import StepRecordings
+from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.phases import PHASES, curriculum
+from traced_graph import TracedGraph
+
+pytestmark = pytest.mark.train
+
+ROBOTS = 16
+STEPS = 12
+"""Policy steps in each phase; two iterations of recordings."""
+
+
+def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
+    """Step robots through all phases, with jumps, pushes, falls and empty batteries."""
+    gains = training_gains("naive", training_env.ROBOT)
+    cfg = training_env.config(ROBOTS, gains)
+    cfg.events["push"].params["interval_s"] = (0.05, 0.2)
+    cfg.commands["motion"].resampling_time_range = (0.1, 0.3)
+    cfg.commands["motion"].jump_off_s = (0.05, 0.2)
+    cfg.curriculum["phases"].params["steps_per_iteration"] = 10**9  # phases are set below
+    env = ManagerBasedRlEnv(cfg, device=device)
+    StackedRewardManager.install(env)
+    recordings = StepRecordings(env) if records else None
+    env.reset(seed=0)
+    generator = torch.Generator().manual_seed(1)
+    history = []
+    for phase in PHASES.values():
+        with torch.inference_mode():
+            for step in range(STEPS):
+                if step % (STEPS // 2) == 0:
+                    curriculum(env).apply(env, phase, step / STEPS)
+                    if recordings is not None:
+                        recordings.begin()
+                if step % 3 == 2:
+                    env.episode_length_buf[step : step + 4] = 10**6  # episodes end
+                    env.sim.data.qpos[2, 4] = 1.0  # this robot lies on its side
+                actions = torch.randn(ROBOTS, 12, generator=generator).to(device)
+                obs, reward, terminated, _, extras = env.step(0.3 * actions)
+                history.append(
+                    {
+                        **{name: group.clone() for name, group in obs.items()},
+                        "reward": reward.clone(),
+                        "terminated": terminated.clone(),
+                        "torque": env.sim.data.ctrl[:].clone(),
+                        "mode": motion_command(env).state.mode.clone(),
+                        "terms": env.reward_manager._step_reward.clone(),
+                        **{name: torch.as_tensor(x) for name, x in extras["log"].items()},
+                    }
+                )
+    env.close()
+    return history
+
+
+def test_a_recorded_step_is_the_step_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With graphs that are traced on the CPU, where what is drawn is the same in any order."""
+    expected = rollout(device="cpu", records=False)
+    monkeypatch.setattr(compiled.RecordedFunction, "graph_type", TracedGraph)
+    for module in (commands, reward_manager):
+        monkeypatch.setattr(module, "compiled_step", lambda function: function)
+    recorded = rollout(device="cpu", records=True)
+    for step, (before, after) in enumerate(zip(expected, recorded, strict=True)):
+        assert before.keys() == after.keys()
+        for name, value in before.items():
+            error = (after[name].double() - value.double()).abs().max()
+            assert error <= 1e-5 * (1.0 + value.double().abs().max()), (step, name)
+    assert max(float(step["terminated"].sum()) for step in expected) >= 1.0
+    assert max(float(step["mode"].float().mean()) for step in expected) > 0.1
+
+
+class NoGraph(compiled.DeviceGraph):
+    """Records nothing."""
+
+    @staticmethod
+    def records(device: str) -> bool:
+        return False
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU of NVIDIA")
+def test_cuda_graphs_give_the_same_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Physics rounds otherwise in each run on a GPU, which grows where feet slip."""
+    recorded = rollout(device="cuda:0", records=True)
+    monkeypatch.setattr(compiled.RecordedFunction, "graph_type", NoGraph)
+    expected = rollout(device="cuda:0", records=True)
+    for step, (before, after) in enumerate(zip(expected, recorded, strict=True)):
+        assert before.keys() == after.keys()
+        for name, value in before.items():
+            error = (after[name].double() - value.double()).abs()
+            assert error.median() <= 1e-3 * (1.0 + value.double().abs().mean()), (step, name)
