@@ -78,13 +78,17 @@ class _Tracer(TorchDispatchMode):
         if name == "aten::lift_fresh":
             self._numbers.append(args[0])
             return args[0]
+        masks = [x for x in arguments if isinstance(x, Tensor) and x.dtype == torch.bool]
         for argument in arguments:
             is_number = any(argument is number for number in self._numbers)
-            assert not is_number or name in TAKES_NUMBERS, f"{name} copies a number of Python's"
-        if name.startswith("aten::index"):
-            for argument in arguments:
-                is_mask = isinstance(argument, Tensor) and argument.dtype == torch.bool
-                assert not is_mask or argument is args[0], f"{name} with a mask waits"
+            fills = name in TAKES_NUMBERS or (name == "aten::index_put_" and len(masks) == 1)
+            assert not is_number or fills, f"{name} copies a number of Python's"
+        if name == "aten::index":
+            assert not any(mask is not args[0] for mask in masks), f"{name} with a mask waits"
+        if name == "aten::index_put_" and masks:
+            # With a number in Python's memory it is a fill, which does not wait.
+            is_fill = any(args[2] is number for number in self._numbers)
+            assert is_fill, f"{name} with a mask waits"
         for place, argument in enumerate(func._schema.arguments):
             if argument.alias_info is not None and argument.alias_info.is_write:
                 target = options.get(argument.name, args[place] if place < len(args) else None)

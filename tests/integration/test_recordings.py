@@ -9,15 +9,16 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import RewardTermCfg, TerminationTermCfg
 
 import training_env
 from pronk.jump.train import compiled
-from pronk.jump.train.gains import training_gains
 from pronk.jump.train.mdp import commands, reward_manager
 from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.recordings import StepRecordings
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.phases import PHASES, curriculum
+from pronk.jump.train.tasks.jump_env_cfg import draw_rotor_frequency, draw_weak_drives
 from traced_graph import TracedGraph
 
 pytestmark = pytest.mark.train
@@ -29,8 +30,9 @@ STEPS = 12
 
 def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
     """Step robots through all phases, with jumps, pushes, falls and empty batteries."""
-    gains = training_gains("naive", training_env.ROBOT)
-    cfg = training_env.config(ROBOTS, gains)
+    cfg = training_env.config(ROBOTS, training_env.MATCHED)
+    draw_weak_drives(cfg, 0.7)
+    draw_rotor_frequency(cfg, 40.0)
     cfg.events["push"].params["interval_s"] = (0.05, 0.2)
     cfg.commands["motion"].resampling_time_range = (0.1, 0.3)
     cfg.commands["motion"].jump_off_s = (0.05, 0.2)
@@ -60,7 +62,6 @@ def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
                         "terminated": terminated.clone(),
                         "torque": env.sim.data.ctrl[:].clone(),
                         "mode": motion_command(env).state.mode.clone(),
-                        "terms": env.reward_manager._step_reward.clone(),
                         **{name: torch.as_tensor(x) for name, x in extras["log"].items()},
                     }
                 )
@@ -82,6 +83,40 @@ def test_a_recorded_step_is_the_step_itself(monkeypatch: pytest.MonkeyPatch) -> 
             assert error <= 1e-5 * (1.0 + value.double().abs().max()), (step, name)
     assert max(float(step["terminated"].sum()) for step in expected) >= 1.0
     assert max(float(step["mode"].float().mean()) for step in expected) > 0.1
+
+
+def steps_so_far(env: ManagerBasedRlEnv) -> Any:
+    """A reward of somebody else's, of a number that Python counts."""
+    return torch.full((ROBOTS,), float(env.common_step_counter), device=env.device)
+
+
+def never(env: ManagerBasedRlEnv) -> Any:
+    """A termination of somebody else's."""
+    return torch.zeros(ROBOTS, dtype=torch.bool, device=env.device)
+
+
+def test_terms_of_somebody_else_are_computed_in_every_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A recording would go on with the number of the step in which it was made."""
+    monkeypatch.setattr(compiled.RecordedFunction, "graph_type", TracedGraph)
+    for module in (commands, reward_manager):
+        monkeypatch.setattr(module, "compiled_step", lambda function: function)
+    cfg = training_env.config(ROBOTS, training_env.MATCHED)
+    cfg.rewards["steps"] = RewardTermCfg(func=steps_so_far, weight=2.0)
+    cfg.terminations["never"] = TerminationTermCfg(func=never)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    StackedRewardManager.install(env)
+    recordings = StepRecordings(env)
+    assert recordings.left_out == ["rewards (steps)", "terminations (never)"]
+    env.reset(seed=0)
+    recordings.begin()
+    with torch.inference_mode():
+        for step in range(1, 6):
+            env.step(torch.zeros(ROBOTS, 12))
+            rewards = dict(env.reward_manager.get_active_iterable_terms(0))
+            assert rewards["steps"] == [2.0 * step]
+    env.close()
 
 
 class NoGraph(compiled.DeviceGraph):

@@ -174,7 +174,9 @@ class RecordedFunction:
         return tuple(output.clone() for output in self._outputs)
 
 
-Recorder = Callable[[Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]]], RecordedFunction]
+TensorFunction = Callable[..., tuple[Tensor, ...]]
+"""A function of tensors by name, or of nothing, as `RecordedFunction` has it."""
+Recorder = Callable[[TensorFunction], TensorFunction]
 """What prepares a function to be recorded."""
 
 

@@ -12,7 +12,7 @@ draws are uniform, from PyTorch's generator of the device.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
-from pronk.jump.train.compiled import NO_TENSORS, Recorder
+from pronk.jump.train.compiled import NO_TENSORS, Recorder, TensorFunction
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.observations import gravity_direction
 
@@ -339,7 +339,7 @@ class Pushes:
         self._env = env
         self._time_left = _uniform(env, cfg.params["interval_s"], env.num_envs)
         self._step_s = torch.zeros((), device=env.device)
-        self._push: Callable[[], tuple[Tensor, ...]] = self._push_robots
+        self._push: TensorFunction = self._push_robots
         self._settings = PushSettings(**cfg.params)
 
     def record(self, record: Recorder) -> None:

@@ -5,8 +5,10 @@ compute. What is computed alike in every step of an iteration, on memory that st
 once an iteration. Physics has graphs of its own; ends of episodes, whose robots are others in each
 step, and histories of measurements, which Python numbers, are computed as they are.
 
-What a phase sets is read when a function is recorded. A phase that begins in the last step of an
-iteration, where mjlab calls the curriculum, takes effect in recordings with the next one.
+A recording does not run Python again. So terms are recorded that are pronk's; a term of somebody
+else's `env_cfgs.py` may read what Python counts. What a phase sets is read when a function is
+recorded: a phase that begins in the last step of an iteration, where mjlab calls the curriculum,
+takes effect in recordings with the next one.
 """
 
 from __future__ import annotations
@@ -16,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 import warp
+from mjlab.actuator import DcMotorActuator
 from torch import Tensor
 
-from pronk.jump.train.compiled import RecordedFunction
+from pronk.jump.train.compiled import RecordedFunction, TensorFunction
 from pronk.jump.train.mdp import observations
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.commands import motion_command
@@ -44,41 +47,85 @@ class StepRecordings:
         Args:
             env: The environment, with a `StackedRewardManager`.
         """
+        self.left_out: list[str] = []
+        """Parts that are not recorded, since not all of their terms are pronk's, with the terms."""
+        self._env = env
         self._functions: list[RecordedFunction] = []
-        self._device = env.device
         self._stream = None
         if env.device != "cpu":
             # mjlab writes to the simulator on the simulator's stream.
             physics_stream = warp.get_stream(env.sim.wp_device)
             self._stream = torch.cuda.ExternalStream(physics_stream.cuda_stream)
         motion_command(env).compile(self.record)
-        env.reward_manager.compile(self.record)
-        self._record_method(joint_position_action(env).battery, "advance")
-        self._record_method(env.scene, "write_data_to_sim")
-        self._record_method(env.termination_manager, "compute")
-        for names in env.event_manager.active_terms.values():
-            for name in names:
-                event = env.event_manager.get_term_cfg(name).func
-                if isinstance(event, Pushes):
-                    event.record(self.record)
-        for group, names in env.observation_manager.active_terms.items():
-            for name in names:
-                term = env.observation_manager.get_term_cfg(group, name)
-                if term.func in _OBSERVATIONS:
-                    term.func = self._recorded_term(env, term.func)
+        if self._knows("rewards", env.reward_manager):
+            env.reward_manager.compile(self.record)
+        else:
+            env.reward_manager.compile(lambda function: function)
+        if self._knows("terminations", env.termination_manager):
+            self._record_method(env.termination_manager, "compute")
+        self._record_drives()
+        self._record_pushes()
+        self._record_observations()
 
     def begin(self) -> None:
         """Begin an iteration: everything is recorded again."""
         for function in self._functions:
             function.begin()
 
-    def record(
-        self, function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]]
-    ) -> RecordedFunction:
+    def record(self, function: TensorFunction) -> RecordedFunction:
         """Prepare a function to be recorded once an iteration."""
-        recorded_function = RecordedFunction(function, self._device, self._stream)
+        recorded_function = RecordedFunction(function, self._env.device, self._stream)
         self._functions.append(recorded_function)
         return recorded_function
+
+    def _knows(self, part: str, manager: Any) -> bool:
+        """Return whether all terms of a manager are pronk's functions; note those that are not."""
+        unknown = []
+        for name in manager.active_terms:
+            if not _is_ours(manager.get_term_cfg(name).func):
+                unknown.append(name)
+        if unknown:
+            self.left_out.append(f"{part} ({', '.join(unknown)})")
+        return not unknown
+
+    def _record_drives(self) -> None:
+        """Record drives and batteries, which are computed in every physics step."""
+        env = self._env
+        unknown = []
+        for name, entity in env.scene.entities.items():
+            for drive in entity.actuators:
+                if type(drive) is not DcMotorActuator or drive.cfg.delay_max_lag > 0:
+                    unknown.append(name)
+        if unknown:
+            self.left_out.append(f"drives ({', '.join(sorted(set(unknown)))})")
+            return
+        self._record_method(joint_position_action(env).battery, "advance")
+        self._record_method(env.scene, "write_data_to_sim")
+
+    def _record_pushes(self) -> None:
+        """Record pushes."""
+        manager = self._env.event_manager
+        for names in manager.active_terms.values():
+            for name in names:
+                event = manager.get_term_cfg(name).func
+                if isinstance(event, Pushes):
+                    event.record(self.record)
+
+    def _record_observations(self) -> None:
+        """Record observations of many operations."""
+        manager = self._env.observation_manager
+        for group, names in manager.active_terms.items():
+            for name in names:
+                term = manager.get_term_cfg(group, name)
+                if term.func in _OBSERVATIONS:
+                    term.func = self._recorded_term(term.func)
+
+    def _recorded_term(
+        self, function: Callable[[ManagerBasedRlEnv], Tensor]
+    ) -> Callable[[ManagerBasedRlEnv], Tensor]:
+        """Return the recording of an observation."""
+        recorded_function = self.record(lambda _: (function(self._env),))
+        return lambda _: recorded_function({})[0]
 
     def _record_method(self, owner: Any, name: str) -> None:
         """Put a recording in the place of a method that returns a tensor or nothing."""
@@ -96,9 +143,8 @@ class StepRecordings:
 
         setattr(owner, name, replay)
 
-    def _recorded_term(
-        self, env: ManagerBasedRlEnv, function: Callable[[ManagerBasedRlEnv], Tensor]
-    ) -> Callable[[ManagerBasedRlEnv], Tensor]:
-        """Return the recording of an observation."""
-        recorded_function = self.record(lambda _: (function(env),))
-        return lambda _: recorded_function()[0]
+
+def _is_ours(function: Any) -> bool:
+    """Return whether a term is a function of pronk's."""
+    module = getattr(function, "__module__", "")
+    return callable(function) and module.startswith("pronk.jump.train.mdp.")

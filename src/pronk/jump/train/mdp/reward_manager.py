@@ -16,7 +16,7 @@ from mjlab.managers import RewardTermCfg
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
 
-from pronk.jump.train.compiled import NO_TENSORS, RecordedFunction, Recorder, compiled_step
+from pronk.jump.train.compiled import NO_TENSORS, Recorder, TensorFunction, compiled_step
 from pronk.jump.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class StackedRewardManager(RewardManager):
         self._scales: list[float] = []
         self._scale_tensor = torch.ones(len(self._term_names), device=self.device)
         self._calls: list[tuple[Callable[..., Tensor], dict[str, Any], bool]] = []
-        self._recorded_step: RecordedFunction | None = None
+        self._recorded_step: TensorFunction | None = None
 
     def compile(self, record: Recorder) -> None:
         """Compile the terms together, and record them with their sums.

@@ -99,6 +99,10 @@ class PronkRunner(MjlabOnPolicyRunner):
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
             self._recordings = StepRecordings(env.unwrapped)
+            for part in self._recordings.left_out:
+                self.note(
+                    f"note: --compile does not record {part}, since these are not pronk's own."
+                )
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
