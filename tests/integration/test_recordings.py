@@ -138,3 +138,15 @@ def test_cuda_graphs_give_the_same_step(monkeypatch: pytest.MonkeyPatch) -> None
         for name, value in before.items():
             error = (after[name].double() - value.double()).abs()
             assert error.median() <= 1e-3 * (1.0 + value.double().abs().mean()), (step, name)
+
+
+def test_all_tensors_of_jumps_and_motion_are_kept() -> None:
+    """What is copied for recordings is all that there is."""
+    env = training_env.nominal()
+    command = motion_command(env)
+    motion = command.motion
+    for part in (motion.joints, motion.trunk, motion.legs, command.state):
+        kept = command.state.tensors() if part is command.state else motion.tensors()
+        for name, value in vars(part).items():
+            if isinstance(value, torch.Tensor):
+                assert any(value is tensor for tensor in kept), name

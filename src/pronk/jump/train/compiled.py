@@ -180,15 +180,7 @@ Recorder = Callable[[TensorFunction], TensorFunction]
 """What prepares a function to be recorded."""
 
 
-def keep_in_place(owner: object, before: Mapping[str, Any]) -> None:
-    """Put tensors that were replaced back into their memory, with the new numbers.
-
-    Args:
-        owner: The object that has the tensors.
-        before: Its attributes as they were before.
-    """
-    for name, kept in before.items():
-        new = getattr(owner, name)
-        if isinstance(kept, Tensor) and new is not kept:
-            kept.copy_(new)
-            setattr(owner, name, kept)
+def keep_in_place(kept: list[Tensor], new: list[Tensor]) -> None:
+    """Copy new numbers into tensors that stay where they are, one for one."""
+    for tensor, numbers in zip(kept, new, strict=True):
+        tensor.copy_(numbers)

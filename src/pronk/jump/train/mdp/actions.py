@@ -72,6 +72,8 @@ class DelayedJointPositionAction(JointPositionAction):
         self.lag = torch.full((self.num_envs, 1), low, device=self.device)
         """Delay in this episode [physics steps]. (N, 1)"""
         self.battery = Battery(self._entity)
+        self.advance_battery = self.battery.advance
+        """What is called before each physics step; a recording may take its place."""
         self.rotors = Rotors(self._armatures(), env.physics_dt)
         """Rotors of the joints, as of the last `finish_step`."""
         self.position_target = torch.zeros_like(self._processed_actions)
@@ -116,7 +118,7 @@ class DelayedJointPositionAction(JointPositionAction):
         if changes:
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
-        self.battery.advance()
+        self.advance_battery()
         self._is_step_open = True
 
     def finish_step(self) -> Rotors:

@@ -7,6 +7,7 @@ last step, and the ranges of the velocities. Masks are used, so that no step wai
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -258,14 +259,14 @@ class MotionCommand(CommandTerm):
             self._motion_step = step
             self._jump_scales.clear()
             if not self._is_compiled:
-                self._motion = self._measure(simulator_state(self._env), self._motion)
+                self._motion = self._measure(simulator_state(self._env), self._motion, self.state)
                 return self._motion
             self._step_s.fill_(self._env.step_dt)
             if self._motion is not None:
                 self._recorded_measure()
             else:
                 with ordinary_tensors():
-                    self._motion = self._measure(simulator_state(self._env), None)
+                    self._motion = self._measure(simulator_state(self._env), None, self.state)
         return self._motion
 
     def compile(self, record: Recorder) -> None:
@@ -297,15 +298,22 @@ class MotionCommand(CommandTerm):
     def _measure_in_place(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
         """Measure the motion in a step, and keep it and the jumps in the memory that they have."""
         assert self._motion is not None
-        jumps_before = dict(vars(self.state))
-        motion = self._compiled_measure(simulator_state(self._env), self._motion)
-        keep_in_place(self.state, jumps_before)
-        for kept, measured in zip(self._motion.tensors(), motion.tensors(), strict=True):
-            kept.copy_(measured)
+        jumps = copy(self.state)
+        motion = self._compiled_measure(simulator_state(self._env), self._motion, jumps)
+        keep_in_place(self.state.tensors(), jumps.tensors())
+        keep_in_place(self._motion.tensors(), motion.tensors())
         return ()
 
-    def _measure(self, state: SimulatorState, before: StepMotion | None) -> StepMotion:
-        """Measure the motion in a step; advance the jumps and the ranges of the velocities."""
+    def _measure(
+        self, state: SimulatorState, before: StepMotion | None, jumps: JumpState
+    ) -> StepMotion:
+        """Measure the motion in a step; advance the jumps and the ranges of the velocities.
+
+        Args:
+            state: What the simulator computed.
+            before: Motion in the step before; None where there is none.
+            jumps: State of the jumps, which is advanced: `self.state` or a copy of it.
+        """
         motion = measure_motion(state, self.frames, before)
         trunk = motion.trunk
         horizontal = trunk.velocity_heading
@@ -330,9 +338,9 @@ class MotionCommand(CommandTerm):
             direction=way / way_norm.clamp_min(1e-6),
             extension=motion.legs.length - self._standing_leg,
         )
-        self.state.advance(inputs, self.step_s)
+        jumps.advance(inputs, self.step_s)
         if not self.scripted:
-            counted = ~self.state.mode[None]
+            counted = ~jumps.mode[None]
             if self.cfg.counted_from > 0.0:
                 counted = counted & fast_commands(
                     commanded, self._limits, self.ranges.fraction, self.cfg.counted_from

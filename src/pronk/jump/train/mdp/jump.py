@@ -186,9 +186,9 @@ class JumpState:
         else:
             self.liftoff_std = std
 
-    def reset(self, robots: Tensor) -> None:
-        """Clear the state of some robots, bool (N,)."""
-        for value in (
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors of the state, always in the same order; the last one is `stance`."""
+        return [
             self.commanded,
             self.airborne,
             self.mode,
@@ -213,9 +213,15 @@ class JumpState:
             self.best_gap,
             self.gap_gain,
             self.similarity,
-        ):
+            self.stance,
+        ]
+
+    def reset(self, robots: Tensor) -> None:
+        """Clear the state of some robots, bool (N,)."""
+        *values, stance = self.tensors()
+        for value in values:
             value.masked_fill_(robots, 0)
-        self.stance.masked_fill_(robots[:, None, None], 0.0)
+        stance.masked_fill_(robots[:, None, None], 0.0)
 
     def advance(self, inputs: JumpInputs, dt: float | Tensor) -> None:
         """Advance by one policy step.

@@ -88,10 +88,30 @@ class StepMotion:
 
     def tensors(self) -> list[Tensor]:
         """Return all tensors, always in the same order."""
-        tensors = [self.non_foot_contacts]
-        for part in (self.joints, self.trunk, self.legs):
-            tensors += vars(part).values()
-        return tensors
+        joints = self.joints
+        trunk = self.trunk
+        legs = self.legs
+        return [
+            joints.position,
+            joints.velocity,
+            joints.torque,
+            joints.torque_change,
+            trunk.height,
+            trunk.velocity_world,
+            trunk.velocity_heading,
+            trunk.angular_velocity,
+            trunk.gravity,
+            trunk.heading,
+            legs.contact,
+            legs.force,
+            legs.foot_position,
+            legs.foot_height,
+            legs.foot_velocity,
+            legs.foot_velocity_change,
+            legs.knee_height,
+            legs.length,
+            self.non_foot_contacts,
+        ]
 
     def reset(self, robots: Tensor) -> None:
         """Leave robots that start a new episode, bool (N,), without a step before."""

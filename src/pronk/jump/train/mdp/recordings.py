@@ -62,7 +62,7 @@ class StepRecordings:
         else:
             env.reward_manager.compile(lambda function: function)
         if self._knows("terminations", env.termination_manager):
-            self._record_method(env.termination_manager, "compute")
+            self._record_terminations()
         self._record_drives()
         self._record_pushes()
         self._record_observations()
@@ -88,6 +88,12 @@ class StepRecordings:
             self.left_out.append(f"{part} ({', '.join(unknown)})")
         return not unknown
 
+    def _record_terminations(self) -> None:
+        """Record which episodes end."""
+        compute = self._env.termination_manager.compute
+        recorded_function = self.record(lambda _: (compute(),))
+        self._env.termination_manager.compute = lambda: recorded_function({})[0]
+
     def _record_drives(self) -> None:
         """Record drives and batteries, which are computed in every physics step."""
         env = self._env
@@ -99,8 +105,9 @@ class StepRecordings:
         if unknown:
             self.left_out.append(f"drives ({', '.join(sorted(set(unknown)))})")
             return
-        self._record_method(joint_position_action(env).battery, "advance")
-        self._record_method(env.scene, "write_data_to_sim")
+        action = joint_position_action(env)
+        action.advance_battery = self._recorded_call(action.battery.advance)
+        env.scene.write_data_to_sim = self._recorded_call(env.scene.write_data_to_sim)
 
     def _record_pushes(self) -> None:
         """Record pushes."""
@@ -127,21 +134,19 @@ class StepRecordings:
         recorded_function = self.record(lambda _: (function(self._env),))
         return lambda _: recorded_function({})[0]
 
-    def _record_method(self, owner: Any, name: str) -> None:
-        """Put a recording in the place of a method that returns a tensor or nothing."""
-        method = getattr(owner, name)
+    def _recorded_call(self, function: Callable[[], None]) -> Callable[[], None]:
+        """Return the recording of a function without arguments and results."""
 
-        def compute(_: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-            result = method()
-            return () if result is None else (result,)
+        def call(_: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+            function()
+            return ()
 
-        recorded_function = self.record(compute)
+        recorded_function = self.record(call)
 
-        def replay() -> Tensor | None:
-            results = recorded_function()
-            return results[0] if results else None
+        def replay() -> None:
+            recorded_function({})
 
-        setattr(owner, name, replay)
+        return replay
 
 
 def _is_ours(function: Any) -> bool:
