@@ -21,6 +21,11 @@ GO2_POLICY = ROOT / "policies" / "go2" / "matched" / "policy.onnx"
     ("policy", "robot", "gains"),
     [
         ("matched", "mini_cheetah", "policies/gains.yaml"),
+        (
+            "recipes/contact_rotors",
+            "mini_cheetah",
+            "examples/studies/match_worth/gains/shipped.yaml",
+        ),
         ("go2/matched", "go2", "examples/studies/go2/gains.yaml"),
     ],
 )

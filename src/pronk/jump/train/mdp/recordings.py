@@ -5,8 +5,9 @@ compute. What is computed alike in every step of an iteration, on memory that st
 once an iteration. Physics has graphs of its own; ends of episodes, whose robots are others in each
 step, and histories of measurements, which Python numbers, are computed as they are.
 
-A recording does not run Python again. So terms are recorded that are pronk's; a term of somebody
-else's `env_cfgs.py` may read what Python counts. What a phase sets is read when a function is
+A recording does not run Python again, and what is compiled is compiled again for another number. So
+rewards and terminations with a term of somebody else's `env_cfgs.py`, which may read what Python
+counts, are computed as they are. What a phase sets is read when a function is
 recorded: a phase that begins in the last step of an iteration, where mjlab calls the curriculum,
 takes effect in recordings with the next one.
 """
@@ -48,7 +49,7 @@ class StepRecordings:
             env: The environment, with a `StackedRewardManager`.
         """
         self.left_out: list[str] = []
-        """Parts that are not recorded, since not all of their terms are pronk's, with the terms."""
+        """Parts that are computed as without recordings, with the terms that are not pronk's."""
         self._env = env
         self._functions: list[RecordedFunction] = []
         self._stream = None
@@ -59,8 +60,6 @@ class StepRecordings:
         motion_command(env).compile(self.record)
         if self._knows("rewards", env.reward_manager):
             env.reward_manager.compile(self.record)
-        else:
-            env.reward_manager.compile(lambda function: function)
         if self._knows("terminations", env.termination_manager):
             self._record_terminations()
         self._record_drives()

@@ -100,9 +100,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         if compiles:
             self._recordings = StepRecordings(env.unwrapped)
             for part in self._recordings.left_out:
-                self.note(
-                    f"note: --compile does not record {part}, since these are not pronk's own."
-                )
+                self.note(f"note: --compile leaves {part} as it is: not all of it is pronk's own.")
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
             self.note(f"warning: {warning}")
