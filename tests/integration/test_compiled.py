@@ -20,8 +20,8 @@ import training_env
 from pronk.cli import main as cli
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.train.mdp.recordings import StepRecordings
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum
 from pronk.jump.train.provenance import RunFolder
 
@@ -63,7 +63,7 @@ def rewards_of_all_phases(*, compiles: bool) -> list[Any]:
     StackedRewardManager.install(env)
     command = motion_command(env)
     if compiles:
-        StepRecordings(env)
+        StepGraphs(env)
     env.reset(seed=0)
     rewards: list[Any] = []
     generator = torch.Generator().manual_seed(1)

@@ -6,7 +6,7 @@ compiled again for every other value of a number that it reads.
 
 What is computed alike many times in an iteration is recorded as a CUDA graph, whose kernels are
 launched together (`RecordedFunction`): the steps of learning and of the policy, and what
-`pronk.jump.train.mdp.recordings` lists of the robots' step.
+`pronk.jump.train.mdp.step_graphs` lists of the robots' step.
 """
 
 from __future__ import annotations

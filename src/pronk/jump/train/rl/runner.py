@@ -28,8 +28,8 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train import compiled
 from pronk.jump.train.devices import check_cuda_graphs
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.train.mdp.recordings import StepRecordings
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
 from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY
 from pronk.jump.train.rl import checkpoint
@@ -93,13 +93,13 @@ class PronkRunner(MjlabOnPolicyRunner):
                 f"{self.curriculum.steps_per_iteration} steps an iteration; give both alike."
             )
         compiles = train_cfg.get("torch_compile_mode") is not None
-        self._recordings: StepRecordings | None = None
+        self._step_graphs: StepGraphs | None = None
         if compiles:
             compiled.prepare(device)
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
-            self._recordings = StepRecordings(env.unwrapped)
-            for part in self._recordings.left_out:
+            self._step_graphs = StepGraphs(env.unwrapped)
+            for part in self._step_graphs.left_out:
                 self.note(f"note: --compile leaves {part} as it is: not all of it is pronk's own.")
         warning = check_cuda_graphs(env.unwrapped.sim, device)
         if warning is not None:
@@ -227,8 +227,8 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _begin_iteration(self) -> None:
         """Set the phase of the iteration that begins."""
-        if self._recordings is not None:
-            self._recordings.begin()
+        if self._step_graphs is not None:
+            self._step_graphs.begin()
         self.env.unwrapped.curriculum_manager.compute()
         name, done = phase_at(self.curriculum.iterations, self.iteration)
         phase = PHASES[name]

@@ -15,8 +15,8 @@ import training_env
 from pronk.jump.train import compiled
 from pronk.jump.train.mdp import commands, reward_manager
 from pronk.jump.train.mdp.commands import motion_command
-from pronk.jump.train.mdp.recordings import StepRecordings
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
+from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum
 from pronk.jump.train.tasks.jump_env_cfg import draw_rotor_frequency, draw_weak_drives
 from traced_graph import TracedGraph
@@ -39,7 +39,7 @@ def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
     cfg.curriculum["phases"].params["steps_per_iteration"] = 10**9  # phases are set below
     env = ManagerBasedRlEnv(cfg, device=device)
     StackedRewardManager.install(env)
-    recordings = StepRecordings(env) if records else None
+    graphs = StepGraphs(env) if records else None
     env.reset(seed=0)
     generator = torch.Generator().manual_seed(1)
     history = []
@@ -48,8 +48,8 @@ def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
             for step in range(STEPS):
                 if step % (STEPS // 2) == 0:
                     curriculum(env).apply(env, phase, step / STEPS)
-                    if recordings is not None:
-                        recordings.begin()
+                    if graphs is not None:
+                        graphs.begin()
                 if step % 3 == 2:
                     env.episode_length_buf[step : step + 4] = 10**6  # episodes end
                     env.sim.data.qpos[2, 4] = 1.0  # this robot lies on its side
@@ -107,10 +107,10 @@ def test_terms_of_somebody_else_are_computed_in_every_step(
     cfg.terminations["never"] = TerminationTermCfg(func=never)
     env = ManagerBasedRlEnv(cfg, device="cpu")
     StackedRewardManager.install(env)
-    recordings = StepRecordings(env)
-    assert recordings.left_out == ["rewards (steps)", "terminations (never)"]
+    graphs = StepGraphs(env)
+    assert graphs.left_out == ["rewards (steps)", "terminations (never)"]
     env.reset(seed=0)
-    recordings.begin()
+    graphs.begin()
     with torch.inference_mode():
         for step in range(1, 6):
             env.step(torch.zeros(ROBOTS, 12))

@@ -5,11 +5,11 @@ compute. What is computed alike in every step of an iteration, on memory that st
 once an iteration. Physics has graphs of its own; ends of episodes, whose robots are others in each
 step, and histories of measurements, which Python numbers, are computed as they are.
 
-A recording does not run Python again, and what is compiled is compiled again for another number. So
-rewards and terminations with a term of somebody else's `env_cfgs.py`, which may read what Python
-counts, are computed as they are. What a phase sets is read when a function is
-recorded: a phase that begins in the last step of an iteration, where mjlab calls the curriculum,
-takes effect in recordings with the next one.
+A CUDA graph does not run Python again, and what is compiled is compiled again for another number.
+So rewards and terminations with a term of somebody else's `env_cfgs.py`, which may read what Python
+counts, are computed as they are. What a phase sets is read when a function is recorded: a phase
+that begins in the last step of an iteration, where mjlab calls the curriculum, takes effect in the
+graphs with the next one.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _OBSERVATIONS = (
 """Observations of many operations each, without noise and history."""
 
 
-class StepRecordings:
-    """Recorded parts of the step of an environment."""
+class StepGraphs:
+    """The recorded parts of the step of an environment."""
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         """Compile and record the step of an environment from now on.
@@ -49,7 +49,7 @@ class StepRecordings:
             env: The environment, with a `StackedRewardManager`.
         """
         self.left_out: list[str] = []
-        """Parts that are computed as without recordings, with the terms that are not pronk's."""
+        """Parts that are computed without graphs, with the terms that are not pronk's."""
         self._env = env
         self._functions: list[RecordedFunction] = []
         self._stream = None
