@@ -21,6 +21,8 @@ from torch import Tensor
 
 NO_TENSORS: Mapping[str, Tensor] = MappingProxyType({})
 """For functions without inputs."""
+TensorFunction = Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]]
+"""A function of tensors by name."""
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -120,7 +122,7 @@ class RecordedFunction:
 
     def __init__(
         self,
-        function: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
+        function: TensorFunction,
         device: str,
         stream: torch.cuda.Stream | None = None,
     ) -> None:
@@ -174,9 +176,7 @@ class RecordedFunction:
         return tuple(output.clone() for output in self._outputs)
 
 
-TensorFunction = Callable[..., tuple[Tensor, ...]]
-"""A function of tensors by name, or of nothing, as `RecordedFunction` has it."""
-Recorder = Callable[[TensorFunction], TensorFunction]
+Recorder = Callable[[TensorFunction], RecordedFunction]
 """What prepares a function to be recorded."""
 
 

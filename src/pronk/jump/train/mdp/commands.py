@@ -17,7 +17,6 @@ from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
 from pronk.jump.train.compiled import (
-    NO_TENSORS,
     Recorder,
     compiled_step,
     keep_in_place,
@@ -295,7 +294,7 @@ class MotionCommand(CommandTerm):
             self._jump_scales[scale] = torch.where(self.state.mode, scale, 1.0)
         return value * self._jump_scales[scale]
 
-    def _measure_in_place(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+    def _measure_in_place(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Measure the motion in a step, and keep it and the jumps in the memory that they have."""
         assert self._motion is not None
         jumps = copy(self.state)
@@ -401,7 +400,7 @@ class MotionCommand(CommandTerm):
         with ordinary_tensors():
             self._recorded_advance()
 
-    def _advance_in_place(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+    def _advance_in_place(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Advance the commands by the time that is stored."""
         self._advance_commands(self._elapsed_s)
         return ()

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
-from pronk.jump.train.compiled import NO_TENSORS, Recorder, TensorFunction
+from pronk.jump.train.compiled import Recorder, TensorFunction
 from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.observations import gravity_direction
 
@@ -340,7 +340,7 @@ class Pushes:
         self._time_left = _uniform(env, cfg.params["interval_s"], env.num_envs)
         self._step_s = torch.zeros((), device=env.device)
         self._push: TensorFunction = self._push_robots
-        self._settings = PushSettings(**cfg.params)
+        self._settings: PushSettings
 
     def record(self, record: Recorder) -> None:
         """Record what is computed in every step; `record` prepares a function for it."""
@@ -360,9 +360,9 @@ class Pushes:
         """
         self._settings = PushSettings(interval_s=interval_s, speed=speed, yaw_rate=yaw_rate)
         self._step_s.fill_(env.step_dt)
-        self._push()
+        self._push({})
 
-    def _push_robots(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+    def _push_robots(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Push the robots whose interval is over after the time that is stored."""
         env = self._env
         settings = self._settings

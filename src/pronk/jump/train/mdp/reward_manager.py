@@ -16,7 +16,7 @@ from mjlab.managers import RewardTermCfg
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
 
-from pronk.jump.train.compiled import NO_TENSORS, Recorder, TensorFunction, compiled_step
+from pronk.jump.train.compiled import RecordedFunction, Recorder, compiled_step
 from pronk.jump.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class StackedRewardManager(RewardManager):
         self._scales: list[float] = []
         self._scale_tensor = torch.ones(len(self._term_names), device=self.device)
         self._calls: list[tuple[Callable[..., Tensor], dict[str, Any], bool]] = []
-        self._recorded_step: TensorFunction | None = None
+        self._recorded_step: RecordedFunction | None = None
 
     def compile(self, record: Recorder) -> None:
         """Compile the terms together, and record them with their sums.
@@ -90,7 +90,7 @@ class StackedRewardManager(RewardManager):
         self._reward_buf = rates.sum(dim=0) * scale
         return self._reward_buf
 
-    def _step(self, _: Mapping[str, Tensor] = NO_TENSORS) -> tuple[Tensor, ...]:
+    def _step(self, _: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Compute the reward of each robot, (N,), by compiled terms, and add up the terms."""
         rates = self._compiled_rates(self._weight_tensor, self._scale_tensor)
         scale = motion_command(self._env).step_s if self._scale_by_dt else 1.0

@@ -91,7 +91,7 @@ class StepGraphs:
         """Record which episodes end."""
         compute = self._env.termination_manager.compute
         recorded_function = self.record(lambda _: (compute(),))
-        self._env.termination_manager.compute = lambda: recorded_function({})[0]
+        self._env.termination_manager.compute = lambda: recorded_function()[0]
 
     def _record_drives(self) -> None:
         """Record drives and batteries, which are computed in every physics step."""
@@ -131,7 +131,7 @@ class StepGraphs:
     ) -> Callable[[ManagerBasedRlEnv], Tensor]:
         """Return the recording of an observation."""
         recorded_function = self.record(lambda _: (function(self._env),))
-        return lambda _: recorded_function({})[0]
+        return lambda _: recorded_function()[0]
 
     def _recorded_call(self, function: Callable[[], None]) -> Callable[[], None]:
         """Return the recording of a function without arguments and results."""
@@ -143,7 +143,7 @@ class StepGraphs:
         recorded_function = self.record(call)
 
         def replay() -> None:
-            recorded_function({})
+            recorded_function()
 
         return replay
 
@@ -151,4 +151,4 @@ class StepGraphs:
 def _is_ours(function: Any) -> bool:
     """Return whether a term is a function of pronk's."""
     module = getattr(function, "__module__", "")
-    return callable(function) and module.startswith("pronk.jump.train.mdp.")
+    return str(module).startswith("pronk.jump.train.mdp.")
