@@ -113,6 +113,8 @@ def probe_simulator(
         acting_law += f" or {other.label}"
     if "residual" in result.faults:
         acting_law = "none of the laws"
+    if not result.complete:
+        acting_law = "not found"
     acting_stiffness = probed_joint.stiffness * result.gains.stiffness_factor
     acting_damping = probed_joint.damping * result.gains.damping_factor
     # Adding 0 makes -0 a 0.

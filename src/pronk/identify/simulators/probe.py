@@ -13,14 +13,14 @@ Three experiments on one joint, all others held at their default positions:
   of a position that is some steps old.
 
 A joint with friction is fitted to each law; the law with the smallest residual is the answer, with
-those that explain the motion as well. The time of the fits is limited.
+those that explain the motion as well. The fits are limited by the steps that they simulate, which
+the answer of every machine has in common, and not by time.
 Gravity and the inertia of the links are the robot's, which is what makes the gains absolute.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -77,10 +77,11 @@ _EXACT_RESIDUAL = 1e-6
 """Residual of a law that is certainly right: no other is tried."""
 _STALE_STEPS = (1, 2, 3, 4)
 """Ages of the position in the torque that are tried [steps]."""
-MOST_SECONDS = 12.0
-"""Time of the processor after which no further law is tried [s]."""
-_SHARE_OF_TIME = 0.4
-"""Share of the time that is left in which laws are tried with one share of the gains."""
+MOST_STEPS = 1_500_000
+"""Integration steps after which no further law is tried. None of 50 random simulators needs more
+than 520,000, which take 11 s of a core (`python -m benchmarks probe`)."""
+_SHARE_OF_STEPS = 0.4
+"""Share of the steps that are left in which laws are tried with one share of the gains."""
 _HIGHEST_STEP = 3.0
 """Highest step of the command with which a limit of the torque is looked for [rad]."""
 _CLIPPED_SLOPE = 0.3
@@ -182,10 +183,29 @@ class Probe:
     """Steps that a command is held for."""
     residual: float
     """RMS of the motion that the answer does not explain, as a share of the motion."""
+    complete: bool
+    """False if the limit of integration steps ended the fits before all laws were fitted."""
     alike: tuple[ActingLaw, ...] = ()
     """Other laws that explain the motion as well."""
     faults: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word for each, and a sentence."""
+
+
+class _StepCount:
+    """Integration steps that were simulated to fit laws, and how many may be."""
+
+    def __init__(self, most: int) -> None:
+        self.simulated = 0
+        self.most = most
+
+    def add(self, steps: int) -> None:
+        """Count steps that were simulated."""
+        self.simulated += steps
+
+    @property
+    def left(self) -> int:
+        """Steps that may still be simulated."""
+        return max(self.most - self.simulated, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,13 +228,15 @@ class _Runs:
     """Inertia of the links about the joint [kg m^2]."""
     gravity: tuple[float, float]
     """Torque of gravity, `gravity[0] cos q + gravity[1] sin q` [N m]."""
-    deadline: float
-    """Time of the processor after which no further law is tried, and fits end [s]."""
+    steps: _StepCount
+    """Integration steps of the fits, those to all runs of the probe."""
+    last_step: int
+    """Count of `steps` after which no further law is tried, and fits end."""
 
     @property
-    def late(self) -> bool:
-        """True after the deadline."""
-        return time.process_time() > self.deadline
+    def exhausted(self) -> bool:
+        """True after the last step."""
+        return self.steps.simulated > self.last_step
 
     @property
     def torque(self) -> float:
@@ -257,6 +279,8 @@ class _Answer:
     """Gains that act over those that are set."""
     hold: int
     runs: _Runs
+    complete: bool
+    """False if the steps were over before all laws were fitted."""
 
 
 def probe_joint(
@@ -264,7 +288,7 @@ def probe_joint(
     robot: RobotSpec,
     joint: str | None = None,
     *,
-    most_seconds: float = MOST_SECONDS,
+    most_steps: int = MOST_STEPS,
 ) -> Probe:
     """Name the drive law and the parameters that act at one joint, whose gains are the robot's.
 
@@ -272,7 +296,7 @@ def probe_joint(
         simulator: The simulator.
         robot: The robot whose joint it is.
         joint: The joint; the first one that moves no other if None.
-        most_seconds: Time of the processor after which no further law is tried [s].
+        most_steps: Integration steps of the fits after which no further law is tried.
 
     Raises:
         PronkError: There is no such joint, it does not move, or the simulator diverges even with
@@ -290,7 +314,7 @@ def probe_joint(
     clip = bench.clip(stable_share)
     if clip is not None:
         bench.lower_amplitude(_CLEAR_OF_CLIP * clip.acting * clip.height)
-    deadline = time.process_time() + most_seconds
+    steps = _StepCount(most_steps)
     answers: list[_Answer] = []
     shares = [stable_share]
     while shares:
@@ -302,10 +326,9 @@ def probe_joint(
                 # Friction holds the joint against smaller gains.
                 break
             raise
-        # Other shares of the gains need time as well.
-        now = time.process_time()
-        share_deadline = now + _SHARE_OF_TIME * max(deadline - now, 0.0)
-        runs = bench.chirps(share, hold, phase, share_deadline)
+        # Other shares of the gains need steps as well.
+        last_step = steps.simulated + round(_SHARE_OF_STEPS * steps.left)
+        runs = bench.chirps(share, hold, phase, steps, last_step)
         if runs.motion < 1e-3 * bench.amplitude:
             # Friction, or a defect, holds the joint.
             break
@@ -337,9 +360,17 @@ def probe_joint(
         elif doubt > _CLEAR and share <= stable_share and bench.stable(4.0 * share):
             # Rounding hides by how many iterations laws differ; of larger gains less.
             more_shares = [4.0 * share]
-        shares = more_shares if time.process_time() < deadline else []
+        shares = more_shares if steps.left else []
         answers.append(
-            _Answer(doubt=doubt, fit=best, alike=alike, scale=scale, hold=hold, runs=runs)
+            _Answer(
+                doubt=doubt,
+                fit=best,
+                alike=alike,
+                scale=scale,
+                hold=hold,
+                runs=runs,
+                complete=not runs.exhausted,
+            )
         )
     if not answers:
         raise PronkError(
@@ -365,6 +396,7 @@ def probe_joint(
         delay_s=delay_steps * answer.runs.timestep,
         hold=answer.hold,
         residual=answer.fit.residual,
+        complete=answer.complete,
         alike=answer.alike,
     )
     if answer.fit.law.drive.kind == "implicit" and scale > 1.5:
@@ -523,14 +555,17 @@ class _Bench:
             hold = int(np.diff(instants).max())
         return int(lateness.min()), hold, int(first_steps[lateness.argmin()])
 
-    def chirps(self, share: float, hold: int, phase: int, deadline: float) -> _Runs:
+    def chirps(
+        self, share: float, hold: int, phase: int, steps: _StepCount, last_step: int
+    ) -> _Runs:
         """Run chirps with three pairs of gains, and with another armature where it can be set.
 
         Args:
             share: Share of the gains.
             hold: Steps that the simulator holds a command for.
             phase: Instant of a hold's first step.
-            deadline: `_Runs.deadline` [s].
+            steps: `_Runs.steps`.
+            last_step: `_Runs.last_step`.
         """
         links = links_of(self._robot, self._joint.name)
         index = links.joints.index(self._joint.name)
@@ -567,7 +602,8 @@ class _Bench:
             timestep=self._step,
             inertia=inertia,
             gravity=(gravity_at_zero, gravity_at_quarter),
-            deadline=deadline,
+            steps=steps,
+            last_step=last_step,
         )
 
     def _run(self, command: Array, values: Values) -> Array:
@@ -657,6 +693,7 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
     kept_speed = 1.0 - gain * total_damping
     step_spring = gain * step_spring
     step_damping = gain * step_damping
+    runs.steps.add(iterations * len(command))
     has_gravity = bool(np.any(runs.gravity))
     cosine = gain * gravity * runs.gravity[0]
     sine = gain * gravity * runs.gravity[1]
@@ -692,7 +729,7 @@ def _simulated(runs: _Runs, law: ActingLaw, theta: Array) -> Array:
 
 
 class _FitEndError(Exception):
-    """A fit ends before it has converged: its time is over, or its simulation diverges."""
+    """A fit ends before it has converged: its steps are over, or its simulation diverges."""
 
 
 def _fit_law(
@@ -732,7 +769,7 @@ def _fit_law(
             if square < least_square:
                 least_square = square
                 best_values = values.copy()
-            if runs.late:
+            if runs.exhausted:
                 raise _FitEndError
         return latest[key]
 
@@ -797,7 +834,7 @@ def _best_laws(runs: _Runs, delay: int, stated: DriveLaw, armature_settable: boo
         is_plain = any(candidate.law.moves_as(ActingLaw(drive=drive)) for drive in plain_laws)
         if is_far and not is_stated and not (undamped and is_plain):
             continue
-        if finals and runs.late:
+        if finals and runs.exhausted:
             break
         fit = _fit_law(runs, candidate.law, candidate.theta, fixed, _FINAL_EVALUATIONS)
         if is_far:
@@ -837,7 +874,7 @@ def _alike(ranking: Sequence[_Fit]) -> tuple[ActingLaw, ...]:
 def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
     """Fit the laws to the runs with few simulations, the quick ones first.
 
-    The fits end with a law that leaves nothing, or at the deadline.
+    The fits end with a law that leaves nothing, or with the last step.
     """
     explicit = DriveLaw()
     implicit_damping = DriveLaw(kind="implicit_damping")
@@ -858,7 +895,7 @@ def _screened(runs: _Runs, delay: int, fixed: Sequence[str]) -> list[_Fit]:
             quick.append(ActingLaw(drive=explicit, stale_position=age, stale_speed=age))
         quick.append(ActingLaw(drive=implicit_damping, stale_position=1))
         for law in quick:
-            if runs.late:
+            if fits and runs.exhausted:
                 return fits
             fits.append(
                 _screened_law(runs, replace(law, soft_friction=soft), friction_start, delay, fixed)
@@ -907,7 +944,7 @@ def _screen_iterations(
     previous: _Fit | None = None
     rises = 0
     for iterations in _ITERATIONS:
-        if runs.late:
+        if runs.exhausted:
             return
         fit = fit_iterations(iterations, start if previous is None else previous.theta)
         # The residual has one minimum over the iterations.
@@ -927,7 +964,7 @@ def _screen_iterations(
     if by_iterations[best].residual > least_residual:
         return
     for iterations in range(max(best - 2, 1), best + 3):
-        if iterations not in by_iterations and not runs.late:
+        if iterations not in by_iterations and not runs.exhausted:
             fit_iterations(iterations, by_iterations[best].theta)
 
 
@@ -993,12 +1030,19 @@ def _faults(
         )
     elif clip is not None:
         faults["clipped"] = f"the command is clipped at {probe.law.clip:.3g} rad about the pose"
-    if probe.residual > _LARGE_RESIDUAL:
-        faults["residual"] = (
-            f"{100.0 * probe.residual:.1f} % of the motion is not explained: the joint follows "
-            "none of the laws, or others move with it"
+    if not probe.complete:
+        faults["incomplete"] = (
+            f"the fits ended after {runs.steps.simulated:,} integration steps, before all laws "
+            "were fitted: the law may be another, and with it what acts"
         )
-        # What a law says that does not explain the motion is no finding.
+    if probe.residual > _LARGE_RESIDUAL:
+        unexplained = f"{100.0 * probe.residual:.1f} % of the motion is not explained"
+        if probe.complete:
+            unexplained += ": the joint follows none of the laws, or others move with it"
+        faults["residual"] = unexplained
+    if faults.keys() & {"incomplete", "residual"}:
+        # What a law says that does not explain the motion, or may not be the best one, is no
+        # finding.
         return faults
     labels = [law.label]
     for other in probe.alike:
