@@ -18,8 +18,12 @@ def children_of(pid: int) -> dict[int, str]:
     children = {}
     # Each thread has a list of its own.
     for listed in Path(f"/proc/{pid}/task").glob("*/children"):
+        words: list[str] = []
         with contextlib.suppress(OSError):
-            for word in listed.read_text().split():
+            words = listed.read_text().split()
+        for word in words:
+            # A child may end in between.
+            with contextlib.suppress(OSError):
                 command = Path(f"/proc/{word}/cmdline").read_bytes()
                 children[int(word)] = command.replace(b"\0", b" ").decode(errors="replace")
     return children

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,7 +63,11 @@ def cluster() -> Iterator[Any]:
 
 
 class NodeKiller:
-    """Kills a node that trains as soon as a checkpoint of that training is at home."""
+    """Kills a node that trains as soon as a checkpoint of that training is at home.
+
+    A thread stops the first training that has written a checkpoint (SIGSTOP), so that it cannot end
+    before its checkpoint is at home, however slow the machine is.
+    """
 
     def __init__(self, root: Path, cluster: Any) -> None:
         self.root = root
@@ -70,22 +77,54 @@ class NodeKiller:
         self.attempts = 0
         self.seen: set[str] = set()
         """Commands of all processes that ran below the nodes, for the message of a failure."""
+        self._node: Any = None
+        """Node whose training is stopped."""
+        self._process = 0
+        """Number of the process that is stopped."""
+        self._folder = ""
+        self._is_over = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> NodeKiller:
+        self._watcher.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._is_over.set()
+        self._watcher.join()
+        if self._node is not None and not self.lost:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._process, signal.SIGCONT)
 
     def __call__(self, progress: StudyProgress) -> None:
         for status in progress.tasks:
             self.attempts = max(self.attempts, status.attempts)
-        if self.lost:
+        if self.lost or self._node is None:
             return
-        saved = {path.parent.name for path in self.root.rglob("model_*.pt")}
-        for node in self.cluster.worker_nodes:
-            raylet = node.all_processes["raylet"][0].process.pid
-            commands = descendants_of(raylet).values()
-            self.seen.update(commands)
-            for folder in saved:
-                if any(f"/{folder} " in f"{command} " for command in commands):
-                    self.lost = folder
-                    self.cluster.remove_node(node, allow_graceful=False)
-                    return
+        if any(self.root.rglob(f"{self._folder}/model_*.pt")):
+            self.lost = self._folder
+            self.cluster.remove_node(self._node, allow_graceful=False)
+            # With a machine its processes are gone too.
+            os.kill(self._process, signal.SIGKILL)
+
+    def _watch(self) -> None:
+        while self._node is None and not self._is_over.wait(0.1):
+            for node in list(self.cluster.worker_nodes):
+                self._stop_training_of(node)
+
+    def _stop_training_of(self, node: Any) -> None:
+        """Stop a training on a node if it has written a checkpoint and none is stopped yet."""
+        raylet = node.all_processes["raylet"][0].process.pid
+        for process, command in descendants_of(raylet).items():
+            self.seen.add(command)
+            # A task's process works in a folder of its own.
+            for checkpoint in Path(f"/proc/{process}/cwd").glob("trainings/*/*/model_*.pt"):
+                folder = checkpoint.parent.name
+                if self._node is None and f"/{folder} " in f"{command} ":
+                    os.kill(process, signal.SIGSTOP)
+                    self._folder = folder
+                    self._process = process
+                    self._node = node
 
 
 def test_failures_on_nodes_are_named_with_their_log(cluster: Any, tmp_path: Path) -> None:
@@ -108,12 +147,14 @@ def test_a_study_survives_the_loss_of_a_node(cluster: Any, tmp_path: Path) -> No
     plan = plan_study(load_study(path), tmp_path, {"nominal": arm})
     root = tmp_path / "out"
     tasks = study_tasks(plan, root, TrainingPlace(device="cpu"))
-    killer = NodeKiller(root, cluster)
-    with ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor:
+    with (
+        ray_executor(root, cluster.address, per_gpu=1, say=lambda text: None) as executor,
+        NodeKiller(root, cluster) as killer,
+    ):
         statuses = run_tasks(tasks, executor, root, report=killer)
+    assert {status.state for status in statuses.values()} == {"done"}, statuses
     assert killer.lost, f"no node was killed in flight; processes: {sorted(killer.seen)}"
     assert killer.attempts == 2
-    assert {status.state for status in statuses.values()} == {"done"}
     sessions = {}
     for seed in (1, 2):
         folder = root / "trainings" / "nominal" / f"seed-{seed}"
