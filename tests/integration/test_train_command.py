@@ -95,6 +95,49 @@ def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
         run_training(TrainSettings(task="walk", out=tmp_path, resume=True))
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("settings",), []),
+        (("settings", "phase"), "walk=4"),
+        (("settings", "envs"), "many"),
+        (("settings", "task"), None),
+        (("gains",), "matched"),
+        (("gains", "sha256"), 5),
+        (("recipe",), ["walk_speed.yaml"]),
+        (("recipe",), {"sha256": "", "task": 0.5}),
+        (("finished",), "yes"),
+        (("sessions",), [{}]),
+        (("sessions",), {}),
+    ],
+)
+def test_a_record_with_a_value_of_another_type_is_refused(
+    tmp_path: Path, place: tuple[str, ...], value: Any
+) -> None:
+    settings = TrainSettings(task="walk", out=tmp_path, gains="naive").completed()
+    record: dict[str, Any] = {
+        "schema": "pronk/run/2",
+        "settings": settings.stored_values(),
+        "gains": {"name": "naive", "file": None, "sha256": "", "virtual": False, "unmatched": {}},
+        "recipe": None,
+        "start_sha256": "",
+        "phases": {},
+        "finished": False,
+        "sessions": [],
+    }
+    folder = RunFolder(tmp_path)
+    folder.write(record)
+    assert folder.read() == record
+    target = record
+    for name in place[:-1]:
+        target = target[name]
+    target[place[-1]] = value
+    folder.write(record)
+    text = refused("train", "walk", "--resume", "--out", tmp_path)
+    assert "provenance.json" in text
+    assert place[0] in text
+
+
 def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
     first = TrainSettings(task="all", out=tmp_path, gains="naive", phase=("walk=7",), seed=0)
     stored = first.completed().stored_values()

@@ -25,6 +25,7 @@ from pronk.cli import main as cli
 from pronk.files import sha256
 from pronk.jump.train.phases import PHASES, TASKS
 from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.recipe import load_recipe
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import PronkRunner, mean_log
 from pronk.policy.runtime import load_policy
@@ -206,7 +207,7 @@ def test_a_jump_does_not_begin_with_a_policy_of_other_actions(
     start = RunFolder(tmp_path / "start")
     start.path.mkdir()
     shutil.copyfile(finished_run.path / "walk.pt", start.path / "walk.pt")
-    start.write(finished_run.read() | {"recipe": {"task": {"action_scale": 0.42}}})
+    start.write(finished_run.read() | {"recipe": load_recipe(recipe).record()})
     out = tmp_path / "jump"
     words = ("jump", "--gains", "naive", *SMALL, "--out", out, "--init-checkpoint")
     assert train(*words, finished_run.path, "--recipe", recipe) == 2

@@ -22,12 +22,13 @@ from mjlab.envs import ManagerBasedRlEnv
 from tensordict import TensorDict
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.jump.train.gains import training_gains
+from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import SCHEMA, RunFolder
 from pronk.jump.train.recipe import apply_recipe, load_recipe
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import contract_for, export_policy
+from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
 from pronk.jump.trial.jumps import JumpRules, measure_jump
 from pronk.jump.trial.protocol import Case
@@ -182,6 +183,29 @@ def test_an_environment_of_training_is_refused() -> None:
 # --- The policy under evaluation ----------------------------------------------------------------
 
 
+def write_record(
+    folder: RunFolder,
+    gains: TrainingGains,
+    draws: DrawSettings | None = None,
+    recipe: dict[str, Any] | None = None,
+) -> None:
+    """Write the record of a run that is finished."""
+    settings = TrainSettings(task="all", out=folder.path, gains="gains.yaml")
+    if draws is not None:
+        settings = replace(settings, draws=draws)
+    record = {
+        "schema": SCHEMA,
+        "settings": settings.completed().stored_values(),
+        "gains": {"name": gains.name, "file": None, "sha256": gains.sha256, "virtual": False},
+        "recipe": recipe,
+        "start_sha256": "",
+        "phases": {},
+        "finished": True,
+        "sessions": [],
+    }
+    folder.write(record)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
@@ -189,8 +213,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     actor = adapter.blank_actor()
     torch.nn.init.normal_(actor.mlp[0].jump_weight)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    gains = {"name": "matched", "sha256": "ab" * 32}
-    folder.write({"schema": SCHEMA, "settings": {"robot": "mini_cheetah"}, "gains": gains})
+    naive = training_gains("naive", ROBOT)
+    write_record(folder, replace(naive, name="matched", sha256="ab" * 32))
     state: dict[str, Any] = {"iter": 7, "infos": {}}
     for key in (*checkpoint.NETWORKS, *checkpoint.OPTIMIZERS):
         state[key] = {}
@@ -269,9 +293,7 @@ def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
     gains = training_gains(file / "shipped.yaml", ROBOT, by_joint=True)
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
-    settings = {"robot": "mini_cheetah", "by_joint": True, "weakest_drive": 0.7}
-    recorded = {"name": "matched", "sha256": gains.sha256}
-    folder.write({"schema": SCHEMA, "settings": settings, "gains": recorded})
+    write_record(folder, gains, draws=DrawSettings(by_joint=True, weakest_drive=0.7))
     shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
     cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
     provenance = {"by_joint": True, "weakest_drive": 0.7}
@@ -284,8 +306,11 @@ def test_a_policy_is_evaluated_with_the_drives_that_it_was_trained_with(
     plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
     evaluation = adapter.run_evaluation(policy, gains, plan, device="cpu")
     assert evaluation.about["by_joint"] is True
+    assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is False
     # A policy of which nothing is recorded is evaluated by group.
-    assert adapter.load_evaluated_policy(trained[0], "cpu").draws.by_joint is None
+    (tmp_path / "alone").mkdir()
+    shutil.copyfile(trained[0] / "model_7.pt", tmp_path / "alone" / "model_7.pt")
+    assert adapter.load_evaluated_policy(tmp_path / "alone", "cpu").draws.by_joint is None
 
 
 def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recipe(
@@ -299,13 +324,7 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     recipe.write_text(f"schema: pronk/recipe/1\ntask: {numbers}\n")
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
-    record = {
-        "schema": SCHEMA,
-        "settings": {"robot": "mini_cheetah"},
-        "gains": {"name": "naive"},
-        "recipe": load_recipe(recipe).record(),
-    }
-    folder.write(record)
+    write_record(folder, gains, recipe=load_recipe(recipe).record())
     shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
     cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
     apply_recipe(cfg, load_recipe(recipe))

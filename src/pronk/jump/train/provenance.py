@@ -22,6 +22,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
@@ -29,6 +31,59 @@ from pronk.jump.train.versions import package_versions
 from pronk.robots import ROBOT_NAMES
 
 SCHEMA = "pronk/run/2"
+
+
+class StoredSettings(msgspec.Struct, kw_only=True):
+    """Types of `TrainSettings.stored_values`; what earlier versions lack has a default."""
+
+    task: str
+    robot: str
+    gains: str
+    ranges_from: str | None
+    init_checkpoint: str | None
+    envs: int
+    seed: int
+    ellipsoid: bool
+    phase: list[str]
+    by_joint: bool = False
+    weakest_drive: float = 1.0
+    recipe: str | list[str] | None = None
+    allow_unmatched: bool = False
+
+
+class StoredGains(msgspec.Struct, kw_only=True):
+    """Types of what is recorded of the gains."""
+
+    name: str
+    file: str | None
+    sha256: str
+    virtual: bool
+    unmatched: dict[str, list[str]] = {}
+
+
+class StoredRecipe(msgspec.Struct, kw_only=True):
+    """Types of what is read of a recipe's record."""
+
+    sha256: str
+    task: dict[str, Any] = {}
+
+
+class StoredSession(msgspec.Struct, kw_only=True):
+    """Types of what is read of a session's record."""
+
+    versions: dict[str, str | None]
+
+
+class StoredRun(msgspec.Struct, kw_only=True):
+    """Types of what is read of a run's record; it may hold more."""
+
+    settings: StoredSettings
+    gains: StoredGains
+    start_sha256: str
+    phases: dict[str, Any]
+    finished: bool
+    sessions: list[StoredSession]
+    recipe: StoredRecipe | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +168,13 @@ class RunFolder:
         schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
         if schema != SCHEMA:
             raise ArtefactError(f"{path}: schema {schema!r}; this pronk reads {SCHEMA!r}.")
+        try:
+            msgspec.convert(record, StoredRun)
+        except msgspec.ValidationError as error:
+            raise ArtefactError(
+                f"{path}: {error}; it was changed since pronk wrote it: put it back, or begin a "
+                "new run."
+            ) from None
         return record
 
     def write(self, record: dict[str, Any]) -> None:
