@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.runner import finish, in_parallel
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.identify.simulators.probe import probe_joint
+from pronk.identify.simulators.probe.probe import probe_joint
 from pronk.tables import Cell, Column, Table
 from tests.drawn_simulator import ENGINES, FAULTS, DrawnSimulator, draw_truth, score
 

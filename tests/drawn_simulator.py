@@ -14,7 +14,7 @@ from pronk.identify.simulators.factory import simulator_factory
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.mujoco import Chain
-from pronk.identify.simulators.probe import Probe
+from pronk.identify.simulators.probe.result import Probe
 from pronk.robots import load_robot
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import RobotSpec

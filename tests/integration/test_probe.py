@@ -14,7 +14,8 @@ import pytest
 from command_line import accepted, refused
 from drawn_simulator import ENGINES, ROBOTS, DrawnSimulator, Truth, draw_truth, score
 from pronk.errors import PronkError
-from pronk.identify.simulators.probe import Probe, probe_joint
+from pronk.identify.simulators.probe.probe import probe_joint
+from pronk.identify.simulators.probe.result import Probe
 from pronk.robots import load_robot
 from pronk.robots.drive_law import DriveLaw
 

@@ -14,7 +14,8 @@ from command_line import refused
 from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.identify.simulators.info import SimulatorInfo
-from pronk.identify.simulators.probe import Probe, probe_joint
+from pronk.identify.simulators.probe.probe import probe_joint
+from pronk.identify.simulators.probe.result import Probe
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 

@@ -99,7 +99,7 @@ def probe_simulator(
 ) -> console.Outcome:
     """Excite one joint of a simulator, and print what acts beside what is set."""
     from pronk.identify.simulators.load import load_simulator
-    from pronk.identify.simulators.probe import probe_joint
+    from pronk.identify.simulators.probe.probe import probe_joint
     from pronk.robots import load_robot
 
     robot_spec = load_robot(robot)

@@ -1,0 +1,1 @@
+"""Name how a simulator drives a joint, from the response of the joint alone."""
