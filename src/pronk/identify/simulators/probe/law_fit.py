@@ -105,10 +105,9 @@ class LawFit:
     residual: float
     """RMS of what is not explained, as a share of the motion."""
 
-    @property
-    def delay_steps(self) -> float:
-        """Delay of the command [steps]."""
-        return float(self.theta[PARAMETERS.index("delay")])
+    def value(self, name: str) -> float:
+        """Return the parameter of a name of `PARAMETERS`."""
+        return float(self.theta[PARAMETERS.index(name)])
 
 
 def simulate_law(runs: ProbeRuns, law: ActingLaw, theta: Array) -> Array:

@@ -64,7 +64,7 @@ def best_laws(
         is_stated = candidate.law.moves_as(ActingLaw(drive=stated))
         is_far = finals and candidate.residual > _FAR * max(finals[0].residual, _SAME_RESIDUAL)
         # Where no damping acts, explicit and implicit damping are the same.
-        undamped = len(finals) > 0 and finals[0].theta[0] < _NO_DAMPING
+        undamped = len(finals) > 0 and finals[0].value("damping") < _NO_DAMPING
         is_plain = any(candidate.law.moves_as(ActingLaw(drive=drive)) for drive in plain_laws)
         if is_far and not is_stated and not (undamped and is_plain):
             continue
@@ -118,7 +118,7 @@ def _screened(runs: ProbeRuns, delay: int, fixed: Sequence[str]) -> list[LawFit]
         if soft:
             # Whether friction is soft shows where there is some.
             best = min(fits, key=lambda fit: fit.residual)
-            if best.theta[3] <= 0.002 * runs.torque or best.residual < 1e-5:
+            if best.value("friction") <= 0.002 * runs.torque or best.residual < 1e-5:
                 break
             friction_start = best.theta
         quick = [ActingLaw(drive=explicit), ActingLaw(drive=implicit_damping)]
@@ -225,8 +225,8 @@ def gain_scale(runs: ProbeRuns, fit: LawFit, armature_settable: bool) -> float:
 
     A factor with a usual cause is taken unless another one explains both.
     """
-    applied = float(fit.theta[5])
-    gravity = float(fit.theta[6])
+    applied = fit.value("applied")
+    gravity = fit.value("gravity")
     shares = []
     if armature_settable:
         shares.append(applied)

@@ -92,7 +92,7 @@ def probe_joint(
             f"chirps of {bench.amplitude:.2g} rad; check friction and limits of the simulator."
         )
     answer = min(answers, key=lambda candidate: candidate.doubt)
-    damping, inertia, viscous, friction, delay_steps, applied, gravity = answer.fit.theta.tolist()
+    fit = answer.fit
     scale = answer.scale
     limit = None
     if clip is not None:
@@ -101,20 +101,20 @@ def probe_joint(
         clip = None
     probe = Probe(
         joint=joint,
-        law=replace(answer.fit.law, clip=limit),
+        law=replace(fit.law, clip=limit),
         gains=ActingGains(
             stiffness_factor=scale,
-            damping_factor=scale * damping,
+            damping_factor=scale * fit.value("damping"),
             stable_share=stable_share,
         ),
-        armature=scale * inertia - answer.runs.inertia,
-        armature_applied=scale * applied if bench.armature_settable else None,
-        viscous_damping=scale * viscous,
-        frictionloss=scale * friction,
-        gravity=scale * gravity,
-        delay_s=delay_steps * answer.runs.timestep,
+        armature=scale * fit.value("inertia") - answer.runs.inertia,
+        armature_applied=scale * fit.value("applied") if bench.armature_settable else None,
+        viscous_damping=scale * fit.value("viscous"),
+        frictionloss=scale * fit.value("friction"),
+        gravity=scale * fit.value("gravity"),
+        delay_s=fit.value("delay") * answer.runs.timestep,
         hold=answer.hold,
-        residual=answer.fit.residual,
+        residual=fit.residual,
         complete=answer.complete,
         alike=answer.alike,
     )
@@ -213,7 +213,7 @@ def _fault_limit(clip: Clip, answer: _Answer, joint: Joint, stable_share: float)
     if not clip.of_torque:
         return clip.height
     # In its first step a command acts for the share of the step that the delay leaves.
-    delay_steps = answer.fit.delay_steps
+    delay_steps = answer.fit.value("delay")
     acting = 1.0 - (delay_steps - math.floor(delay_steps + 1e-3))
     if acting < 1.0 / (SHORT_FIRST_STEP - 2.0):
         acting = 1.0
