@@ -94,6 +94,35 @@ def test_a_joint_that_does_not_move_is_refused() -> None:
         probe_joint(DrawnSimulator(without_joints), FAULTLESS.robot)
 
 
+@pytest.mark.parametrize(
+    ("timestep_s", "iterations", "armature_acts"), [(0.002, 10, True), (0.005, 4, False)]
+)
+def test_less_torque_near_the_no_load_speed_is_no_fault(
+    timestep_s: float, iterations: int, armature_acts: bool
+) -> None:
+    """With half its damping this knee would turn at its no-load speed in resonance."""
+    law = DriveLaw(kind="implicit", iterations=iterations)
+    mini_cheetah = replace(load_robot("mini_cheetah"), timestep_s=timestep_s)
+    knee = mini_cheetah.joint("FR_knee")
+    drive = replace(knee.drive, rotor_inertia=4.3e-5)
+    knee = replace(knee, drive=drive, stiffness=20.0, damping=0.21)
+    joints = [knee if joint.name == knee.name else joint for joint in mini_cheetah.joints]
+    truth = Truth(
+        kind="mujoco",
+        robot=replace(mini_cheetah, joints=tuple(joints)),
+        joint="FR_knee",
+        law=law,
+        stated=law,
+        armature=knee.drive.armature if armature_acts else 0.0,
+        frictionloss=0.2,
+        delay_s=0.0,
+        hold=1,
+        scale=1.0,
+        fault="" if armature_acts else "ignored",
+    )
+    assert_named_as_drawn(truth)
+
+
 @pytest.mark.slow
 def test_random_simulators_are_named() -> None:
     engines = ["numpy", "mujoco"]

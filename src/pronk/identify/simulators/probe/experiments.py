@@ -31,6 +31,14 @@ _CLIPPED_SLOPE = 0.3
 """Share of its greatest growth with the height of a step below which the motion is clipped."""
 _DAMPED_SHARE = 0.3
 """What the drive itself takes from the motion of the second step, about, over that of the first."""
+_MOST_SPEED = 0.6
+"""Largest speed of the joint over the drive's no-load speed."""
+_FEWEST_HEIGHTS = 6
+"""Fewest heights of a step in which a limit is looked for."""
+_SLOWER_RUNS = 3
+"""Most repetitions of chirps with smaller amplitudes."""
+_LEAST_CHANGE = 0.25
+"""Smallest factor on the amplitude from one repetition to the next: faster motion diverges."""
 SHORT_FIRST_STEP = 5.0
 """Motion after two steps over that after one from which on a command acts for less than a third of
 the first one; it is 3 where it acts for all of it."""
@@ -105,6 +113,14 @@ class Bench:
         elif after_one > 0.0:
             # Without damping after_two / after_one is 2 + 1 / acting; damping takes some of it.
             acting = min(1.0, 1.0 / max(after_two / after_one - 2.0 + _DAMPED_SHARE, 1.0))
+        # Near its no-load speed a drive has less torque, which is no limit below the effort limit.
+        speed = (both_sides[:, first + 1] - both_sides[:, first]) / self._step
+        is_fast = np.abs(speed) > _MOST_SPEED * self._joint.drive.no_load_speed
+        slow = int(is_fast.argmax()) if is_fast.any() else len(heights)
+        if slow < _FEWEST_HEIGHTS:
+            return None
+        heights = heights[:slow]
+        reach = reach[:slow]
         slope = np.diff(reach) / np.diff(heights)
         steepest = int(slope.argmax())
         if slope[steepest] <= 0.0 or slope[-1] > _CLIPPED_SLOPE * slope[steepest]:
@@ -186,7 +202,6 @@ class Bench:
         index = links.joints.index(self._joint.name)
         pose = np.array([self._robot.joint(name).default_position for name in links.joints])
         inertia = links.inertia_about(index, pose)
-        armature = self._joint.drive.armature
         stiffness = self._joint.stiffness * share * np.array([1.0, 1.0, 0.5])
         damping = self._joint.damping * share * np.array([1.0, 0.5, 0.5])
         armature_change = np.zeros(3)
@@ -194,13 +209,13 @@ class Bench:
         if self.armature_settable:
             stiffness = np.append(stiffness, stiffness[0])
             damping = np.append(damping, damping[0])
+            armature = self._joint.drive.armature
             armature_change = np.append(armature_change, armature + 0.5 * inertia)
             values["armature"] = armature + armature_change
         values["stiffness"] = stiffness
         values["damping"] = damping
         runs = len(stiffness)
-        command = np.tile(self._chirp(), (runs, 1))
-        position = self._run(command, values)
+        command, position = self._slow_enough(values, runs)
         step = np.arange(command.shape[1])
         read_step = np.maximum((step - phase) // hold * hold + phase, 0)
         held_command = command[0, np.minimum(read_step, step)] + self._joint.default_position
@@ -208,6 +223,11 @@ class Bench:
         gravity_at_zero = float(links.gravity_torque(pose)[index])
         pose[index] = 0.5 * np.pi
         gravity_at_quarter = float(links.gravity_torque(pose)[index])
+        drive = self._joint.drive
+        set_inertia = inertia + drive.armature
+        set_values = np.array(
+            [1.0, set_inertia, drive.viscous_damping, drive.frictionloss, 0.0, 1.0, 1.0]
+        )
         return ProbeRuns(
             command=np.tile(held_command[:, None], (1, runs)),
             position=position.T,
@@ -217,9 +237,36 @@ class Bench:
             timestep=self._step,
             inertia=inertia,
             gravity=(gravity_at_zero, gravity_at_quarter),
+            set_values=set_values,
             steps=steps,
             last_step=last_step,
         )
+
+    def _slow_enough(self, values: Values, runs: int) -> tuple[Array, Array]:
+        """Run chirps whose motion is slow enough for the torque that they need.
+
+        A drive near its no-load speed has less torque than its gains command, at resonance already
+        with small commands.
+
+        Args:
+            values: Gains and armature of each run.
+            runs: Number of runs.
+
+        Returns:
+            Commands about the pose and positions [rad], shape (B, T).
+        """
+        highest_speed = _MOST_SPEED * self._joint.drive.no_load_speed
+        command = np.tile(self._chirp(), (runs, 1))
+        position = self._run(command, values)
+        for _ in range(_SLOWER_RUNS):
+            with np.errstate(all="ignore"):
+                speed = float(np.abs(np.diff(position, axis=1)).max()) / self._step
+            if not speed > highest_speed:
+                break
+            self.lower_amplitude(self.amplitude * max(highest_speed / speed, _LEAST_CHANGE))
+            command = np.tile(self._chirp(), (runs, 1))
+            position = self._run(command, values)
+        return command, position
 
     def _run(self, command: Array, values: Values) -> Array:
         """Return positions of the joint [rad], with commands about the pose, both (B, T)."""

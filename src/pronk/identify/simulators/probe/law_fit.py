@@ -68,6 +68,8 @@ class ProbeRuns:
     """Inertia of the links about the joint [kg m^2]."""
     gravity: tuple[float, float]
     """Torque of gravity, `gravity[0] cos q + gravity[1] sin q` [N m]."""
+    set_values: Array
+    """`PARAMETERS` if all acts as it is set and nothing is late, shape (7,)."""
     steps: StepCount
     """Integration steps of the fits, those to all runs of the probe."""
     last_step: int

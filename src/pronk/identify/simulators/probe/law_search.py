@@ -12,7 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from pronk.arrays import Array
-from pronk.identify.simulators.probe.law_fit import LawFit, ProbeRuns, fit_law, simulate_law
+from pronk.identify.simulators.probe.law_fit import (
+    PARAMETERS,
+    LawFit,
+    ProbeRuns,
+    fit_law,
+    simulate_law,
+)
 from pronk.identify.simulators.probe.result import ActingLaw
 from pronk.robots.drive_law import DriveLaw
 
@@ -35,7 +41,9 @@ _NO_DAMPING = 1e-3
 """Damping that acts over the one that is set below which there is none."""
 _SAME_RESIDUAL = 1e-7
 """Residual below which laws are told apart by nothing but rounding."""
-_EXACT_RESIDUAL = 1e-6
+_NEAR_RESIDUAL = 0.05
+"""Residual of a law below which the kind of its friction may be all that is wrong."""
+EXACT_RESIDUAL = 1e-6
 """Residual of a law that is certainly right: no other is tried."""
 
 
@@ -51,7 +59,16 @@ def best_laws(
         armature_settable: True if the armature was changed in one run.
     """
     fixed = [] if armature_settable else ["applied"]
-    candidates = _screened(runs, delay, fixed)
+    candidates = _as_set(runs, delay, stated, fixed)
+    if candidates[-1].residual < EXACT_RESIDUAL:
+        # These two move alike where no damping acts.
+        soft = candidates[-1].law.soft_friction
+        for law in (DriveLaw(), DriveLaw(kind="implicit_damping")):
+            acting_law = ActingLaw(drive=law, soft_friction=soft)
+            if not acting_law.moves_as(candidates[-1].law):
+                candidates.append(_screened_law(runs, acting_law, None, delay, fixed))
+    else:
+        candidates += _screened(runs, delay, fixed)
     candidates.sort(key=lambda fit: fit.residual)
     # The stated law too, which is the answer where others explain the motion no better.
     tried = candidates[:3]
@@ -105,6 +122,19 @@ def alike_laws(ranking: Sequence[LawFit]) -> tuple[ActingLaw, ...]:
     return tuple(laws)
 
 
+def _as_set(runs: ProbeRuns, delay: int, stated: DriveLaw, fixed: Sequence[str]) -> list[LawFit]:
+    """Fit the stated law from what is set, with soft friction too where it leaves something."""
+    fits: list[LawFit] = []
+    start = runs.set_values.copy()
+    start[PARAMETERS.index("delay")] = delay
+    for soft in (False, True):
+        law = ActingLaw(drive=stated, soft_friction=soft)
+        fits.append(fit_law(runs, law, start, fixed, _SCREENING_EVALUATIONS))
+        if not EXACT_RESIDUAL < fits[-1].residual < _NEAR_RESIDUAL:
+            break
+    return fits
+
+
 def _screened(runs: ProbeRuns, delay: int, fixed: Sequence[str]) -> list[LawFit]:
     """Fit the laws to the runs with few simulations, the quick ones first.
 
@@ -134,11 +164,11 @@ def _screened(runs: ProbeRuns, delay: int, fixed: Sequence[str]) -> list[LawFit]
             fits.append(
                 _screened_law(runs, replace(law, soft_friction=soft), friction_start, delay, fixed)
             )
-        if min(fit.residual for fit in fits) < _EXACT_RESIDUAL:
+        if min(fit.residual for fit in fits) < EXACT_RESIDUAL:
             return fits
         for beside in (False, True):
             _screen_iterations(runs, fits, (beside, soft), friction_start, delay, fixed)
-            if min(fit.residual for fit in fits) < _EXACT_RESIDUAL:
+            if min(fit.residual for fit in fits) < EXACT_RESIDUAL:
                 return fits
     return fits
 
@@ -189,7 +219,7 @@ def _screen_iterations(
         least_residual = min(other.residual for other in fits)
         if rises == 2 or (iterations >= 4 and fit.residual > _FAR * least_residual):
             break
-        if least_residual < _EXACT_RESIDUAL:
+        if least_residual < EXACT_RESIDUAL:
             return
         previous = fit
     # Numbers between those of the list: 5 beside 4 and 6.
