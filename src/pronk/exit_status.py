@@ -13,8 +13,9 @@ class ExitStatus(IntEnum):
     DEFECT = 1
     """An error that pronk does not expect: a defect of pronk."""
     REFUSED = 2
-    """The input was refused, or the machine could not do it: a full disk, a closed output, too
-    little memory. One sentence on standard error says why."""
+    """The input was refused, the machine could not do it (a full disk, a closed output, too little
+    memory), or a Python file of the user's raised an exception. One sentence on standard error says
+    why."""
     NOT_BETTER = 3
     """`match`: every joint was matched, and at least one is no better on what was held out of the
     fit than less fitting. The files are written."""

@@ -221,6 +221,40 @@ def test_a_robot_with_its_own_task(tmp_path: Path) -> None:
             load_task(robot)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        # mjlab's own pushes have this parameter.
+        (
+            'cfg.events["push"].params["velocity_range"] = {"x": (-0.5, 0.5)}',
+            ["events['push']", "velocity_range", "yaw_rate"],
+        ),
+        ('del cfg.rewards["posture"].params["standing"]', ["rewards['posture']", "standing"]),
+        ('cfg.terminations["fell"].func = "fall"', ["terminations['fell']", "str"]),
+        ('cfg.rewards["height"].weight = 2.0', ["KeyError", "height", "line 6"]),
+        (
+            'cfg.rewards["posture"] = type(cfg.rewards["posture"])(func=broken, weight=1.0)',
+            ["ZeroDivisionError", "line 10"],
+        ),
+    ],
+)
+def test_mistakes_in_the_task_of_a_robot_are_named_as_such(
+    change: str, words: list[str], tmp_path: Path
+) -> None:
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    shutil.copytree(shipped, tmp_path / "robot")
+    lines = ENV_CFGS.replace('cfg.rewards["posture"].weight = -1.0', change)
+    (tmp_path / "robot" / "env_cfgs.py").write_text(
+        f"{lines}\ndef broken(env):\n    return 1 / 0\n"
+    )
+    text = refused(
+        *("train", "walk", *NAIVE, "--robot", tmp_path / "robot" / "robot.yaml"),
+        *("--envs", "2", "--phase", "walk=1", "--device", "cpu", "--out", tmp_path / "run"),
+    )
+    for word in ["env_cfgs.py", *words]:
+        assert word in text, (word, text)
+
+
 def test_the_robot_of_a_run_in_a_study_is_found_from_any_folder(tmp_path: Path) -> None:
     """The run names the copy in the folder of the study, which `evaluate` and --resume look for."""
     shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"

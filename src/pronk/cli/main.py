@@ -1,9 +1,10 @@
 """The command line: each command is a function whose parameters tyro makes into options.
 
 A command that returns an `Outcome` also has the option `--json`. Bad input ends with one sentence
-on standard error and exit status 2, and so does what the machine cannot do. Any other exception is
-a defect of pronk, is named so, and ends with 1 (`PRONK_DEBUG=1` prints the traceback). All exit
-statuses are in `pronk.exit_status`.
+on standard error and exit status 2, and so do what the machine cannot do and an exception of a
+user's own code, whose file and line are named. Any other exception is a defect of pronk, is named
+so, and ends with 1 (`PRONK_DEBUG=1` prints the traceback). All exit statuses are in
+`pronk.exit_status`.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import pkgutil
 import re
 import signal
 import sys
+import sysconfig
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from pronk.errors import PronkError
@@ -116,11 +119,29 @@ def run(
         message = "interrupted."
     except Exception as error:
         status, message = _failure(error)
-        if status == ExitStatus.DEFECT and os.environ.get("PRONK_DEBUG"):
+        if not isinstance(error, PronkError) and os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
     with contextlib.suppress(OSError):  # Standard error may be closed or full as well.
         print(f"pronk: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
     return status
+
+
+def _foreign_place(error: Exception) -> str:
+    """Return the file and line in which an error was raised if that code is a user's own.
+
+    That is the innermost frame of what is neither installed nor of Python itself, unless it is
+    pronk's.
+    """
+    paths = sysconfig.get_paths()
+    installed = [Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    package = Path(__file__).parents[1]
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.is_relative_to(package):
+            return ""
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in installed):
+            return f"{path}, line {frame.lineno}"
+    return ""
 
 
 def _failure(error: Exception) -> tuple[ExitStatus, str]:
@@ -138,6 +159,12 @@ def _failure(error: Exception) -> tuple[ExitStatus, str]:
         place = f"{error.filename}: " if error.filename else "the output cannot be written: "
         return ExitStatus.REFUSED, (
             f"{place}{error.strerror}; make room or give another place, then run the command again."
+        )
+    place = _foreign_place(error)
+    if place:
+        return ExitStatus.REFUSED, (
+            f"{type(error).__name__}: {error}, raised in {place}, which is not part of pronk; "
+            "PRONK_DEBUG=1 prints how it was called."
         )
     return ExitStatus.DEFECT, (
         f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "

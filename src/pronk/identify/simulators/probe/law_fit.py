@@ -34,18 +34,18 @@ _GRAVITY_SHOWS = 0.002
 class StepCount:
     """Integration steps that were simulated to fit laws, and how many may be."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, limit: int) -> None:
         self.simulated = 0
-        self.most = most
+        self.limit = limit
 
     def add(self, steps: int) -> None:
         """Count steps that were simulated."""
         self.simulated += steps
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Steps that may still be simulated."""
-        return max(self.most - self.simulated, 0)
+        return max(self.limit - self.simulated, 0)
 
 
 @dataclass(frozen=True, kw_only=True)

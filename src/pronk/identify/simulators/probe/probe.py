@@ -155,7 +155,7 @@ def _answers(
                 break
             raise
         # Other shares of the gains need steps as well.
-        last_step = steps.simulated + round(_SHARE_OF_STEPS * steps.left)
+        last_step = steps.simulated + round(_SHARE_OF_STEPS * steps.remaining)
         runs = bench.chirps(share, hold, phase, steps, last_step)
         if runs.motion < 1e-3 * bench.amplitude:
             # Friction, or a defect, holds the joint.
@@ -188,7 +188,7 @@ def _answers(
         elif doubt > CLEAR and share <= stable_share and bench.stable(4.0 * share):
             # Rounding hides by how many iterations laws differ; of larger gains less.
             more_shares = [4.0 * share]
-        shares = more_shares if steps.left else []
+        shares = more_shares if steps.remaining else []
         answers.append(
             _Answer(
                 doubt=doubt,

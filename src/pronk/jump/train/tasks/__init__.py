@@ -27,6 +27,7 @@ from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import PronkRunner
 from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
+from pronk.jump.train.tasks.term_check import check_terms
 from pronk.robots import load_robot, robot_file_path
 from pronk.robots.robot import RobotSpec
 
@@ -65,7 +66,13 @@ def load_task(robot: str) -> Task:
             f"{robot} has no training task: expected {env_file} with a function env_cfg, as "
             f"docs/train-your-robot.md has one, or one of the robots {', '.join(ROBOTS)}."
         )
-    env_cfg = _function(env_file, "env_cfg")
+    make_env_cfg = _function(env_file, "env_cfg")
+
+    def env_cfg(*arguments: Any, **options: Any) -> ManagerBasedRlEnvCfg:
+        cfg: ManagerBasedRlEnvCfg = make_env_cfg(*arguments, **options)
+        check_terms(cfg, env_file)
+        return cfg
+
     rl_cfg = _function(rl_file, "rl_cfg") if rl_file.is_file() else jump_rl_cfg
     return Task(robot=spec, env_cfg=env_cfg, rl_cfg=rl_cfg)
 
