@@ -69,7 +69,7 @@ def best_laws(
                 candidates.append(_screened_law(runs, acting_law, None, delay, fixed))
     else:
         candidates += _screened(runs, delay, fixed)
-    candidates.sort(key=lambda fit: fit.residual)
+    candidates = _best_of_each_law(candidates)
     # The stated law too, which is the answer where others explain the motion no better.
     tried = candidates[:3]
     plain_laws = [stated, DriveLaw(), DriveLaw(kind="implicit_damping")]
@@ -111,13 +111,21 @@ def best_laws(
     return finals
 
 
+def _best_of_each_law(fits: Sequence[LawFit]) -> list[LawFit]:
+    """Return the best fit of each law, the best law first; the stated one was fitted twice."""
+    best: dict[ActingLaw, LawFit] = {}
+    for fit in sorted(fits, key=lambda law_fit: law_fit.residual):
+        best.setdefault(fit.law, fit)
+    return list(best.values())
+
+
 def alike_laws(ranking: Sequence[LawFit]) -> tuple[ActingLaw, ...]:
     """Return the laws but the first that explain the motion as well as the best one."""
     least_residual = min(fit.residual for fit in ranking)
     laws: list[ActingLaw] = []
     for fit in ranking[1:]:
         as_well = fit.residual < max(least_residual / CLEAR, _SAME_RESIDUAL)
-        if as_well and not fit.law.moves_as(ranking[0].law):
+        if as_well and not any(fit.law.moves_as(law) for law in (ranking[0].law, *laws)):
             laws.append(fit.law)
     return tuple(laws)
 
