@@ -12,6 +12,7 @@ import pytest
 
 from command_line import refused
 from pronk.arrays import Array
+from pronk.cli.probe import acting_table
 from pronk.errors import PronkError
 from pronk.identify.simulators.info import SimulatorInfo
 from pronk.identify.simulators.probe.probe import probe_joint
@@ -307,6 +308,13 @@ def test_a_law_that_is_none_of_them_is_said_to_be_so(robot: RobotSpec) -> None:
             moved = positions - command[:, :1]
             return command[:, :1] + np.round(6.0 * moved * np.abs(moved), 2)
 
-    probe = probe_joint(Odd(robot, Truth()), robot, most_steps=FEW_STEPS)
+    simulator = Odd(robot, Truth())
+    probe = probe_joint(simulator, robot, most_steps=FEW_STEPS)
     assert "residual" in probe.faults
     assert not {"law", "stiffness", "damping", "armature"} & set(probe.faults)
+    # Nor are values of the law printed that explains the motion least badly.
+    table = acting_table(probe, robot.joint("swing"), simulator.info)
+    acting = {str(row[0]): row[2] for row in table.rows}
+    assert acting.pop("law") in ("none of the laws", "not found")
+    assert acting.pop("hold [steps]") == 1
+    assert set(acting.values()) == {None}

@@ -16,6 +16,9 @@ from pronk.tables import Cell, Column, Table
 
 if TYPE_CHECKING:
     from pronk.identify.simulators.actuator_network import NetworkDrive
+    from pronk.identify.simulators.info import SimulatorInfo
+    from pronk.identify.simulators.probe.result import Probe
+    from pronk.robots.robot import Joint
 
 _NETWORK_SUFFIXES = (".pt", ".pth", ".jit", ".torchscript")
 """Endings of files that hold a network."""
@@ -105,48 +108,66 @@ def probe_simulator(
     robot_spec = load_robot(robot)
     engine = load_simulator(simulator, robot_spec, threads=1, python=simulator_python)
     result = probe_joint(engine, robot_spec, joint)
-    info = engine.info
-    probed_joint = robot_spec.joint(result.joint)
-    drive = probed_joint.drive
-    acting_law = result.law.label
-    for other in result.alike:
-        acting_law += f" or {other.label}"
-    if "residual" in result.faults:
-        acting_law = "none of the laws"
-    if not result.complete:
-        acting_law = "not found"
-    acting_stiffness = probed_joint.stiffness * result.gains.stiffness_factor
-    acting_damping = probed_joint.damping * result.gains.damping_factor
+    console.show(acting_table(result, robot_spec.joint(result.joint), engine.info))
+    for sentence in result.faults.values():
+        console.warn(f"{result.joint}: {sentence}.")
+    return console.Outcome(figures={"probe": asdict(result)})
+
+
+def acting_table(probe: Probe, joint: Joint, info: SimulatorInfo) -> Table:
+    """Return what acts at a joint beside what is set; of a law that was not found, its hold alone.
+
+    Args:
+        probe: What the joint responds like.
+        joint: The joint with what is set.
+        info: The simulator.
+    """
+    law_name = probe.law.label
+    for other in probe.alike:
+        law_name += f" or {other.label}"
     # Adding 0 makes -0 a 0.
-    viscous_damping = round(result.viscous_damping, 4) + 0.0
-    delay_ms = round(1e3 * result.delay_s, 4) + 0.0
-    table = Table(
-        title=f"{result.joint} in {info.engine} {info.version}",
+    viscous_damping = round(probe.viscous_damping, 4) + 0.0
+    delay_ms = round(1e3 * probe.delay_s, 4) + 0.0
+    acting: list[Cell] = [
+        joint.stiffness * probe.gains.stiffness_factor,
+        joint.damping * probe.gains.damping_factor,
+        probe.armature,
+        viscous_damping,
+        probe.frictionloss,
+        max(probe.gravity, 0.0),
+        delay_ms,
+    ]
+    if "residual" in probe.faults or not probe.complete:
+        # Values of a law that does not explain the motion are no measurement.
+        law_name = "none of the laws" if probe.complete else "not found"
+        acting = [None] * len(acting)
+    drive = joint.drive
+    settings: list[tuple[str, Cell]] = [
+        ("stiffness [N m/rad]", joint.stiffness),
+        ("damping [N m s/rad]", joint.damping),
+        ("armature [kg m^2]", drive.armature),
+        ("passive damping [N m s/rad]", drive.viscous_damping),
+        ("dry friction [N m]", drive.frictionloss),
+        ("gravity [of the model's]", 1.0),
+        ("delay [ms]", 0.0),
+    ]
+    rows: list[tuple[Cell, ...]] = [("law", info.drive_law.label, law_name)]
+    for (name, set_value), acting_value in zip(settings, acting, strict=True):
+        rows.append((name, set_value, acting_value))
+    rows.append(("hold [steps]", 1, probe.hold))
+    return Table(
+        title=f"{probe.joint} in {info.engine} {info.version}",
         columns=(
             Column(heading="of the joint"),
             Column(heading="set", digits=4),
             Column(heading="acts", digits=4),
         ),
-        rows=(
-            ("law", info.drive_law.label, acting_law),
-            ("stiffness [N m/rad]", probed_joint.stiffness, acting_stiffness),
-            ("damping [N m s/rad]", probed_joint.damping, acting_damping),
-            ("armature [kg m^2]", drive.armature, result.armature),
-            ("passive damping [N m s/rad]", drive.viscous_damping, viscous_damping),
-            ("dry friction [N m]", drive.frictionloss, result.frictionloss),
-            ("gravity [of the model's]", 1.0, max(result.gravity, 0.0)),
-            ("delay [ms]", 0.0, delay_ms),
-            ("hold [steps]", 1, result.hold),
-        ),
+        rows=tuple(rows),
         notes=(
-            f"Steps of {1e3 * info.timestep_s:g} ms. {100.0 * result.residual:.2g} % of the "
+            f"Steps of {1e3 * info.timestep_s:g} ms. {100.0 * probe.residual:.2g} % of the "
             "motion is not explained.",
         ),
     )
-    console.show(table)
-    for sentence in result.faults.values():
-        console.warn(f"{result.joint}: {sentence}.")
-    return console.Outcome(figures={"probe": asdict(result)})
 
 
 def probe_network_file(path: Path, options: NetworkOptions) -> console.Outcome:

@@ -88,7 +88,7 @@ class Bench:
 
         Returns:
             The height [rad], and the share of its first step for which the command acts, about;
-            None where the joint always goes further.
+            None where the joint always goes further, until it is near its no-load speed.
         """
         heights = self._highest * np.geomspace(1e-3, 1.0, 24)
         length = _REST + 2 * _LONGEST_HOLD
