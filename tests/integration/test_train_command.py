@@ -19,7 +19,7 @@ from pronk.jump.study.robot_inputs import robot_input
 from pronk.jump.train import devices
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.phases import TASKS
-from pronk.jump.train.provenance import RunFolder
+from pronk.jump.train.provenance import RunFolder, new_record
 from pronk.jump.train.rl.runner import stop_signals
 from pronk.jump.train.run import run_training
 from pronk.jump.train.settings import DrawSettings, TrainSettings
@@ -115,16 +115,7 @@ def test_a_record_with_a_value_of_another_type_is_refused(
     tmp_path: Path, place: tuple[str, ...], value: Any
 ) -> None:
     settings = TrainSettings(task="walk", out=tmp_path, gains="naive").completed()
-    record: dict[str, Any] = {
-        "schema": "pronk/run/2",
-        "settings": settings.stored_values(),
-        "gains": {"name": "naive", "file": None, "sha256": "", "virtual": False, "unmatched": {}},
-        "recipe": None,
-        "start_sha256": "",
-        "phases": {},
-        "finished": False,
-        "sessions": [],
-    }
+    record = new_record(settings, training_gains("naive", load_robot("mini_cheetah")))
     folder = RunFolder(tmp_path)
     folder.write(record)
     assert folder.read() == record

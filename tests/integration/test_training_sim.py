@@ -24,8 +24,8 @@ from tensordict import TensorDict
 from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.jump.train.phases import TASKS
-from pronk.jump.train.provenance import SCHEMA, RunFolder
-from pronk.jump.train.recipe import apply_recipe, load_recipe
+from pronk.jump.train.provenance import RunFolder, new_record
+from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import contract_for, export_policy
 from pronk.jump.train.settings import DrawSettings, TrainSettings
@@ -187,23 +187,13 @@ def write_record(
     folder: RunFolder,
     gains: TrainingGains,
     draws: DrawSettings | None = None,
-    recipe: dict[str, Any] | None = None,
+    recipe: Recipe | None = None,
 ) -> None:
-    """Write the record of a run that is finished."""
+    """Write the record of a run."""
     settings = TrainSettings(task="all", out=folder.path, gains="gains.yaml")
     if draws is not None:
         settings = replace(settings, draws=draws)
-    record = {
-        "schema": SCHEMA,
-        "settings": settings.completed().stored_values(),
-        "gains": {"name": gains.name, "file": None, "sha256": gains.sha256, "virtual": False},
-        "recipe": recipe,
-        "start_sha256": "",
-        "phases": {},
-        "finished": True,
-        "sessions": [],
-    }
-    folder.write(record)
+    folder.write(new_record(settings.completed(), gains, recipe=recipe))
 
 
 @pytest.fixture(scope="module")
@@ -324,7 +314,7 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     recipe.write_text(f"schema: pronk/recipe/1\ntask: {numbers}\n")
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
-    write_record(folder, gains, recipe=load_recipe(recipe).record())
+    write_record(folder, gains, recipe=load_recipe(recipe))
     shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
     cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
     apply_recipe(cfg, load_recipe(recipe))

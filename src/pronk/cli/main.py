@@ -91,6 +91,8 @@ MACHINE_ERRORS = (
 """Errors of the operating system that say what the machine or its user cannot do, whatever pronk
 does: a full disk or quota, a folder without permission, too many open files, a bad disk, a name
 that is too long."""
+_PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
+"""Folders of installed packages: of Python, of a user, and of Debian."""
 _JSON_PARAMETER = "json_file"
 """Parameter of the option `--json`, which commands with an `Outcome` get."""
 
@@ -132,14 +134,14 @@ def _foreign_place(error: Exception) -> str:
     That is the innermost frame of what is neither installed nor of Python itself, unless it is
     pronk's.
     """
-    paths = sysconfig.get_paths()
-    installed = [Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    library = sysconfig.get_path("stdlib")
     package = Path(__file__).parents[1]
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = Path(frame.filename)
         if path.is_relative_to(package):
             return ""
-        if path.is_file() and not any(path.is_relative_to(folder) for folder in installed):
+        is_installed = not _PACKAGE_FOLDERS.isdisjoint(path.parts)
+        if path.is_file() and not is_installed and not path.is_relative_to(library):
             return f"{path}, line {frame.lineno}"
     return ""
 

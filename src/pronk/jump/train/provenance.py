@@ -20,35 +20,22 @@ import sys
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import write_text
 from pronk.jump.train.rl import checkpoint
+from pronk.jump.train.settings import StoredSettings, TrainSettings
 from pronk.jump.train.versions import package_versions
 from pronk.robots import ROBOT_NAMES
 
+if TYPE_CHECKING:
+    from pronk.jump.train.gains import TrainingGains
+    from pronk.jump.train.recipe import Recipe
+
 SCHEMA = "pronk/run/2"
-
-
-class StoredSettings(msgspec.Struct, kw_only=True):
-    """Types of `TrainSettings.stored_values`; what earlier versions lack has a default."""
-
-    task: str
-    robot: str
-    gains: str
-    ranges_from: str | None
-    init_checkpoint: str | None
-    envs: int
-    seed: int
-    ellipsoid: bool
-    phase: list[str]
-    by_joint: bool = False
-    weakest_drive: float = 1.0
-    recipe: str | list[str] | None = None
-    allow_unmatched: bool = False
 
 
 class StoredGains(msgspec.Struct, kw_only=True):
@@ -180,6 +167,40 @@ class RunFolder:
     def write(self, record: dict[str, Any]) -> None:
         """Write the provenance, whole or not at all."""
         write_text(self.provenance, json.dumps(record, indent=2, allow_nan=False) + "\n")
+
+
+def new_record(
+    settings: TrainSettings,
+    gains: TrainingGains,
+    *,
+    recipe: Recipe | None = None,
+    start_sha256: str = "",
+) -> dict[str, Any]:
+    """Describe a run that has not begun.
+
+    Args:
+        settings: Its completed settings.
+        gains: What it trains with.
+        recipe: The recipe, if there is one.
+        start_sha256: Hash of the checkpoint that it begins with; empty if it begins with none.
+    """
+    gains_file = settings.gains_file
+    return {
+        "schema": SCHEMA,
+        "settings": settings.stored_values(),
+        "gains": {
+            "name": gains.name,
+            "file": None if gains_file is None else gains_file.name,
+            "sha256": gains.sha256,
+            "virtual": gains.virtual,
+            "unmatched": dict(gains.unmatched),
+        },
+        "recipe": None if recipe is None else recipe.record(),
+        "start_sha256": start_sha256,
+        "phases": {},
+        "finished": False,
+        "sessions": [],
+    }
 
 
 def new_session() -> dict[str, Any]:

@@ -150,22 +150,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     if start is not None:
         checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
         start_sha256 = start["infos"]["start_sha256"]
-    record: dict[str, Any] = {
-        "schema": provenance.SCHEMA,
-        "settings": settings.stored_values(),
-        "gains": {
-            "name": gains.name,
-            "file": None if gains_file is None else gains_file.name,
-            "sha256": gains.sha256,
-            "virtual": gains.virtual,
-            "unmatched": dict(gains.unmatched),
-        },
-        "recipe": None if recipe is None else recipe.record(),
-        "start_sha256": start_sha256,
-        "phases": {},
-        "finished": False,
-        "sessions": [],
-    }
+    record = provenance.new_record(settings, gains, recipe=recipe, start_sha256=start_sha256)
     folder.write(record)
     return record
 

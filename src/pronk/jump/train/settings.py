@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
+import msgspec
 import tyro
 
 from pronk.errors import PronkError
@@ -19,6 +20,28 @@ if TYPE_CHECKING:
 
 WEAKEST_DRIVE = 0.3
 """Smallest share of its torque that a drive may be drawn with: with less a robot cannot stand."""
+
+
+class StoredSettings(msgspec.Struct, kw_only=True):
+    """Types of `TrainSettings.stored_values`.
+
+    Runs of earlier versions had no recipes, groups of joints alone, full drives, and no joints that
+    are no match.
+    """
+
+    task: Literal["walk", "jump", "all", "together"]
+    robot: str
+    gains: str
+    ranges_from: str | None
+    init_checkpoint: str | None
+    envs: int
+    seed: int
+    ellipsoid: bool
+    phase: list[str]
+    by_joint: bool = False
+    weakest_drive: float = 1.0
+    recipe: str | list[str] | None = None
+    allow_unmatched: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,25 +274,24 @@ class TrainSettings:
                     f"in {self.out} has {_option_text(stored_value)}; leave it out to continue "
                     "that run, or give a new --out."
                 )
+        values = msgspec.convert(stored, StoredSettings)
         return replace(
             self,
-            task=stored["task"],
-            robot=stored["robot"],
-            gains=stored["gains"],
-            ranges_from=_optional_path(stored["ranges_from"]),
-            init_checkpoint=_optional_path(stored["init_checkpoint"]),
-            envs=stored["envs"],
-            seed=stored["seed"],
-            # Runs of earlier versions had no recipes, groups of joints alone, full drives, and no
-            # joints that are no match.
+            task=values.task,
+            robot=values.robot,
+            gains=values.gains,
+            ranges_from=_optional_path(values.ranges_from),
+            init_checkpoint=_optional_path(values.init_checkpoint),
+            envs=values.envs,
+            seed=values.seed,
             draws=DrawSettings(
-                ellipsoid=stored["ellipsoid"],
-                by_joint=stored.get("by_joint", False),
-                weakest_drive=stored.get("weakest_drive", 1.0),
+                ellipsoid=values.ellipsoid,
+                by_joint=values.by_joint,
+                weakest_drive=values.weakest_drive,
             ),
-            recipe=_recipe_files(stored.get("recipe")),
-            allow_unmatched=stored.get("allow_unmatched", False),
-            phase=tuple(stored["phase"]),
+            recipe=_recipe_files(values.recipe),
+            allow_unmatched=values.allow_unmatched,
+            phase=tuple(values.phase),
         )
 
     def stored_values(self) -> dict[str, Any]:

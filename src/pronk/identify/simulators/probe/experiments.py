@@ -215,7 +215,7 @@ class Bench:
         values["stiffness"] = stiffness
         values["damping"] = damping
         runs = len(stiffness)
-        command, position = self._slow_enough(values, runs)
+        command, position = self._slow_enough(values)
         step = np.arange(command.shape[1])
         read_step = np.maximum((step - phase) // hold * hold + phase, 0)
         held_command = command[0, np.minimum(read_step, step)] + self._joint.default_position
@@ -242,7 +242,7 @@ class Bench:
             last_step=last_step,
         )
 
-    def _slow_enough(self, values: Values, runs: int) -> tuple[Array, Array]:
+    def _slow_enough(self, values: Values) -> tuple[Array, Array]:
         """Run chirps whose motion is slow enough for the torque that they need.
 
         A drive near its no-load speed has less torque than its gains command, at resonance already
@@ -250,11 +250,11 @@ class Bench:
 
         Args:
             values: Gains and armature of each run.
-            runs: Number of runs.
 
         Returns:
             Commands about the pose and positions [rad], shape (B, T).
         """
+        runs = len(values["stiffness"])
         highest_speed = _MOST_SPEED * self._joint.drive.no_load_speed
         command = np.tile(self._chirp(), (runs, 1))
         position = self._run(command, values)

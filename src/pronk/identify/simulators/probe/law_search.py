@@ -40,7 +40,7 @@ CLEAR = 0.7
 _NO_DAMPING = 1e-3
 """Damping that acts over the one that is set below which there is none."""
 _SAME_RESIDUAL = 1e-7
-"""Residual below which laws are told apart by nothing but rounding."""
+"""Residual below which only rounding tells laws apart."""
 _NEAR_RESIDUAL = 0.05
 """Residual of a law below which the kind of its friction may be all that is wrong."""
 EXACT_RESIDUAL = 1e-6
@@ -94,7 +94,7 @@ def best_laws(
             fit = min(fit, other_fit, key=lambda law_fit: law_fit.residual)
         # A factor on one of the gains must explain more than none.
         plain_start = fit.theta.copy()
-        plain_start[0] = 1.0
+        plain_start[PARAMETERS.index("damping")] = 1.0
         plain_fit = fit_law(
             runs, candidate.law, plain_start, [*fixed, "damping"], _FINAL_EVALUATIONS
         )
