@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import RewardTermCfg, TerminationTermCfg
+from tensordict import TensorDict
 
 import training_env
 from pronk.jump.train import compiled
@@ -19,17 +21,22 @@ from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum
 from pronk.jump.train.tasks.jump_env_cfg import draw_rotor_frequency, draw_weak_drives
+from pronk.jump.trial.training_sim.adapter import load_evaluated_policy
 from traced_graph import TracedGraph
 
 pytestmark = pytest.mark.train
 
 ROBOTS = 16
-STEPS = 12
-"""Policy steps in each phase; two iterations of recordings."""
+STEPS = {"walk": 12, "jump_a": 12, "jump_b": 60}
+"""Policy steps in each phase, in iterations of six; those of the last one are a jump's."""
+POLICY = Path(__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 
 
 def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
-    """Step robots through all phases, with jumps, pushes, falls and empty batteries."""
+    """Step robots through all phases, with jumps, pushes, falls and empty batteries.
+
+    Episodes of the first eight robots end early; the others jump as the policy does.
+    """
     cfg = training_env.config(ROBOTS, training_env.MATCHED)
     draw_weak_drives(cfg, 0.7)
     draw_rotor_frequency(cfg, 40.0)
@@ -40,21 +47,22 @@ def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
     env = ManagerBasedRlEnv(cfg, device=device)
     StackedRewardManager.install(env)
     graphs = StepGraphs(env) if records else None
-    env.reset(seed=0)
-    generator = torch.Generator().manual_seed(1)
+    obs, _ = env.reset(seed=0)
+    policy = load_evaluated_policy(POLICY, device)
     history = []
-    for phase in PHASES.values():
+    for phase, steps in STEPS.items():
         with torch.inference_mode():
-            for step in range(STEPS):
-                if step % (STEPS // 2) == 0:
-                    curriculum(env).apply(env, phase, step / STEPS)
+            for step in range(steps):
+                if step % 6 == 0:
+                    curriculum(env).apply(env, PHASES[phase], step / steps)
                     if graphs is not None:
                         graphs.begin()
                 if step % 3 == 2:
-                    env.episode_length_buf[step : step + 4] = 10**6  # episodes end
+                    ended = step % ROBOTS // 2
+                    env.episode_length_buf[ended : ended + 3] = 10**6  # episodes end
                     env.sim.data.qpos[2, 4] = 1.0  # this robot lies on its side
-                actions = torch.randn(ROBOTS, 12, generator=generator).to(device)
-                obs, reward, terminated, _, extras = env.step(0.3 * actions)
+                actions = policy.act(TensorDict(obs, batch_size=[ROBOTS]))
+                obs, reward, terminated, _, extras = env.step(actions)
                 history.append(
                     {
                         **{name: group.clone() for name, group in obs.items()},
@@ -62,6 +70,7 @@ def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
                         "terminated": terminated.clone(),
                         "torque": env.sim.data.ctrl[:].clone(),
                         "mode": motion_command(env).state.mode.clone(),
+                        "lift-offs": motion_command(env).state.liftoffs.clone(),
                         **{name: torch.as_tensor(x) for name, x in extras["log"].items()},
                     }
                 )
@@ -83,6 +92,7 @@ def test_a_recorded_step_is_the_step_itself(monkeypatch: pytest.MonkeyPatch) -> 
             assert error <= 1e-5 * (1.0 + value.double().abs().max()), (step, name)
     assert max(float(step["terminated"].sum()) for step in expected) >= 1.0
     assert max(float(step["mode"].float().mean()) for step in expected) > 0.1
+    assert max(float(step["lift-offs"].max()) for step in expected) >= 1.0
 
 
 def steps_so_far(env: ManagerBasedRlEnv) -> Any:

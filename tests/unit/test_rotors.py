@@ -96,7 +96,7 @@ def test_rotors_rest_on_their_links_until_belts_are_drawn() -> None:
     assert not rotors.offset.any()
     rotors.draw(45.0 * ones, 0.2 * ones)
     rotors.advance(ones, ones)
-    rotors.reset(torch.tensor([1]))
+    rotors.reset(torch.tensor([False, True]))
     assert rotors.offset[0].all()
     assert not rotors.offset[1].any()
     assert not rotors.speed[1].any()

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.actuators import Battery
+from pronk.jump.train.mdp.masks import robot_mask
 from pronk.jump.train.mdp.rotors import Rotors
 
 if TYPE_CHECKING:
@@ -153,22 +154,22 @@ class DelayedJointPositionAction(JointPositionAction):
     def reset(self, env_ids: Tensor | slice | None = None) -> None:
         """Draw the delays of new episodes; the default pose is in force until a target arrives."""
         super().reset(env_ids)
-        robots = slice(None) if env_ids is None else env_ids
+        robots = robot_mask(env_ids, self.num_envs, self.device)
         self.battery.reset(robots)
         self.finish_step()
         self.rotors.reset(robots)
         if self.guidance is not None:
-            self.guidance[robots] = 0.0
+            self.guidance.masked_fill_(robots[:, None], 0.0)
         low, high = self.cfg.delay_steps
         if high == 0:
             return
-        self._targets[:, robots] = self._default[robots]
+        torch.where(robots[:, None], self._default, self._targets, out=self._targets)
         if low < high:
             if self.cfg.delay_span is None:
                 delays = torch.randint(low, high + 1, self.lag.shape, device=self.device)
             else:
                 delays = self._rounded_delays(self.cfg.delay_span).clamp(low, high)
-            self.lag[robots] = delays[robots]
+            torch.where(robots[:, None], delays, self.lag, out=self.lag)
 
     def _rounded_delays(self, span: tuple[float, float]) -> Tensor:
         """Draw delays in a span, rounded by chance to physics steps of the same mean."""

@@ -149,10 +149,13 @@ class Battery:
         self.voltage.lerp_(new_voltage, _VOLTAGE_STEP)
         self._apply()
 
-    def reset(self, robots: Tensor | slice) -> None:
-        """Return some batteries to no load; a power that is not finite has spoiled the voltage."""
+    def reset(self, robots: Tensor) -> None:
+        """Return the batteries of some robots, bool (N,), to no load.
+
+        A power that is not finite has spoiled the voltage.
+        """
         if not self.ideal:
-            self.voltage[robots] = self.no_load[robots]
+            torch.where(robots[:, None], self.no_load, self.voltage, out=self.voltage)
 
     def _apply(self) -> None:
         """Scale the torque-speed lines of the drives by the voltage."""

@@ -27,6 +27,7 @@ from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import foot_sweep, guidance
 from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
 from pronk.jump.train.mdp.liftoff import speed_share
+from pronk.jump.train.mdp.masks import robot_mask
 from pronk.jump.train.mdp.motion import (
     RobotFrames,
     SimulatorState,
@@ -349,8 +350,7 @@ class MotionCommand(CommandTerm):
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
         """Draw commands for robots that start a new episode, and clear their jumps."""
-        assert isinstance(env_ids, Tensor)
-        robots = torch.zeros_like(self.jump).index_fill_(0, env_ids, True)
+        robots = robot_mask(env_ids, self.num_envs, self.device)
         if self._motion is None:
             self.state.reset(robots)
             self._redraw(robots)

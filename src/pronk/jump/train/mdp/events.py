@@ -26,6 +26,7 @@ from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
 from pronk.jump.train.compiled import Recorder, TensorFunction
 from pronk.jump.train.mdp.actions import joint_position_action
+from pronk.jump.train.mdp.masks import robot_mask
 from pronk.jump.train.mdp.observations import gravity_direction
 
 Range = tuple[float, float]
@@ -380,7 +381,12 @@ class Pushes:
 
 
 def reset_state(
-    env: Any, env_ids: Tensor, place: float, speed: float, heading: float, joints: float
+    env: Any,
+    env_ids: Tensor | slice | None,
+    place: float,
+    speed: float,
+    heading: float,
+    joints: float,
 ) -> None:
     """Draw the state in which an episode begins, about the initial state, which stands upright.
 
@@ -389,17 +395,18 @@ def reset_state(
 
     Args:
         env: The environment.
-        env_ids: Robots whose episode begins, (n,).
+        env_ids: Robots whose episode begins, as `robot_mask` takes them.
         place: Half-width of the position along world x and y [m].
         speed: Half-width of the velocity along world x and y [m/s].
         heading: Half-width of the yaw angle [rad].
         joints: Half-width of the joint positions about the default pose [rad].
     """
+    robots = robot_mask(env_ids, env.num_envs, env.device)[:, None]
     robot = env.scene["robot"].data
-    root = robot.default_root_state[env_ids]
-    joint_position = robot.default_joint_pos[env_ids]
-    uniform = _uniform(env, (-1.0, 1.0), len(env_ids), 5 + joint_position.shape[1])
-    root[:, :3] += env.scene.env_origins[env_ids]
+    root = robot.default_root_state.clone()
+    joint_position = robot.default_joint_pos.clone()
+    uniform = _uniform(env, (-1.0, 1.0), env.num_envs, 5 + joint_position.shape[1])
+    root[:, :3] += env.scene.env_origins
     root[:, :2].add_(uniform[:, :2], alpha=place)
     half_angle = uniform[:, 2] * (heading / 2)
     root[:, 3] = half_angle.cos()
@@ -408,7 +415,9 @@ def reset_state(
     joint_position.add_(uniform[:, 5:], alpha=joints)
     # An index makes mjlab's arrays tensors without a copy. The robot is all that is simulated.
     positions = torch.cat([root[:, :7], joint_position], dim=1)
-    env.sim.data.qpos[:].index_copy_(0, env_ids, positions)
+    state = env.sim.data.qpos[:]
+    torch.where(robots, positions, state, out=state)
     at_rest = torch.zeros_like(uniform[:, 2:])  # all but the velocity of the trunk
     velocities = torch.cat([root[:, 7:10], at_rest], dim=1)
-    env.sim.data.qvel[:].index_copy_(0, env_ids, velocities)
+    state = env.sim.data.qvel[:]
+    torch.where(robots, velocities, state, out=state)

@@ -16,8 +16,14 @@ from mjlab.managers import RewardTermCfg
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor
 
-from pronk.jump.train.compiled import RecordedFunction, Recorder, compiled_step
+from pronk.jump.train.compiled import (
+    RecordedFunction,
+    Recorder,
+    TensorFunction,
+    compiled_step,
+)
 from pronk.jump.train.mdp.commands import motion_command
+from pronk.jump.train.mdp.masks import robot_mask
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -48,6 +54,7 @@ class StackedRewardManager(RewardManager):
         self._scale_tensor = torch.ones(len(self._term_names), device=self.device)
         self._calls: list[tuple[Callable[..., Tensor], dict[str, Any], bool]] = []
         self._recorded_step: RecordedFunction | None = None
+        self._clear: TensorFunction = self._clear_sums
 
     def compile(self, record: Recorder) -> None:
         """Compile the terms together, and record them with their sums.
@@ -60,6 +67,7 @@ class StackedRewardManager(RewardManager):
         """
         self._compiled_rates = compiled_step(self._rates)
         self._recorded_step = record(self._step)
+        self._clear = record(self._clear_sums)
 
     def compute(self, dt: float) -> Tensor:
         """Compute the reward of a step.
@@ -128,15 +136,21 @@ class StackedRewardManager(RewardManager):
         Returns:
             Mean rate of every term over the episodes that end, for the log.
         """
-        robots = slice(None) if env_ids is None else env_ids
-        means = self._sums[:, robots].mean(dim=1) / self._env.max_episode_length_s
-        self._sums[:, robots] = 0.0
+        robots = robot_mask(env_ids, self.num_envs, self.device)
+        (means,) = self._clear({"robots": robots})
         for term in self._class_term_cfgs:
             term.func.reset(env_ids=env_ids)
         log = {}
         for name, mean in zip(self._term_names, means, strict=True):
             log[f"Episode_Reward/{name}"] = mean
         return log
+
+    def _clear_sums(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Clear the sums of `robots`, bool (N,); returns their mean rates, (terms,)."""
+        robots = inputs["robots"]
+        sums = torch.where(robots, self._sums, 0.0).sum(dim=1)
+        self._sums.masked_fill_(robots, 0.0)
+        return (sums / robots.sum().clamp_min(1) / self._env.max_episode_length_s,)
 
 
 def _finite_rates(values: list[Tensor], weights: Tensor) -> Tensor:

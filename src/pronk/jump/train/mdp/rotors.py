@@ -80,9 +80,9 @@ class Rotors:
         self.offset.copy_(steady_offset + new_distance)
         self.speed.copy_(speed)
 
-    def reset(self, robots: Tensor | slice) -> None:
-        """Put the rotors of some robots at rest on their links."""
+    def reset(self, robots: Tensor) -> None:
+        """Put the rotors of some robots, bool (N,), at rest on their links."""
         if self.rigid:
             return
-        self.offset[robots] = 0.0
-        self.speed[robots] = 0.0
+        self.offset.masked_fill_(robots[:, None], 0.0)
+        self.speed.masked_fill_(robots[:, None], 0.0)

@@ -1,0 +1,23 @@
+"""Robots as masks: tensors of one size, whichever robots are meant."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def robot_mask(robots: Tensor | slice | None, count: int, device: torch.device | str) -> Tensor:
+    """Return which robots are meant, bool (N,).
+
+    Args:
+        robots: Their indices, a slice, a mask, which is returned as it is, or None for all.
+        count: Number of all robots, N.
+        device: Device of the mask.
+    """
+    if isinstance(robots, Tensor) and robots.dtype == torch.bool:
+        return robots
+    mask = torch.zeros(count, dtype=torch.bool, device=device)
+    if isinstance(robots, Tensor):
+        return mask.index_fill_(0, robots, True)
+    mask[slice(None) if robots is None else robots] = True
+    return mask
