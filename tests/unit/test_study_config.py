@@ -259,6 +259,7 @@ def test_the_study_of_the_examples_is_as_large_as_it_says() -> None:
         ("contact.yaml", 10),
         ("flat.yaml", 10),
         ("back.yaml", 20),
+        ("backwards.yaml", 10),
     ],
 )
 def test_a_study_of_recipes_is_balanced(name: str, trainings: int) -> None:
