@@ -137,7 +137,7 @@ def acting_table(probe: Probe, joint: Joint, info: SimulatorInfo) -> Table:
         max(probe.gravity, 0.0),
         delay_ms,
     ]
-    if "residual" in probe.faults or not probe.complete:
+    if not probe.law_found:
         # Values of a law that does not explain the motion are no measurement.
         law_name = "none of the laws" if probe.complete else "not found"
         acting = [None] * len(acting)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 from pronk.identify.simulators.probe.law_fit import ProbeRuns
-from pronk.identify.simulators.probe.result import Clip, Probe
+from pronk.identify.simulators.probe.result import LARGE_RESIDUAL, Clip, Probe
 from pronk.identify.simulators.simulator import Simulator
 from pronk.robots.robot import RobotSpec
 
-LARGE_RESIDUAL = 0.01
-"""Share of the motion that a right answer leaves unexplained at most."""
 _DELAY_SHOWS = 0.05
 """Share of a step from which on a delay is named."""
 
@@ -41,7 +39,7 @@ def find_faults(
         if probe.complete:
             unexplained += ": the joint follows none of the laws, or others move with it"
         faults["residual"] = unexplained
-    if faults.keys() & {"incomplete", "residual"}:
+    if not probe.law_found:
         # What a law says that does not explain the motion, or may not be the best one, is no
         # finding.
         return faults

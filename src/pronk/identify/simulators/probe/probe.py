@@ -20,7 +20,7 @@ import numpy as np
 
 from pronk.errors import PronkError
 from pronk.identify.simulators.probe.experiments import SHORT_FIRST_STEP, Bench
-from pronk.identify.simulators.probe.faults import LARGE_RESIDUAL, find_faults
+from pronk.identify.simulators.probe.faults import find_faults
 from pronk.identify.simulators.probe.law_fit import LawFit, ProbeRuns, StepCount
 from pronk.identify.simulators.probe.law_search import (
     CLEAR,
@@ -29,7 +29,13 @@ from pronk.identify.simulators.probe.law_search import (
     best_laws,
     gain_scale,
 )
-from pronk.identify.simulators.probe.result import ActingGains, ActingLaw, Clip, Probe
+from pronk.identify.simulators.probe.result import (
+    LARGE_RESIDUAL,
+    ActingGains,
+    ActingLaw,
+    Clip,
+    Probe,
+)
 from pronk.identify.simulators.simulator import Simulator
 from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import Joint, RobotSpec

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, replace
 
 from pronk.robots.drive_law import DriveLaw
 
+LARGE_RESIDUAL = 0.01
+"""Share of the motion that a right answer leaves unexplained at most."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ActingLaw:
@@ -97,3 +100,8 @@ class Probe:
     """Other laws that explain the motion as well."""
     faults: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word for each, and a sentence."""
+
+    @property
+    def law_found(self) -> bool:
+        """Whether the law explains the motion and all laws were fitted."""
+        return self.complete and self.residual <= LARGE_RESIDUAL
