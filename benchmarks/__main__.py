@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from pronk.cli.main import run
+from pronk.opengl import keep_opengl_out
 
 SUMMARIES = {
     "match": "pronk and its peers on virtual robots drawn at random.",
@@ -37,6 +38,7 @@ MODULES = {"foreign": "foreign.command"}
 """Modules whose names are not those of their benchmarks."""
 
 if __name__ == "__main__":
+    keep_opengl_out()
     commands = {}
     for name, summary in SUMMARIES.items():
         function = name.replace("-", "_")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -397,3 +399,19 @@ def test_a_joint_is_judged_on_the_signals_that_excite_it() -> None:
 def test_an_impossible_run_is_refused() -> None:
     with pytest.raises(PronkError, match="0 robots"):
         next(match.run(0, 0, lambda _stage, _share: None))
+
+
+def test_no_benchmark_needs_the_requested_opengl() -> None:
+    """MuJoCo itself cannot be imported with an unknown or a missing one."""
+    environment = {**os.environ, "MUJOCO_GL": "nonsense"}
+    environment.pop("PRONK_GL", None)
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "grid", "--help"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        cwd=Path(__file__).parents[2],
+    )
+    assert done.returncode == 0, done.stderr
+    assert "grid" in done.stdout
