@@ -28,14 +28,14 @@ pytestmark = pytest.mark.train
 
 ROBOTS = 16
 STEPS = {"walk": 12, "jump_a": 12, "jump_b": 60}
-"""Policy steps in each phase, in iterations of six; those of the last one are a jump's."""
+"""Policy steps in each phase, in iterations of six; a jump takes most of the last phase."""
 POLICY = Path(__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 
 
 def rollout(*, device: str, records: bool) -> list[dict[str, Any]]:
     """Step robots through all phases, with jumps, pushes, falls and empty batteries.
 
-    Episodes of the first eight robots end early; the others jump as the policy does.
+    Episodes of the first ten robots end early; the others jump as the policy does.
     """
     cfg = training_env.config(ROBOTS, training_env.MATCHED)
     draw_weak_drives(cfg, 0.7)

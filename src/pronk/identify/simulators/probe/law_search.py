@@ -40,7 +40,7 @@ CLEAR = 0.7
 _NO_DAMPING = 1e-3
 """Damping that acts over the one that is set below which there is none."""
 _SAME_RESIDUAL = 1e-7
-"""Residual below which only rounding tells laws apart."""
+"""Residual below which laws differ by rounding alone."""
 _NEAR_RESIDUAL = 0.05
 """Residual of a law below which the kind of its friction may be all that is wrong."""
 EXACT_RESIDUAL = 1e-6

@@ -17,7 +17,10 @@ def robot_mask(robots: Tensor | slice | None, count: int, device: torch.device |
     if isinstance(robots, Tensor) and robots.dtype == torch.bool:
         return robots
     mask = torch.zeros(count, dtype=torch.bool, device=device)
-    if isinstance(robots, Tensor):
-        return mask.index_fill_(0, robots, True)
-    mask[slice(None) if robots is None else robots] = True
+    if robots is None:
+        mask.fill_(True)
+    elif isinstance(robots, Tensor):
+        mask.index_fill_(0, robots, True)
+    else:
+        mask[robots] = True
     return mask
