@@ -45,13 +45,15 @@ class TracedGraph:
         with tracer:
             outputs = function()
         torch.set_rng_state(generator_state)
-        for tensor, before in reversed(tracer.overwritten):
-            tensor.copy_(before)
+        with torch.no_grad():
+            for tensor, before in reversed(tracer.overwritten):
+                tensor.copy_(before)
         self._trace = tracer.trace
         return outputs
 
+    @torch.no_grad()
     def replay(self) -> None:
-        """Run the operations on the memory of the recording."""
+        """Run the operations on the memory of the recording; gradients are among them."""
         for operation, arguments, options, outputs in self._trace:
             results, _ = tree_flatten(operation(*arguments, **options))
             for output, result in zip(outputs, results, strict=True):

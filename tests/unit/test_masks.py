@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from pronk.jump.train.mdp.masks import robot_mask
+from pronk.jump.train.mdp.masks import overwrite, robot_mask
 
 pytestmark = pytest.mark.train
 
@@ -25,3 +25,10 @@ pytestmark = pytest.mark.train
 )
 def test_a_mask_has_the_robots_that_are_meant(robots: Any, expected: list[bool]) -> None:
     assert robot_mask(robots, 4, "cpu").tolist() == expected
+
+
+def test_numbers_are_written_where_the_mask_is_and_into_the_same_memory() -> None:
+    kept = torch.zeros(3, 2)
+    view = kept[:]
+    overwrite(kept, torch.tensor([True, False, True])[:, None], torch.tensor([1.0, 2.0]))
+    assert view.tolist() == [[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.jump.train.mdp.actuators import Battery
-from pronk.jump.train.mdp.masks import robot_mask
+from pronk.jump.train.mdp.masks import overwrite, robot_mask
 from pronk.jump.train.mdp.rotors import Rotors
 
 if TYPE_CHECKING:
@@ -163,13 +163,13 @@ class DelayedJointPositionAction(JointPositionAction):
         low, high = self.cfg.delay_steps
         if high == 0:
             return
-        torch.where(robots[:, None], self._default, self._targets, out=self._targets)
+        overwrite(self._targets, robots[:, None], self._default)
         if low < high:
             if self.cfg.delay_span is None:
                 delays = torch.randint(low, high + 1, self.lag.shape, device=self.device)
             else:
                 delays = self._rounded_delays(self.cfg.delay_span).clamp(low, high)
-            torch.where(robots[:, None], delays, self.lag, out=self.lag)
+            overwrite(self.lag, robots[:, None], delays)
 
     def _rounded_delays(self, span: tuple[float, float]) -> Tensor:
         """Draw delays in a span, rounded by chance to physics steps of the same mean."""

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from pronk.errors import PronkError, RobotError
 from pronk.jump.train.gains import TrainingGains
+from pronk.jump.train.mdp.masks import overwrite
 from pronk.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ class Battery:
         A power that is not finite has spoiled the voltage.
         """
         if not self.ideal:
-            torch.where(robots[:, None], self.no_load, self.voltage, out=self.voltage)
+            overwrite(self.voltage, robots[:, None], self.no_load)
 
     def _apply(self) -> None:
         """Scale the torque-speed lines of the drives by the voltage."""

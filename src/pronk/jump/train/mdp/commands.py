@@ -27,7 +27,7 @@ from pronk.jump.train.mdp.actions import joint_position_action
 from pronk.jump.train.mdp.guidance import foot_sweep, guidance
 from pronk.jump.train.mdp.jump import JumpInputs, JumpSettings, JumpState
 from pronk.jump.train.mdp.liftoff import speed_share
-from pronk.jump.train.mdp.masks import robot_mask
+from pronk.jump.train.mdp.masks import overwrite, robot_mask
 from pronk.jump.train.mdp.motion import (
     RobotFrames,
     SimulatorState,
@@ -377,9 +377,9 @@ class MotionCommand(CommandTerm):
         if self.scripted:
             return
         velocity, time, _, off = self._draw()
-        torch.where(robots[:, None], velocity, self.velocity, out=self.velocity)
-        torch.where(robots, time, self.time_left, out=self.time_left)
-        torch.where(robots, off, self._jump_left, out=self._jump_left)
+        overwrite(self.velocity, robots[:, None], velocity)
+        overwrite(self.time_left, robots, time)
+        overwrite(self._jump_left, robots, off)
         self.jump &= ~robots
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
@@ -411,9 +411,8 @@ class MotionCommand(CommandTerm):
             self.time_left -= dt
             due = self.time_left <= 0.0
             velocity, time, on, off = self._draw()
-            # In place: what is recorded stays where it is.
-            torch.where(due[:, None], velocity, self.velocity, out=self.velocity)
-            torch.where(due, time, self.time_left, out=self.time_left)
+            overwrite(self.velocity, due[:, None], velocity)
+            overwrite(self.time_left, due, time)
             if self.cfg.jump_fraction <= 0.0:
                 self.jump.zero_()
             else:
@@ -421,7 +420,7 @@ class MotionCommand(CommandTerm):
                 turn = (self._jump_left <= 0.0) & self.jumper
                 self.jump ^= turn
                 change = torch.where(self.jump, on, off)
-                torch.where(turn, change, self._jump_left, out=self._jump_left)
+                overwrite(self._jump_left, turn, change)
         self._set_guidance()
 
     def _set_guidance(self) -> None:

@@ -26,7 +26,7 @@ from pronk.errors import PronkError
 from pronk.identify.match.gains import GroupGains
 from pronk.jump.train.compiled import Recorder, TensorFunction
 from pronk.jump.train.mdp.actions import joint_position_action
-from pronk.jump.train.mdp.masks import robot_mask
+from pronk.jump.train.mdp.masks import overwrite, robot_mask
 from pronk.jump.train.mdp.observations import gravity_direction
 
 Range = tuple[float, float]
@@ -370,7 +370,7 @@ class Pushes:
         self._time_left -= self._step_s
         due = self._time_left <= 0.0
         interval = _uniform(env, settings.interval_s, env.num_envs)
-        torch.where(due, interval, self._time_left, out=self._time_left)
+        overwrite(self._time_left, due, interval)
         uniform = _uniform(env, (-1.0, 1.0), env.num_envs, 3) * due[:, None]
         velocity = env.sim.data.qvel[:]
         velocity[:, :2] += settings.speed * uniform[:, :2]
@@ -415,9 +415,7 @@ def reset_state(
     joint_position.add_(uniform[:, 5:], alpha=joints)
     # An index makes mjlab's arrays tensors without a copy. The robot is all that is simulated.
     positions = torch.cat([root[:, :7], joint_position], dim=1)
-    state = env.sim.data.qpos[:]
-    torch.where(robots, positions, state, out=state)
+    overwrite(env.sim.data.qpos[:], robots, positions)
     at_rest = torch.zeros_like(uniform[:, 2:])  # all but the velocity of the trunk
     velocities = torch.cat([root[:, 7:10], at_rest], dim=1)
-    state = env.sim.data.qvel[:]
-    torch.where(robots, velocities, state, out=state)
+    overwrite(env.sim.data.qvel[:], robots, velocities)

@@ -24,3 +24,14 @@ def robot_mask(robots: Tensor | slice | None, count: int, device: torch.device |
     else:
         mask[robots] = True
     return mask
+
+
+def overwrite(kept: Tensor, mask: Tensor, numbers: Tensor) -> None:
+    """Write numbers where a mask is true, in the same memory, without waiting for the device.
+
+    Args:
+        kept: Tensor that is changed, for example (N, size).
+        mask: Where, bool; of the shape of `kept` or one that broadcasts to it, as (N, 1) does.
+        numbers: New numbers, of such a shape as well.
+    """
+    torch.where(mask, numbers, kept, out=kept)
