@@ -139,10 +139,10 @@ class NoGraph(compiled.DeviceGraph):
         return False
 
 
-def standard_error(values: Any, others: Any) -> float:
+def standard_error(plain: Any, recorded: Any) -> float:
     """Return the standard error of the difference of two means over robots, the largest of all."""
-    errors = (values.var(dim=0) + others.var(dim=0)) / len(values)
-    return float(errors.max().sqrt())
+    squares = (plain.var(dim=0) + recorded.var(dim=0)) / len(plain)
+    return float(squares.max().sqrt())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU of NVIDIA")
@@ -155,21 +155,21 @@ def test_cuda_graphs_give_the_same_step(
     Physics rounds otherwise in each run on a GPU, which grows where feet slip: some robots differ,
     most do not, and means over robots differ by less than robots scatter.
     """
-    recorded = rollout(device="cuda:0", records=True, robots=MANY)
+    recorded_steps = rollout(device="cuda:0", records=True, robots=MANY)
     monkeypatch.setattr(compiled.RecordedFunction, "graph_type", NoGraph)
-    expected = rollout(device="cuda:0", records=is_compiled, robots=MANY)
-    for step, (before, after) in enumerate(zip(expected, recorded, strict=True)):
+    plain_steps = rollout(device="cuda:0", records=is_compiled, robots=MANY)
+    for step, (before, after) in enumerate(zip(plain_steps, recorded_steps, strict=True)):
         assert before.keys() == after.keys()
-        for name, value in before.items():
-            place = (step, name)
-            values = value.double()
-            others = after[name].double()
-            tolerance = 1e-3 * (1.0 + values.abs().mean())
-            assert (others - values).abs().median() <= tolerance, place
-            if values.ndim > 0:
-                difference = (others.mean(dim=0) - values.mean(dim=0)).abs().max()
-                assert difference <= tolerance + 5.0 * standard_error(values, others), place
-    assert max(float(step["lift-offs"].max()) for step in expected) >= 1.0
+        for name, measured in before.items():
+            plain = measured.double()
+            recorded = after[name].double()
+            tolerance = 1e-3 * (1.0 + plain.abs().mean())
+            assert (recorded - plain).abs().median() <= tolerance, (step, name)
+            if plain.ndim > 0:
+                difference = (recorded.mean(dim=0) - plain.mean(dim=0)).abs().max()
+                tolerance += 5.0 * standard_error(plain, recorded)
+                assert difference <= tolerance, (step, name)
+    assert max(float(step["lift-offs"].max()) for step in plain_steps) >= 1.0
 
 
 def test_all_tensors_of_jumps_and_motion_are_kept() -> None:

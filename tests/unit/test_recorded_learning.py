@@ -62,5 +62,5 @@ def test_recorded_updates_are_those_without_a_recording(monkeypatch: pytest.Monk
     assert len(set(plain_rates)) > 1
     for plain_model, fast_model in ((plain.actor, fast.actor), (plain.critic, fast.critic)):
         expected = weights(plain_model)
-        for name, value in weights(fast_model).items():
-            torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-5)
+        for name, weight in weights(fast_model).items():
+            torch.testing.assert_close(weight, expected[name], rtol=1e-4, atol=1e-5)

@@ -151,14 +151,12 @@ def _screened(runs: ProbeRuns, delay: int, fixed: Sequence[str]) -> list[LawFit]
     explicit = DriveLaw()
     implicit_damping = DriveLaw(kind="implicit_damping")
     fits: list[LawFit] = []
-    friction_start: Array | None = None
     for soft in (False, True):
         if soft:
             # Whether friction is soft shows where there is some.
             best = min(fits, key=lambda fit: fit.residual)
             if best.value("friction") <= 0.002 * runs.torque or best.residual < 1e-5:
                 break
-            friction_start = best.theta
         quick = [ActingLaw(drive=explicit), ActingLaw(drive=implicit_damping)]
         quick.append(ActingLaw(drive=implicit_damping, beside_explicit=True))
         ages = _STALE_STEPS[:1] if soft else _STALE_STEPS
@@ -169,23 +167,33 @@ def _screened(runs: ProbeRuns, delay: int, fixed: Sequence[str]) -> list[LawFit]
         for law in quick:
             if fits and runs.exhausted:
                 return fits
-            fits.append(
-                _screened_law(runs, replace(law, soft_friction=soft), friction_start, delay, fixed)
-            )
+            start = _hard_friction_start(fits, law) if soft else None
+            fits.append(_screened_law(runs, replace(law, soft_friction=soft), start, delay, fixed))
         if min(fit.residual for fit in fits) < EXACT_RESIDUAL:
             return fits
         for beside in (False, True):
-            _screen_iterations(runs, fits, (beside, soft), friction_start, delay, fixed)
+            _screen_iterations(runs, fits, (beside, soft), delay, fixed)
             if min(fit.residual for fit in fits) < EXACT_RESIDUAL:
                 return fits
     return fits
+
+
+def _hard_friction_start(fits: Sequence[LawFit], law: ActingLaw) -> Array | None:
+    """Return the parameters of a law as it was fitted without soft friction, None if it was not.
+
+    Those of other laws are no start: beside an explicit torque inertia, friction and gravity are
+    twice what they are without it.
+    """
+    for fit in fits:
+        if fit.law == replace(law, soft_friction=False):
+            return fit.theta
+    return None
 
 
 def _screen_iterations(
     runs: ProbeRuns,
     fits: list[LawFit],
     variant: tuple[bool, bool],
-    start: Array | None,
     delay: int,
     fixed: Sequence[str],
 ) -> None:
@@ -195,20 +203,22 @@ def _screen_iterations(
         runs: The runs.
         fits: Fits of other laws.
         variant: True if an explicit torque acts beside it, and if friction is soft.
-        start: Values of `PARAMETERS` to begin with; None to search a grid.
         delay: Whole steps of delay.
         fixed: Names of parameters that are not fitted.
     """
     beside, soft = variant
     by_iterations: dict[int, LawFit] = {}
 
-    def fit_iterations(iterations: int, begin: Array | None) -> LawFit:
+    def fit_iterations(iterations: int, neighbour: LawFit | None) -> LawFit:
         law = ActingLaw(
             drive=DriveLaw(kind="implicit", iterations=iterations),
             beside_explicit=beside,
             soft_friction=soft,
         )
-        fit = _screened_law(runs, law, begin, delay, fixed)
+        start = _hard_friction_start(fits, law) if soft else None
+        if start is None and neighbour is not None:
+            start = neighbour.theta
+        fit = _screened_law(runs, law, start, delay, fixed)
         fits.append(fit)
         by_iterations[iterations] = fit
         return fit
@@ -218,7 +228,7 @@ def _screen_iterations(
     for iterations in _ITERATIONS:
         if runs.exhausted:
             return
-        fit = fit_iterations(iterations, start if previous is None else previous.theta)
+        fit = fit_iterations(iterations, previous)
         # The residual has one minimum over the iterations.
         if previous is not None and fit.residual > previous.residual:
             rises += 1
@@ -237,7 +247,7 @@ def _screen_iterations(
         return
     for iterations in range(max(best - 2, 1), best + 3):
         if iterations not in by_iterations and not runs.exhausted:
-            fit_iterations(iterations, by_iterations[best].theta)
+            fit_iterations(iterations, by_iterations[best])
 
 
 def _screened_law(
