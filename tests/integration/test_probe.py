@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,16 @@ import numpy as np
 import pytest
 
 from command_line import accepted, refused
-from drawn_simulator import ENGINES, ROBOTS, DrawnSimulator, Truth, draw_truth, score
+from drawn_simulator import (
+    DEFAULT_ARMATURE,
+    ENGINES,
+    ROBOTS,
+    DrawnSimulator,
+    Truth,
+    draw_truth,
+    score,
+)
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.identify.simulators.probe.probe import probe_joint
 from pronk.identify.simulators.probe.result import Probe
@@ -121,6 +131,40 @@ def test_less_torque_near_the_no_load_speed_is_no_fault(
         fault="" if armature_acts else "ignored",
     )
     assert_named_as_drawn(truth)
+
+
+class SinglePrecision(DrawnSimulator):
+    """A simulator whose positions have the 24 bits of engines on GPUs."""
+
+    def rollout(
+        self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
+    ) -> Array:
+        positions = super().rollout(command, values, locked=locked)
+        return positions.astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("stiffness", [14.0, 20.0])
+def test_rounding_of_small_motions_is_no_limit_of_the_torque(stiffness: float) -> None:
+    """A heavy joint moves by less than 1e-6 rad in the first millisecond of a small command."""
+    mini_cheetah = replace(load_robot("mini_cheetah"), timestep_s=0.001, decimation=20)
+    knee = replace(mini_cheetah.joint("FR_knee"), stiffness=stiffness, damping=0.45)
+    joints = [knee if joint.name == knee.name else joint for joint in mini_cheetah.joints]
+    truth = Truth(
+        kind="mujoco",
+        robot=replace(mini_cheetah, joints=tuple(joints)),
+        joint="FR_knee",
+        law=DriveLaw(),
+        stated=DriveLaw(),
+        armature=knee.drive.armature + DEFAULT_ARMATURE,
+        frictionloss=0.0,
+        delay_s=0.0,
+        hold=1,
+        scale=1.0,
+        fault="armature",
+    )
+    probe = probe_joint(SinglePrecision(truth), truth.robot, truth.joint)
+    assert set(probe.faults) == {"armature"}
+    assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -29,6 +29,10 @@ _HIGHEST_STEP = 3.0
 """Highest step of the command with which a limit of the torque is looked for [rad]."""
 _CLIPPED_SLOPE = 0.3
 """Share of its greatest growth with the height of a step below which the motion is clipped."""
+_LEAST_GROWTH = 0.03
+"""Growth of the motion from one height of a step to the next, over the largest motion, from which
+on it is read. Less may be rounding: an engine in single precision has 1.5 rad to 1.2e-7, which is a
+tenth of the motion in the first step of a small command."""
 _DAMPED_SHARE = 0.3
 """What the drive itself takes from the motion of the second step, about, over that of the first."""
 _MOST_SPEED = 0.6
@@ -121,9 +125,13 @@ class Bench:
             return None
         heights = heights[:slow]
         reach = reach[:slow]
-        slope = np.diff(reach) / np.diff(heights)
-        steepest = int(slope.argmax())
-        if slope[steepest] <= 0.0 or slope[-1] > _CLIPPED_SLOPE * slope[steepest]:
+        growth = np.diff(reach)
+        slope = growth / np.diff(heights)
+        is_readable = growth > _LEAST_GROWTH * np.abs(reach).max()
+        if not is_readable.any():
+            return None
+        steepest = int(np.where(is_readable, slope, -np.inf).argmax())
+        if slope[-1] > _CLIPPED_SLOPE * slope[steepest]:
             return None
         # Where the line of the steepest part reaches the height of the end.
         height = heights[steepest] + (reach[-1] - reach[steepest]) / slope[steepest]
