@@ -24,6 +24,7 @@ from drawn_simulator import (
 )
 from pronk.arrays import Array
 from pronk.errors import PronkError
+from pronk.identify.simulators.probe.experiments import Bench
 from pronk.identify.simulators.probe.probe import probe_joint
 from pronk.identify.simulators.probe.result import Probe
 from pronk.robots import load_robot
@@ -165,6 +166,45 @@ def test_rounding_of_small_motions_is_no_limit_of_the_torque(stiffness: float) -
     probe = probe_joint(SinglePrecision(truth), truth.robot, truth.joint)
     assert set(probe.faults) == {"armature"}
     assert probe.armature == pytest.approx(truth.armature, rel=1e-3)
+
+
+@pytest.mark.parametrize("delay_steps", [1.9904, 1.9906, 1.9908])
+def test_a_motion_as_small_as_rounding_is_no_hold(delay_steps: float) -> None:
+    """The delay leaves a hundredth of a step, in which the joint moves by 18 roundings or 19."""
+    law = DriveLaw(kind="implicit", iterations=10)
+    go2 = replace(load_robot("go2"), timestep_s=0.002, decimation=10)
+    truth = replace(
+        FAULTLESS,
+        robot=go2,
+        joint="RL_knee",
+        law=law,
+        stated=law,
+        frictionloss=0.0,
+        delay_s=0.002 * delay_steps,
+    )
+    bench = Bench(SinglePrecision(truth), go2, "RL_knee")
+    delay, hold, _ = bench.latency(1.0)
+    assert hold == 1
+    assert delay in (1, 2)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "mujoco"])
+def test_gains_with_which_a_joint_swings_at_its_torque_limit_are_no_stable_ones(kind: str) -> None:
+    """Per degree, not per radian, they are 57 times as large; the limit keeps the joint near."""
+    mini_cheetah = replace(load_robot("mini_cheetah"), timestep_s=0.002, decimation=10)
+    truth = replace(
+        FAULTLESS,
+        kind=kind,
+        robot=mini_cheetah,
+        joint="FR_knee",
+        frictionloss=0.0,
+        delay_s=0.0,
+        scale=180.0 / np.pi,
+    )
+    probe = probed(truth)
+    assert set(probe.faults) == {"degrees", "unstable"}
+    assert probe.gains.stable_share == 0.25
+    assert probe.law.drive == DriveLaw()
 
 
 @pytest.mark.slow

@@ -115,7 +115,9 @@ def find_faults(
             f"commands act {1e3 * probe.delay_s:.3g} ms late ({probe.delay_s / runs.timestep:.3g} "
             "steps), or positions are read so late"
         )
-    passive_tolerance = max(0.1 * drive.viscous_damping, 0.03 * joint.damping)
+    # Beside the damping of a drive much less cannot be told from none.
+    acting_damping = joint.damping * max(probe.gains.damping_factor, 1.0)
+    passive_tolerance = max(0.1 * drive.viscous_damping, 0.03 * acting_damping)
     if abs(probe.viscous_damping - drive.viscous_damping) > passive_tolerance:
         faults["passive"] = (
             f"passive damping of {probe.viscous_damping:.3g} N m s/rad acts, "
@@ -123,8 +125,8 @@ def find_faults(
         )
     if probe.gains.stable_share < 1.0:
         faults["unstable"] = (
-            "the joint diverges with its gains; it was probed with "
-            f"{probe.gains.stable_share:g} of them"
+            "with its gains the joint diverges, or swings from step to step; it was probed "
+            f"with {probe.gains.stable_share:g} of them"
         )
     return faults
 
