@@ -41,9 +41,8 @@ from pronk.robots.drive_law import DriveLaw
 from pronk.robots.robot import Joint, RobotSpec
 
 MOST_STEPS = 4_000_000
-"""Integration steps after which no further law is tried. Of 250 random simulators (`python -m
-benchmarks probe`, seeds 0 to 4) one reaches it, of which no law is found. A core takes 17 s for
-1,200,000."""
+"""Integration steps after which no further law is tried. A core takes 17 s for 1,200,000; of 750
+random simulators (`python -m benchmarks probe`, seeds 0 to 14) the longest takes 16 s."""
 _SHARE_OF_STEPS = 0.4
 """Share of the steps that are left in which laws are tried with one share of the gains."""
 _LIMIT_ERROR = 0.1
