@@ -188,13 +188,15 @@ def test_a_motion_as_small_as_rounding_is_no_hold(delay_steps: float) -> None:
     assert delay in (1, 2)
 
 
-@pytest.mark.parametrize("kind", ["numpy", "mujoco"])
-def test_gains_with_which_a_joint_swings_at_its_torque_limit_are_no_stable_ones(kind: str) -> None:
+@pytest.mark.parametrize("engine", ["numpy", "mujoco"])
+def test_gains_with_which_a_joint_swings_at_its_torque_limit_are_no_stable_ones(
+    engine: str,
+) -> None:
     """Per degree, not per radian, they are 57 times as large; the limit keeps the joint near."""
     mini_cheetah = replace(load_robot("mini_cheetah"), timestep_s=0.002, decimation=10)
     truth = replace(
         FAULTLESS,
-        kind=kind,
+        kind=engine,
         robot=mini_cheetah,
         joint="FR_knee",
         frictionloss=0.0,

@@ -28,7 +28,7 @@ def test_a_mask_has_the_robots_that_are_meant(robots: Any, expected: list[bool])
 
 
 def test_numbers_are_written_where_the_mask_is_and_into_the_same_memory() -> None:
-    kept = torch.zeros(3, 2)
-    view = kept[:]
-    overwrite(kept, torch.tensor([True, False, True])[:, None], torch.tensor([1.0, 2.0]))
-    assert view.tolist() == [[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]]
+    state = torch.zeros(3, 2)
+    memory = state[:]
+    overwrite(state, torch.tensor([True, False, True])[:, None], torch.tensor([1.0, 2.0]))
+    assert memory.tolist() == [[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pronk.arrays import Array
+from pronk.arrays import Array, Mask
 from pronk.errors import PronkError
 from pronk.identify.simulators.links import links_of
 from pronk.identify.simulators.probe.law_fit import AMPLITUDE, ProbeRuns, StepCount
@@ -196,12 +196,12 @@ class Bench:
                 f"{self._joint.name} does not respond to a step of {height:.2g} rad within "
                 f"{2 * _LONGEST_HOLD} steps."
             )
-        delay, hold, phase = _first_responses(distance > least_distance, first_steps)
+        delay, hold, phase = _first_responses(distance > least_distance)
         is_further = distance > 4.0 * least_distance
         if hold > 1 and is_further.any(axis=1).all():
             # A delay that leaves little of a step gives motions about as small as the least one,
             # which are read or not by rounding. In a hold all are alike.
-            other_delay, other_hold, other_phase = _first_responses(is_further, first_steps)
+            other_delay, other_hold, other_phase = _first_responses(is_further)
             if other_hold < hold:
                 return other_delay, other_hold, other_phase
         return delay, hold, phase
@@ -335,16 +335,17 @@ def _resolution(position: Array) -> float:
     return float(np.spacing(largest))
 
 
-def _first_responses(is_apart: Array, first_steps: Array) -> tuple[int, int, int]:
+def _first_responses(is_apart: Mask) -> tuple[int, int, int]:
     """Tell from the first motions after steps of the command when commands act.
 
     Args:
-        is_apart: Whether the joint has moved, bool (steps of the command, T).
-        first_steps: The step in which each command moves.
+        is_apart: Whether the joint has moved, shape (runs, T). The command of run k moves in step
+            `_REST + k`.
 
     Returns:
         What `Bench.latency` returns.
     """
+    first_steps = _REST + np.arange(len(is_apart))
     # Position is read at the start of a step: it is apart one step after the command acts.
     acting_steps = is_apart.argmax(axis=1) - 1
     lateness = acting_steps - first_steps
