@@ -165,15 +165,15 @@ class Bench:
         return bool(turns.mean() < _MOST_TURNS)
 
     def stable_share(self) -> float:
-        """Find the largest share of the gains, a power of 1/2, with which the joint stays near."""
+        """Find the largest share of the gains, a power of 1/2, with which the joint is stable."""
         for halvings in range(_HALVINGS + 1):
             share = 0.5**halvings
             if self.stable(share):
                 return share
         raise PronkError(
-            f"{self._joint.name} diverges even with 1/{2**_HALVINGS} of "
-            f"{self._joint.stiffness:g} N m/rad and {self._joint.damping:g} N m s/rad; check the "
-            "units and the timestep."
+            f"{self._joint.name} diverges, or swings from step to step, even with "
+            f"1/{2**_HALVINGS} of {self._joint.stiffness:g} N m/rad and "
+            f"{self._joint.damping:g} N m s/rad; check the units and the timestep."
         )
 
     def latency(self, share: float) -> tuple[int, int, int]:

@@ -147,7 +147,7 @@ def _answers(
     Args:
         bench: The experiments.
         stated: Law that the simulator states.
-        stable_share: Largest share of the gains with which the joint stays near.
+        stable_share: Largest share of the gains with which the joint is stable.
         steps: Integration steps of the fits.
 
     Raises:
