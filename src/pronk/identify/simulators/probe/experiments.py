@@ -200,7 +200,7 @@ class Bench:
         is_further = distance > 4.0 * least_distance
         if hold > 1 and is_further.any(axis=1).all():
             # A delay that leaves little of a step gives motions about as small as the least one,
-            # which are read or not by rounding. In a hold all are alike.
+            # of which rounding decides which are read. All commands of a hold give the same one.
             other_delay, other_hold, other_phase = _first_responses(is_further)
             if other_hold < hold:
                 return other_delay, other_hold, other_phase
