@@ -545,6 +545,16 @@ def urdf(folder: Path, *, inertia: float = 0.004, effort: float = 9.0, speed: fl
     return path
 
 
+@pytest.mark.parametrize("inertia", [1e308, 1e200, 1e12])
+def test_a_joint_that_no_robot_can_have_is_refused(inertia: float, tmp_path: Path) -> None:
+    path = urdf(tmp_path, inertia=inertia)
+    path.write_text(path.read_text().replace('="0.004"', f'="{inertia}"'))
+    error = refused("robot", "new", path)
+    assert "elbow" in error
+    assert "units" in error
+    assert not (tmp_path / "robot.yaml").exists()
+
+
 def test_a_urdf_needs_no_meshes_and_its_limits_are_used(tmp_path: Path) -> None:
     accepted("robot", "new", urdf(tmp_path))
     file = tmp_path / "robot.yaml"

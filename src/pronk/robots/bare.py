@@ -53,6 +53,8 @@ STOP_DISTANCE = 0.4
 """Distance of the pose from a stop, for a sweep of 0.25 rad and its overshoot [rad]."""
 STOP_SHARE = 0.4
 """Largest distance as a share of the range, so that a small range has room on both sides."""
+LARGEST_INERTIA = 1e9
+"""Inertia about a joint from which on it is taken for a mistake [kg m^2]: 1,000 t at 30 m."""
 DECIMATIONS = (4, 5, 10, 20, 40)
 """Physics steps of a command at 50 Hz: steps of 5, 4, 2, 1 and 0.5 ms."""
 COMMAND_HZ = 50.0
@@ -142,10 +144,11 @@ def describe_model(path: Path) -> ModelDescription:
         name = source.joint_names[hinge]
         dof = model.jnt_dofadr[hinge]
         inertia = float(mass[dof, dof])
-        if not 0.0 < inertia < math.inf:
+        if not 0.0 < inertia < LARGEST_INERTIA:
             raise RobotError(
                 f"{path}: the inertia about joint {name} is {inertia:g} kg m^2; expected a "
-                "positive number. Check its axis and the masses behind it."
+                f"positive number below {LARGEST_INERTIA:g}. Check its axis, and the masses and "
+                "lengths behind it and their units."
             )
         servo = servos[hinge]
         if servo.control_scale:
