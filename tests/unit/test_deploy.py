@@ -970,6 +970,28 @@ def test_messages_of_another_kind_are_refused(name: str, value: Any, tmp_path: P
         read_deploy_log(path)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"joints": [*HEADER["joints"], "HR_"]},
+        {"joints": HEADER["joints"][:-1]},
+        {"joints": [*HEADER["joints"][:-1], HEADER["joints"][0]]},
+        {"limits": {"joints": {"speed": [30.0] * 11}}},
+        {"limits": {"operating": 3}},
+    ],
+)
+def test_headers_of_other_joints_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:
+    """They would give joints the numbers of others."""
+    path = tmp_path / "run.mcap"
+    writer = McapWriter(path, TOPICS)
+    writer.put("/deploy/header", 0.0, {"schema": SCHEMA, **HEADER, **changes})
+    tick = record(0)
+    writer.put("/deploy/tick", 0.0, {field: tick[field].tolist() for field in TICK.names or ()})
+    writer.close()
+    with pytest.raises(LogError, match="header"):
+        read_deploy_log(path)
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     other.write_bytes(b"nothing")

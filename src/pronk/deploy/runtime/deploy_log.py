@@ -24,6 +24,7 @@ from pronk.deploy.runtime.records import STEP, TICK, VIRTUAL, Event
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.identify.logs.mcap import DamagedError, Record, records
+from pronk.policy.observation import JOINTS
 
 MAX_BYTES = 16 * 2**30
 """Largest size that a log may unpack to, four hours [bytes]. It is parsed chunk by chunk and only
@@ -363,6 +364,7 @@ def _log_of(messages: _Messages, damage: str, path: Path) -> DeployLog:
     header = messages.headers[0]
     if header.get("schema") != SCHEMA:
         raise LogError(f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}.")
+    _check_header(header, path)
     ticks = np.concatenate(messages.ticks)
     if not len(ticks):
         raise LogError(f"{path}: cut before the first tick; nothing to read.")
@@ -379,3 +381,33 @@ def _log_of(messages: _Messages, damage: str, path: Path) -> DeployLog:
         source=str(path),
         sha256=sha256(path),
     )
+
+
+def _check_header(header: dict[str, Any], path: Path) -> None:
+    """Refuse a header whose joints or limits are not those of the ticks.
+
+    Raises:
+        LogError: Another number of joints or of limits, or a joint named twice. A header of another
+            kind raises one of `_FOREIGN_ERRORS`.
+    """
+    joints = header["joints"]
+    if len(joints) != JOINTS or len(set(joints)) != JOINTS:
+        raise LogError(
+            f"{path}: its header names {len(joints)} joints, {len(set(joints))} of them different; "
+            f"a log has {JOINTS}. The header is damaged."
+        )
+    limits = header.get("limits", {})
+    parts = {name: limits.get(name, {}) for name in ("joints", "operating", "ages")}
+    for name, part in parts.items():
+        if not isinstance(part, dict):
+            raise LogError(
+                f"{path}: limits.{name} of its header is {part!r}; expected limits by name. The "
+                "header is damaged."
+            )
+    for name in ("speed", "torque"):
+        joint_limits = parts["joints"].get(name)
+        if joint_limits is not None and np.shape(np.array(joint_limits, float)) != (JOINTS,):
+            raise LogError(
+                f"{path}: limits.joints.{name} of its header are not those of {JOINTS} joints. "
+                "The header is damaged."
+            )
