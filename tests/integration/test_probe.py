@@ -209,6 +209,23 @@ def test_gains_with_which_a_joint_swings_at_its_torque_limit_are_no_stable_ones(
     assert probe.law.drive == DriveLaw()
 
 
+def test_passive_damping_that_is_little_beside_the_drives_is_not_named() -> None:
+    """Of 57 times the drive's damping the fit takes or gives 0.05 N m s/rad."""
+    law = DriveLaw(kind="implicit_damping")
+    truth = replace(
+        FAULTLESS,
+        kind="mujoco",
+        robot=replace(load_robot("go2"), timestep_s=0.002, decimation=10),
+        joint="RL_knee",
+        law=law,
+        stated=law,
+        frictionloss=0.0877,
+        delay_s=0.0,
+        scale=180.0 / np.pi,
+    )
+    assert set(probed(truth).faults) == {"degrees"}
+
+
 @pytest.mark.slow
 def test_random_simulators_are_named() -> None:
     engines = ["numpy", "mujoco"]
