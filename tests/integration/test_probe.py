@@ -150,17 +150,14 @@ def test_rounding_of_small_motions_is_no_limit_of_the_torque(stiffness: float) -
     mini_cheetah = replace(load_robot("mini_cheetah"), timestep_s=0.001, decimation=20)
     knee = replace(mini_cheetah.joint("FR_knee"), stiffness=stiffness, damping=0.45)
     joints = [knee if joint.name == knee.name else joint for joint in mini_cheetah.joints]
-    truth = Truth(
+    truth = replace(
+        FAULTLESS,
         kind="mujoco",
         robot=replace(mini_cheetah, joints=tuple(joints)),
         joint="FR_knee",
-        law=DriveLaw(),
-        stated=DriveLaw(),
         armature=knee.drive.armature + DEFAULT_ARMATURE,
         frictionloss=0.0,
         delay_s=0.0,
-        hold=1,
-        scale=1.0,
         fault="armature",
     )
     probe = probe_joint(SinglePrecision(truth), truth.robot, truth.joint)

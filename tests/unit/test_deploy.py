@@ -978,6 +978,9 @@ def test_messages_of_another_kind_are_refused(name: str, value: Any, tmp_path: P
         {"joints": [*HEADER["joints"][:-1], HEADER["joints"][0]]},
         {"limits": {"joints": {"speed": [30.0] * 11}}},
         {"limits": {"operating": 3}},
+        {"joints": "abcdefghijkl"},
+        {"limits": {"operating": {"tilt": "0.8"}}},
+        {"limits": {"ages": {"damp_s": [0.1]}}},
     ],
 )
 def test_headers_of_other_joints_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ def margins(log: DeployLog) -> list[Margin]:
             quantity="age of the state",
             unit="s",
             largest=_largest(log.ticks.state_age[:count]),
-            limit=float(ages.get("damp_s", np.nan)),
+            limit=float(ages.get("damp_s") or np.nan),
         ),
     ]
 

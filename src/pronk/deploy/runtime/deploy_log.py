@@ -387,11 +387,11 @@ def _check_header(header: dict[str, Any], path: Path) -> None:
     """Refuse a header whose joints or limits are not those of the ticks.
 
     Raises:
-        LogError: Another number of joints or of limits, or a joint named twice. A header of another
-            kind raises one of `_FOREIGN_ERRORS`.
+        LogError: Another number of joints or of limits, a joint named twice, or a limit that is no
+            number. A header of another kind raises one of `_FOREIGN_ERRORS`.
     """
     joints = header["joints"]
-    if len(joints) != JOINTS or len(set(joints)) != JOINTS:
+    if not isinstance(joints, list) or len(joints) != JOINTS or len(set(joints)) != JOINTS:
         raise LogError(
             f"{path}: its header names {len(joints)} joints, {len(set(joints))} of them different; "
             f"a log has {JOINTS}. The header is damaged."
@@ -410,4 +410,13 @@ def _check_header(header: dict[str, Any], path: Path) -> None:
             raise LogError(
                 f"{path}: limits.joints.{name} of its header are not those of {JOINTS} joints. "
                 "The header is damaged."
+            )
+    used_limits = (("operating", "temperature"), ("operating", "tilt"), ("ages", "damp_s"))
+    for name, limit_name in used_limits:
+        limit = parts[name].get(limit_name)
+        # A limit that is infinite, as the tilt of a hung robot, is null in a log.
+        if limit is not None and not isinstance(limit, int | float):
+            raise LogError(
+                f"{path}: limits.{name}.{limit_name} of its header is {limit!r}; expected a "
+                "number. The header is damaged."
             )

@@ -115,7 +115,7 @@ def find_faults(
             f"commands act {1e3 * probe.delay_s:.3g} ms late ({probe.delay_s / runs.timestep:.3g} "
             "steps), or positions are read so late"
         )
-    # Beside the damping of a drive much less cannot be told from none.
+    # The fit splits damping between the drive and the joint, to about this share of the drive's.
     acting_damping = joint.damping * max(probe.gains.damping_factor, 1.0)
     passive_tolerance = max(0.1 * drive.viscous_damping, 0.03 * acting_damping)
     if abs(probe.viscous_damping - drive.viscous_damping) > passive_tolerance:
