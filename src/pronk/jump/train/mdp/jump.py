@@ -295,9 +295,11 @@ class JumpState:
         # Gap. No foot stepped between the front-most that took off and the hind-most that lands
         # (A16).
         lands = self.airborne & ~airborne & self.mode
-        direction = inputs.direction[:, :, None]
-        taken_off_at = (self.stance @ direction).amax(dim=(1, 2))
-        landed_at = (inputs.feet @ direction).amin(dim=(1, 2))
+        # A product of matrices may be computed with TF32, in which a position 60 m from the world's
+        # origin is rounded to 3 cm.
+        direction = inputs.direction[:, None, :]
+        taken_off_at = (self.stance * direction).sum(dim=-1).amax(dim=-1)
+        landed_at = (inputs.feet * direction).sum(dim=-1).amin(dim=-1)
         gap = (landed_at - taken_off_at - self.overspeed_distance).clamp_max(s.max_gap)
         gap_before = self.best_gap * keep
         self.best_gap = torch.maximum(gap_before, gap * self.reward_scale * lands)

@@ -99,6 +99,11 @@ class PronkRunner(MjlabOnPolicyRunner):
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
             self._step_graphs = StepGraphs(env.unwrapped)
+            self.note(
+                "warning: ten policies trained with --compile jump 0.51 to 0.60 m forwards at "
+                "1 m/s, five trained without it 0.59 to 0.66 m; the cause is not found "
+                '(docs/evidence/training.md, "Speed of one training").'
+            )
             for part in self._step_graphs.left_out:
                 self.note(f"note: --compile leaves {part} as it is: not all of it is pronk's own.")
         warning = check_cuda_graphs(env.unwrapped.sim, device)
