@@ -2,18 +2,21 @@
 
 Operations are traced once, on the memory of then, and run again on that memory when the graph is
 replayed. Python does not run again. Operations that a CUDA graph refuses, since they wait for the
-device or copy a number to it, are refused.
+device or copy a number to it, are refused. As a CUDA graph does, a trace keeps nothing alive but
+what it made itself; a replay on memory that was freed since is refused.
 """
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten
+from torch.utils._pytree import tree_flatten, tree_map
 
 REFUSED = {
     "aten::_local_scalar_dense",
@@ -37,6 +40,7 @@ class TracedGraph:
 
     def __init__(self, device: str, stream: Any = None) -> None:
         self._trace: list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]] = []
+        self._borrowed: list[tuple[str, StorageWeakRef]] = []
 
     def record(self, function: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Trace a function, and undo what it did."""
@@ -48,12 +52,14 @@ class TracedGraph:
         with torch.no_grad():
             for tensor, before in reversed(tracer.overwritten):
                 tensor.copy_(before)
-        self._trace = tracer.trace
+        self._trace, self._borrowed = tracer.finish()
         return outputs
 
     @torch.no_grad()
     def replay(self) -> None:
         """Run the operations on the memory of the recording; gradients are among them."""
+        for name, storage in self._borrowed:
+            assert not storage.expired(), f"{name} is replayed on memory that was freed"
         for operation, arguments, options, outputs in self._trace:
             results, _ = tree_flatten(operation(*arguments, **options))
             for output, result in zip(outputs, results, strict=True):
@@ -69,6 +75,34 @@ class _Tracer(TorchDispatchMode):
         self.trace: list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]] = []
         self.overwritten: list[tuple[Tensor, Tensor]] = []
         self._numbers: list[Tensor] = []
+        self._made: list[Tensor] = []
+
+    def finish(
+        self,
+    ) -> tuple[
+        list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]],
+        list[tuple[str, StorageWeakRef]],
+    ]:
+        """Return the trace with what it has not made as bare memory, and who owns that memory."""
+        made = {tensor.untyped_storage().data_ptr() for tensor in [*self._made, *self._numbers]}
+        borrowed: dict[int, tuple[str, StorageWeakRef]] = {}
+        name = ""
+
+        def borrow(argument: Any) -> Any:
+            if not isinstance(argument, Tensor) or argument.numel() == 0:
+                return argument
+            storage = argument.untyped_storage()
+            if storage.data_ptr() in made:
+                return argument
+            if storage.data_ptr() not in borrowed:
+                borrowed[storage.data_ptr()] = (name, StorageWeakRef(storage))
+            return _bare(argument)
+
+        trace = []
+        for operation, arguments, options, outputs in self.trace:
+            name = operation._schema.name
+            trace.append((operation, *tree_map(borrow, (arguments, options, outputs))))
+        return trace, list(borrowed.values())
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
@@ -98,8 +132,20 @@ class _Tracer(TorchDispatchMode):
                     self.overwritten.append((target, target.clone()))
         results = func(*args, **options)
         outputs, _ = tree_flatten(results)
+        before = {x.untyped_storage().data_ptr() for x in arguments if isinstance(x, Tensor)}
+        for output in outputs:
+            if isinstance(output, Tensor) and output.untyped_storage().data_ptr() not in before:
+                self._made.append(output)
         self.trace.append((func, args, options, outputs))
         return results
+
+
+def _bare(tensor: Tensor) -> Tensor:
+    """Return a tensor on the same memory that does not keep it alive."""
+    storage = tensor.untyped_storage()
+    memory = (ctypes.c_byte * storage.nbytes()).from_address(storage.data_ptr())
+    numbers = torch.frombuffer(memory, dtype=tensor.dtype)
+    return torch.as_strided(numbers, tensor.size(), tensor.stride(), tensor.storage_offset())
 
 
 def _shares_memory(one: Tensor, other: Tensor) -> bool:

@@ -59,7 +59,7 @@ def rollout(*, device: str, records: bool, robots: int = ROBOTS) -> list[dict[st
                     curriculum(env).apply(env, PHASES[phase], step / steps)
                     if graphs is not None:
                         graphs.begin()
-                if step % 3 == 2:
+                if step % 4 < 2:  # in the first two steps of an iteration, too
                     ended = step % ROBOTS // 2
                     for robot in range(ended, ended + 3):
                         env.episode_length_buf[robot::ROBOTS] = 10**6  # episodes end

@@ -80,8 +80,9 @@ class DelayedJointPositionAction(JointPositionAction):
         self.position_target = torch.zeros_like(self._processed_actions)
         """Joint position targets of the policy step under way [rad]. (N, joints)"""
         self._is_step_open = False
-        self.guidance: Tensor | None = None
-        """Added to the coming targets, if not None [rad]. (N, joints)"""
+        self.guidance = torch.zeros_like(self._processed_actions)
+        """Added to the coming targets [rad]; stays in its memory, which recordings write to.
+        (N, joints)"""
         all_joints = list(range(self._entity.num_joints))
         self._joints: slice | Tensor = self._target_ids
         if self._target_ids.tolist() == all_joints:
@@ -99,8 +100,7 @@ class DelayedJointPositionAction(JointPositionAction):
     def process_actions(self, actions: Tensor) -> None:
         """Issue the targets of a policy step, of the network's actions (N, joints)."""
         super().process_actions(actions)
-        if self.guidance is not None:
-            self._processed_actions += self.guidance
+        self._processed_actions += self.guidance
         self.position_target.copy_(self._processed_actions)
         count = len(self._ages)
         self._newest = (self._newest + 1) % count
@@ -158,8 +158,7 @@ class DelayedJointPositionAction(JointPositionAction):
         self.battery.reset(robots)
         self.finish_step()
         self.rotors.reset(robots)
-        if self.guidance is not None:
-            self.guidance.masked_fill_(robots[:, None], 0.0)
+        self.guidance.masked_fill_(robots[:, None], 0.0)
         low, high = self.cfg.delay_steps
         if high == 0:
             return

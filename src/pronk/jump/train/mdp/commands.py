@@ -427,7 +427,7 @@ class MotionCommand(CommandTerm):
         """Set what the action term adds to the targets of the coming step."""
         action = joint_position_action(self._env)
         if self.guidance_scale == 0.0:
-            action.guidance = None
+            action.guidance.zero_()
             return
         state = self.state
         last_step = len(self._guidance) - 1
@@ -441,7 +441,7 @@ class MotionCommand(CommandTerm):
         if self.cfg.guidance_sweep != 0.0:
             speed = self.cfg.guidance_sweep * self.velocity[:, :1]
             offsets = offsets + speed * self._sweep[steps]
-        action.guidance = self.guidance_scale * offsets
+        action.guidance.copy_(self.guidance_scale * offsets)
 
     def _draw(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Draw velocities (N, 3), and times until the next, with jump and without it [s]."""

@@ -100,8 +100,8 @@ class PronkRunner(MjlabOnPolicyRunner):
         if compiles:
             self._step_graphs = StepGraphs(env.unwrapped)
             self.note(
-                "warning: ten policies trained with --compile jump 0.51 to 0.60 m forwards at "
-                "1 m/s, five trained without it 0.59 to 0.66 m; the cause is not found "
+                "warning: policies trained with --compile jumped shorter. A defect that may be the "
+                "cause is mended, but none has been trained since "
                 '(docs/evidence/training.md, "Speed of one training").'
             )
             for part in self._step_graphs.left_out:
