@@ -18,6 +18,8 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+Operation = tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]
+"""An operation of PyTorch, its arguments, options and results."""
 REFUSED = {
     "aten::_local_scalar_dense",
     "aten::nonzero",
@@ -39,7 +41,7 @@ class TracedGraph:
         return True
 
     def __init__(self, device: str, stream: Any = None) -> None:
-        self._trace: list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]] = []
+        self._trace: list[Operation] = []
         self._borrowed: list[tuple[str, StorageWeakRef]] = []
 
     def record(self, function: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
@@ -72,19 +74,21 @@ class _Tracer(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.trace: list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]] = []
+        self.trace: list[Operation] = []
         self.overwritten: list[tuple[Tensor, Tensor]] = []
         self._numbers: list[Tensor] = []
-        self._made: list[Tensor] = []
+        self._new_tensors: list[Tensor] = []
 
-    def finish(
-        self,
-    ) -> tuple[
-        list[tuple[Any, tuple[Any, ...], dict[str, Any], list[Any]]],
-        list[tuple[str, StorageWeakRef]],
-    ]:
-        """Return the trace with what it has not made as bare memory, and who owns that memory."""
-        made = {tensor.untyped_storage().data_ptr() for tensor in [*self._made, *self._numbers]}
+    def finish(self) -> tuple[list[Operation], list[tuple[str, StorageWeakRef]]]:
+        """Return the trace, which keeps nothing alive that it did not allocate.
+
+        Returns:
+            The operations, with bare memory in the place of tensors from outside, and of each
+            storage from outside the first operation on it and a weak reference.
+        """
+        own_storages = set()
+        for tensor in [*self._new_tensors, *self._numbers]:
+            own_storages.add(tensor.untyped_storage().data_ptr())
         borrowed: dict[int, tuple[str, StorageWeakRef]] = {}
         name = ""
 
@@ -92,13 +96,14 @@ class _Tracer(TorchDispatchMode):
             if not isinstance(argument, Tensor) or argument.numel() == 0:
                 return argument
             storage = argument.untyped_storage()
-            if storage.data_ptr() in made:
+            address = storage.data_ptr()
+            if address in own_storages:
                 return argument
-            if storage.data_ptr() not in borrowed:
-                borrowed[storage.data_ptr()] = (name, StorageWeakRef(storage))
+            if address not in borrowed:
+                borrowed[address] = (name, StorageWeakRef(storage))
             return _bare(argument)
 
-        trace = []
+        trace: list[Operation] = []
         for operation, arguments, options, outputs in self.trace:
             name = operation._schema.name
             trace.append((operation, *tree_map(borrow, (arguments, options, outputs))))
@@ -135,7 +140,7 @@ class _Tracer(TorchDispatchMode):
         before = {x.untyped_storage().data_ptr() for x in arguments if isinstance(x, Tensor)}
         for output in outputs:
             if isinstance(output, Tensor) and output.untyped_storage().data_ptr() not in before:
-                self._made.append(output)
+                self._new_tensors.append(output)
         self.trace.append((func, args, options, outputs))
         return results
 
@@ -148,5 +153,5 @@ def _bare(tensor: Tensor) -> Tensor:
     return torch.as_strided(numbers, tensor.size(), tensor.stride(), tensor.storage_offset())
 
 
-def _shares_memory(one: Tensor, other: Tensor) -> bool:
-    return one.untyped_storage().data_ptr() == other.untyped_storage().data_ptr()
+def _shares_memory(first: Tensor, second: Tensor) -> bool:
+    return first.untyped_storage().data_ptr() == second.untyped_storage().data_ptr()
