@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from pronk.jump.train.compiled import RecordedFunction
+from traced_graph import TracedGraph
 
 pytestmark = pytest.mark.train
 
@@ -72,3 +73,15 @@ def test_recorded_steps_are_those_without_a_recording(device: str) -> None:
     weights = torch.nn.utils.parameters_to_vector(fast.network.parameters())
     expected = torch.nn.utils.parameters_to_vector(plain.network.parameters())
     torch.testing.assert_close(weights, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_trace_refuses_memory_that_was_freed() -> None:
+    """A CUDA graph would write to whatever has that memory then."""
+    owner = {"numbers": torch.zeros(3)}
+    graph = TracedGraph("cpu")
+    graph.record(lambda: (owner["numbers"].add_(1.0),))
+    graph.replay()
+    assert owner["numbers"].tolist() == [1.0, 1.0, 1.0]
+    owner["numbers"] = torch.zeros(3)
+    with pytest.raises(AssertionError, match="freed"):
+        graph.replay()

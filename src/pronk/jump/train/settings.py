@@ -57,8 +57,8 @@ class DeviceSettings:
     process 0, which writes the run. All share --out."""
     compile: bool = False
     """Compile rewards, networks and losses with torch.compile, which changes how they round;
-    compiling takes time at first. Policies trained with it jumped shorter; a defect is mended, but
-    none has been trained since."""
+    compiling takes time at first. Policies trained with it jumped shorter; a defect is
+    corrected, but none has been trained since."""
 
     def __post_init__(self) -> None:
         """Refuse names that are no hosts."""

@@ -101,7 +101,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             self._step_graphs = StepGraphs(env.unwrapped)
             self.note(
                 "warning: policies trained with --compile jumped shorter. A defect that may be the "
-                "cause is mended, but none has been trained since "
+                "cause is corrected, but none has been trained since "
                 '(docs/evidence/training.md, "Speed of one training").'
             )
             for part in self._step_graphs.left_out:
