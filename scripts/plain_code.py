@@ -27,6 +27,8 @@ VAGUE_NAMES_BAR = 0.5
 """Largest share of names that do not say what they hold [%]."""
 MAX_FIELDS = 15
 """Most fields of a dataclass."""
+TASK_FUNCTIONS = ("env_cfg", "rl_cfg")
+"""Functions of `env_cfgs.py` and `rl_cfg.py` beside the `robot.yaml` of a robot."""
 EXEMPT_DATACLASSES = {
     "TrialResults": "the artefact summary.json",
     "LowState": "a message whose fields Unitree declares",
@@ -191,11 +193,16 @@ def _is_any(annotation: ast.expr | None) -> bool:
 
 
 def repeated_names(path: Path) -> dict[str, list[str]]:
-    """Return public classes and functions of modules that have a name in common, by name."""
+    """Return public classes and functions of modules that have a name in common, by name.
+
+    Functions that each robot has for its training task have one meaning.
+    """
     places: dict[str, list[str]] = {}
     for file in python_files(path):
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+            if not isinstance(node, ast.ClassDef | ast.FunctionDef) or node.name.startswith("_"):
+                continue
+            if node.name not in TASK_FUNCTIONS:
                 places.setdefault(node.name, []).append(f"{file}:{node.lineno}")
     return {name: found_at for name, found_at in places.items() if len(found_at) > 1}
 

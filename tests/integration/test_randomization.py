@@ -33,9 +33,9 @@ from pronk.jump.train.mdp.observations import (
     measured_joint_velocity,
 )
 from pronk.jump.train.tasks.jump_env_cfg import (
-    draw_contact_damping,
-    draw_rotor_frequency,
     draw_weak_drives,
+    set_contact_damping,
+    set_rotor_frequency,
     without_randomization,
 )
 from pronk.robots.legged import legged
@@ -128,7 +128,7 @@ def contact_env(least: float) -> Any:
     """Return nominal robots but for the damping of their feet on the ground."""
     cfg = training_env.config(MANY, MATCHED)
     without_randomization(cfg)
-    draw_contact_damping(cfg, least)
+    set_contact_damping(cfg, least)
     return ManagerBasedRlEnv(cfg, device="cpu")
 
 
@@ -160,7 +160,7 @@ def rotor_robots() -> Iterator[Any]:
     """Nominal robots without noise, whose joints are measured on rotors of 40 to 160 Hz."""
     cfg = training_env.config(MANY, MATCHED)
     without_randomization(cfg)
-    draw_rotor_frequency(cfg, 40.0)
+    set_rotor_frequency(cfg, 40.0)
     env = ManagerBasedRlEnv(cfg, device="cpu")
     yield env
     env.close()

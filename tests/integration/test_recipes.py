@@ -15,9 +15,16 @@ from pronk.errors import PronkError
 from pronk.jump.train.gains import training_gains
 from pronk.jump.train.mdp.commands import NAME as COMMAND
 from pronk.jump.train.phases import PHASES, TASKS, changed_phases
-from pronk.jump.train.recipe import SCHEMA, apply_recipe, load_recipe, load_recipes
+from pronk.jump.train.recipe import (
+    SCHEMA,
+    apply_recipe,
+    load_recipe,
+    load_recipes,
+    task_numbers,
+)
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
+from pronk.jump.train.tasks.jump_env_cfg import set_rotor_frequency
 from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import ROBOT, config
 
@@ -76,17 +83,24 @@ def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
     assert cfg.actions["joint_position"].scale == 0.42 != before
 
 
-def test_the_contact_of_the_feet_is_changed_only_where_a_share_is_less(tmp_path: Path) -> None:
-    cfg = task("task: {contact_damping: 0.4}", tmp_path)
-    assert cfg.events["contact"].params["least"] == 0.4
-    for text in ("task: {contact_damping: 1}", "task: {action_scale: 0.4}"):
-        assert "contact" not in task(text, tmp_path).events
+def test_the_contact_of_the_feet_is_drawn_from_another_share_or_not(tmp_path: Path) -> None:
+    default = config(8, training_gains("naive", ROBOT))
+    cfg = task("task: {contact_damping: 0.6}", tmp_path)
+    assert cfg.events["contact"].params["least"] == 0.6
+    assert task_numbers(cfg) == {**task_numbers(default), "contact_damping": 0.6}
+    cfg = task("task: {contact_damping: 1}", tmp_path)
+    assert "contact" not in cfg.events
+    assert task_numbers(cfg) == {**task_numbers(default), "contact_damping": 1.0}
 
 
-def test_joints_are_measured_on_rotors(tmp_path: Path) -> None:
-    cfg = task("task: {rotor_frequency: 40}", tmp_path)
-    assert cfg.events["rotors"].params["lowest_hz"] == 40.0
-    assert "rotors" not in task("task: {action_scale: 0.4}", tmp_path).events
+def test_joints_are_measured_on_other_rotors_or_on_links(tmp_path: Path) -> None:
+    default = config(8, training_gains("naive", ROBOT))
+    cfg = task("task: {rotor_frequency: 60}", tmp_path)
+    assert cfg.events["rotors"].params["lowest_hz"] == 60.0
+    assert task_numbers(cfg) == {**task_numbers(default), "rotor_frequency": 60.0}
+    cfg = task("task: {rotor_frequency: 0}", tmp_path)
+    assert "rotors" not in cfg.events
+    assert task_numbers(cfg) == {**task_numbers(default), "rotor_frequency": 0.0}
 
 
 def test_rotors_without_inertia_are_refused(tmp_path: Path) -> None:
@@ -95,6 +109,7 @@ def test_rotors_without_inertia_are_refused(tmp_path: Path) -> None:
     path.write_text("schema: pronk/recipe/1\ntask: {rotor_frequency: 40}\n")
     knees = cfg.scene.entities["robot"].articulation.actuators[2]
     knees.armature = 0.0
+    set_rotor_frequency(cfg, 0.0)
     with pytest.raises(PronkError, match=r"FR_knee.* is 0") as refusal:
         apply_recipe(cfg, load_recipe(path))
     assert str(path) in str(refusal.value)
@@ -141,7 +156,8 @@ def test_the_direction_of_a_lift_off_is_changed(tmp_path: Path) -> None:
         ("task: {action_scale: 0}", "action_scale|more than 0"),
         ("task: {contact_damping: 0}", "contact_damping|more than 0"),
         ("task: {contact_damping: 1.5}", "contact_damping|up to 1"),
-        ("task: {rotor_frequency: -40}", "rotor_frequency|more than 0"),
+        ("task: {rotor_frequency: -40}", "rotor_frequency|10 Hz or more"),
+        ("task: {rotor_frequency: .inf}", "rotor_frequency|finite"),
         ("task: {rotor_frequency: 4}", "rotor_frequency|10 Hz or more"),
     ],
 )
@@ -256,17 +272,32 @@ def settings_of(cfg: Any) -> str:
 
 MOST_TERMS = 20
 """Number of reward terms that a task and a shipped recipe may have in a phase."""
+DEFAULT_LAYERS = ("forward", "contact", "rotors", "walk_speed")
+"""Recipes that the default consists of."""
 MORE_TERMS = {"go2": 21, "thirty_terms": 30}
 """The same of the Go2's recipe, which pays for the gap beside the distance, and of that with the
 terms that the default has left out."""
 
 
-def test_the_default_is_the_recipe_of_the_study() -> None:
-    """The study of what a match is worth was trained with forward.yaml, which names each change."""
-    forward = Path(__file__).parents[2] / "examples" / "recipes" / "forward.yaml"
+def test_the_default_consists_of_recipes_that_were_measured() -> None:
+    """Each of its layers changes nothing, and with all of them the former default becomes it."""
+    folder = Path(__file__).parents[2] / "examples" / "recipes"
+    layers = [folder / f"{name}.yaml" for name in DEFAULT_LAYERS]
     default = task_with("mini_cheetah", [])
-    assert settings_of(task_with("mini_cheetah", [forward])) == settings_of(default)
+    for layer in layers:
+        assert settings_of(task_with("mini_cheetah", [layer])) == settings_of(default)
+    former = folder / "former_default.yaml"
+    assert settings_of(task_with("mini_cheetah", [former])) != settings_of(default)
+    assert settings_of(task_with("mini_cheetah", [former, *layers])) == settings_of(default)
     assert len(default.rewards) == MOST_TERMS
+
+
+def test_the_recipe_of_the_go2_is_as_its_policies_were_trained() -> None:
+    """The former default changes nothing in it."""
+    folder = Path(__file__).parents[2] / "examples" / "recipes"
+    go2 = folder / "go2.yaml"
+    expected = settings_of(task_with("go2", [folder / "former_default.yaml", go2]))
+    assert settings_of(task_with("go2", [go2])) == expected
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
@@ -282,8 +313,10 @@ def test_the_shipped_recipes_apply(path: Path) -> None:
             weights |= {name: span for name, span in phase.weights.items() if name in weights}
             terms = sum(1 for span in weights.values() if any(span))
             assert terms <= MORE_TERMS.get(path.stem, MOST_TERMS)
-    is_default = path.stem == "forward"
-    assert bool(changed_robots) != is_default
+    if path.stem in DEFAULT_LAYERS:
+        assert "mini_cheetah" not in changed_robots
+    else:
+        assert changed_robots
     assert path.read_text().startswith("# ")
 
 
@@ -294,7 +327,7 @@ def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
     from pronk.jump.train.phases import STEPS_PER_ITERATION, curriculum
 
     text = "rewards: {clearance_gap: {jump_b: [4, 8]}, posture: -0.5, crouch: 0}\n"
-    cfg = task(text + "jump_scales: {tracking_linear: {jump_a: 2}}", tmp_path)
+    cfg = task(text + "jump_scales: {approach_linear: {jump_a: 2}}", tmp_path)
     cfg.curriculum["phases"].params.update(TASKS["all"])
     cfg.scene.num_envs = 2
     env = ManagerBasedRlEnv(cfg, device="cpu")
@@ -304,7 +337,7 @@ def test_an_environment_has_the_weights_of_its_recipe(tmp_path: Path) -> None:
         assert env.reward_manager.get_term_cfg("clearance_gap").weight == pytest.approx(expected)
         assert env.reward_manager.get_term_cfg("posture").weight == -0.5
         # A term without a factor of its own has that of a phase in this phase alone.
-        scale = env.reward_manager.get_term_cfg("tracking_linear").params.get("jump_scale", 1.0)
+        scale = env.reward_manager.get_term_cfg("approach_linear").params.get("jump_scale", 1.0)
         assert scale == (2.0 if 300 <= iteration < 520 else 1.0)
         assert curriculum(env).total == 1080
     assert "crouch" not in env.reward_manager.active_terms

@@ -106,6 +106,7 @@ def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
         (("gains", "sha256"), 5),
         (("recipe",), ["walk_speed.yaml"]),
         (("recipe",), {"sha256": "", "task": 0.5}),
+        (("task", "contact_damping"), "soft"),
         (("finished",), "yes"),
         (("sessions",), [{}]),
         (("sessions",), {}),
@@ -115,7 +116,8 @@ def test_a_record_with_a_value_of_another_type_is_refused(
     tmp_path: Path, place: tuple[str, ...], value: Any
 ) -> None:
     settings = TrainSettings(task="walk", out=tmp_path, gains="naive").completed()
-    record = new_record(settings, training_gains("naive", load_robot("mini_cheetah")))
+    gains = training_gains("naive", load_robot("mini_cheetah"))
+    record = new_record(settings, gains, task={"contact_damping": 0.4})
     folder = RunFolder(tmp_path)
     folder.write(record)
     assert folder.read() == record
@@ -199,6 +201,7 @@ def test_a_robot_with_its_own_task(tmp_path: Path) -> None:
     shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
     shutil.copytree(shipped, tmp_path, dirs_exist_ok=True)
     robot = str(tmp_path / "robot.yaml")
+    (tmp_path / "env_cfgs.py").unlink()
     with pytest.raises(PronkError, match="no training task"):
         load_task(robot)
     (tmp_path / "env_cfgs.py").write_text(ENV_CFGS)

@@ -147,6 +147,10 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path) -> None:
     assert not stopped["finished"]
     assert stopped["sessions"][0]["stopped"] == "SIGTERM"
     assert 1 <= checkpoint.read_checkpoint(folder.checkpoint())["iter"] + 1 < 3
+    # One that began with joints measured on links, as of runs that have not recorded it.
+    folder.write({name: entry for name, entry in stopped.items() if name != "task"})
+    assert train("walk", "--resume", "--out", folder.path) == 2
+    folder.write(stopped)
     assert train("walk", "--resume", "--out", folder.path) == 0
     record = folder.read()
     assert record["finished"]

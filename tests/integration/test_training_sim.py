@@ -25,7 +25,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder, new_record
-from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe
+from pronk.jump.train.recipe import Recipe, apply_recipe, load_recipe, task_numbers
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import contract_for, export_policy
 from pronk.jump.train.settings import DrawSettings, TrainSettings
@@ -193,7 +193,10 @@ def write_record(
     settings = TrainSettings(task="all", out=folder.path, gains="gains.yaml")
     if draws is not None:
         settings = replace(settings, draws=draws)
-    folder.write(new_record(settings.completed(), gains, recipe=recipe))
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    if recipe is not None:
+        apply_recipe(cfg, recipe)
+    folder.write(new_record(settings.completed(), gains, task=task_numbers(cfg), recipe=recipe))
 
 
 @pytest.fixture(scope="module")

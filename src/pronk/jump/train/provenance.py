@@ -17,6 +17,7 @@ import json
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -52,7 +53,7 @@ class StoredRecipe(msgspec.Struct, kw_only=True):
     """Types of what is read of a recipe's record."""
 
     sha256: str
-    task: dict[str, Any] = {}
+    task: dict[str, float] = {}
 
 
 class StoredSession(msgspec.Struct, kw_only=True):
@@ -71,6 +72,7 @@ class StoredRun(msgspec.Struct, kw_only=True):
     finished: bool
     sessions: list[StoredSession]
     recipe: StoredRecipe | None = None
+    task: dict[str, float] = {}
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,7 @@ def new_record(
     settings: TrainSettings,
     gains: TrainingGains,
     *,
+    task: Mapping[str, float],
     recipe: Recipe | None = None,
     start_sha256: str = "",
 ) -> dict[str, Any]:
@@ -181,6 +184,7 @@ def new_record(
     Args:
         settings: Its completed settings.
         gains: What it trains with.
+        task: Numbers of the task that a recipe may change (`recipe.task_numbers`).
         recipe: The recipe, if there is one.
         start_sha256: Hash of the checkpoint that it begins with; empty if it begins with none.
     """
@@ -196,6 +200,7 @@ def new_record(
             "unmatched": dict(gains.unmatched),
         },
         "recipe": None if recipe is None else recipe.record(),
+        "task": dict(task),
         "start_sha256": start_sha256,
         "phases": {},
         "finished": False,

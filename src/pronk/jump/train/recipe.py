@@ -67,11 +67,11 @@ ACTION_SCALE = "action_scale"
 which a policy explores, is in units of it."""
 CONTACT_DAMPING = "contact_damping"
 """Another one: smallest share of the damping of the feet on the ground that is drawn for a robot
-(`events.randomize_contact`)."""
+(`events.randomize_contact`); 1 draws nothing."""
 ROTOR_FREQUENCY = "rotor_frequency"
 """Another one: joints are measured on rotors behind belts or gears that give way. It is the lowest
 natural frequency of a rotor while its link is held that is drawn (`events.randomize_rotors`)
-[Hz]."""
+[Hz]; with 0 joints are measured on their links."""
 SOFTEST_HZ = 10.0
 """Least `ROTOR_FREQUENCY`: at 10 Hz the belt of a knee of the Mini Cheetah is as soft as its drive,
 25 N m/rad, and does not hold the robot up [Hz]."""
@@ -425,7 +425,7 @@ def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: flo
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     """Change the scale of the actions, the contact of the feet, and what encoders measure."""
     from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
-    from pronk.jump.train.tasks.jump_env_cfg import draw_contact_damping, draw_rotor_frequency
+    from pronk.jump.train.tasks.jump_env_cfg import set_contact_damping, set_rotor_frequency
 
     action = cfg.actions[NAME]
     assert isinstance(action, DelayedJointPositionActionCfg)
@@ -439,11 +439,38 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
             action.scale = value
         elif name == ROTOR_FREQUENCY:
             try:
-                draw_rotor_frequency(cfg, value)
+                set_rotor_frequency(cfg, value)
             except PronkError as error:
                 raise ArtefactError(f"{source}: task: {name}: {error}") from None
-        elif value < 1.0:
-            draw_contact_damping(cfg, value)
+        else:
+            set_contact_damping(cfg, value)
+
+
+def task_numbers(cfg: ManagerBasedRlEnvCfg) -> dict[str, float]:
+    """Return the `TASK_NUMBERS` of the configuration of an environment by name."""
+    from pronk.jump.train.mdp.actions import NAME
+
+    contact = cfg.events.get("contact")
+    rotors = cfg.events.get("rotors")
+    return {
+        ACTION_SCALE: float(cfg.actions[NAME].scale),
+        CONTACT_DAMPING: 1.0 if contact is None else contact.params.get("least", 1.0),
+        ROTOR_FREQUENCY: 0.0 if rotors is None else rotors.params.get("lowest_hz", 0.0),
+    }
+
+
+def recorded_task_numbers(record: Mapping[str, Any]) -> dict[str, float]:
+    """Return the `TASK_NUMBERS` that a run began with, as far as its provenance has them.
+
+    Runs begun before 29 November 2026 recorded those of their recipe alone. They drew no contact of
+    the feet and measured joints on links by default.
+
+    Args:
+        record: The provenance.
+    """
+    recipe = record.get("recipe") or {}
+    defaults = {CONTACT_DAMPING: 1.0, ROTOR_FREQUENCY: 0.0}
+    return {**defaults, **recipe.get("task", {}), **record.get("task", {})}
 
 
 def check_task_number(name: str, value: object) -> None:
@@ -460,10 +487,15 @@ def check_task_number(name: str, value: object) -> None:
         raise PronkError(f"no number {name!r}; the numbers are {', '.join(TASK_NUMBERS)}.")
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise PronkError(f"{name} is {value!r}; expected a number.")
+    if name == ROTOR_FREQUENCY:
+        if value != 0.0 and not SOFTEST_HZ <= value < math.inf:
+            raise PronkError(
+                f"{name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more, or 0, with which joints "
+                "are measured on their links."
+            )
+        return
     if not 0.0 < value < math.inf:
         raise PronkError(f"{name} is {value:g}; expected more than 0, and finite.")
-    if name == ROTOR_FREQUENCY and value < SOFTEST_HZ:
-        raise PronkError(f"{name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more.")
     if name == CONTACT_DAMPING and value > 1.0:
         raise PronkError(f"{name} is {value:g}; expected a share up to 1.")
 

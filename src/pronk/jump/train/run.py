@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from pronk.jump.train import devices, provenance
 from pronk.jump.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.jump.train.hosts import Host, check_hosts
 from pronk.jump.train.launch import LOCAL_HOST, launch
-from pronk.jump.train.mdp.actions import NAME as ACTION
 from pronk.jump.train.phases import STEPS_PER_ITERATION
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
@@ -27,6 +26,8 @@ from pronk.jump.train.recipe import (
     load_recipe,
     load_recipes,
     recipe_content,
+    recorded_task_numbers,
+    task_numbers,
 )
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.runner import JumpRunnerCfg
@@ -94,14 +95,16 @@ def run_training(
     return _train_session(folder, settings, hosts, processes)
 
 
-def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | None]:
+def check_training(
+    settings: TrainSettings,
+) -> tuple[TrainingGains, Recipe | None, dict[str, float]]:
     """Read what a new run trains with, and refuse what cannot be trained with.
 
     Args:
         settings: Completed settings.
 
     Returns:
-        The gains, and the recipe if there is one.
+        The gains, the recipe if there is one, and the numbers of the task that it may change.
 
     Raises:
         PronkError: The robot has no task, the gains are impossible, or the recipe changes what the
@@ -110,8 +113,8 @@ def check_training(settings: TrainSettings) -> tuple[TrainingGains, Recipe | Non
     task = load_task(str(settings.robot))
     gains = settings.training_gains(task.robot)
     recipe = load_recipes(settings.recipe) if settings.recipe else None
-    _env_cfg(task, gains, settings, recipe)
-    return gains, recipe
+    numbers = task_numbers(_env_cfg(task, gains, settings, recipe))
+    return gains, recipe, numbers
 
 
 def _check_processes(folder: RunFolder, settings: TrainSettings, processes: int) -> None:
@@ -133,11 +136,11 @@ def _check_processes(folder: RunFolder, settings: TrainSettings, processes: int)
 
 def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     """Make the folder of a new run; returns its provenance."""
-    gains, recipe = check_training(settings)
+    gains, recipe, numbers = check_training(settings)
     start = None
     if settings.init_checkpoint is not None:
         start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
-        _check_action_scale(settings, gains, recipe)
+        _check_action_scale(settings, gains, numbers[ACTION_SCALE])
     folder.path.mkdir(parents=True, exist_ok=True)
     gains_file = settings.gains_file
     if gains_file is not None:
@@ -150,28 +153,34 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
     if start is not None:
         checkpoint.write_checkpoint(folder.path / f"model_{start['iter']}.pt", start)
         start_sha256 = start["infos"]["start_sha256"]
-    record = provenance.new_record(settings, gains, recipe=recipe, start_sha256=start_sha256)
+    record = provenance.new_record(
+        settings, gains, task=numbers, recipe=recipe, start_sha256=start_sha256
+    )
     folder.write(record)
     return record
 
 
-def _check_action_scale(
-    settings: TrainSettings, gains: TrainingGains, recipe: Recipe | None
-) -> None:
+def _check_action_scale(settings: TrainSettings, gains: TrainingGains, scale: float) -> None:
     """Refuse to begin with a policy whose actions are other angles than those of this training.
 
     A checkpoint whose run has no record is taken as it is.
+
+    Args:
+        settings: Completed settings.
+        gains: Its gains.
+        scale: Change of a joint target with an action of 1 in this training [rad].
     """
     assert settings.init_checkpoint is not None
     path = settings.init_checkpoint
     start_folder = RunFolder(path if path.is_dir() else path.parent)
     if not start_folder.provenance.is_file():
         return
-    task = load_task(str(settings.robot))
-    task_scale = _env_cfg(task, gains, settings, None).actions[ACTION].scale
-    scale = task_scale if recipe is None else recipe.task.get(ACTION_SCALE, task_scale)
-    start_recipe = start_folder.read().get("recipe") or {}
-    start_scale = start_recipe.get("task", {}).get(ACTION_SCALE, task_scale)
+    recorded = recorded_task_numbers(start_folder.read())
+    if ACTION_SCALE in recorded:
+        start_scale = recorded[ACTION_SCALE]
+    else:
+        cfg = _env_cfg(load_task(str(settings.robot)), gains, settings, None)
+        start_scale = task_numbers(cfg)[ACTION_SCALE]
     if scale != start_scale:
         raise PronkError(
             f"--init-checkpoint {path}: an action of 1 is {start_scale:g} rad there and "
@@ -380,4 +389,23 @@ def _train_config(folder: RunFolder, settings: TrainSettings) -> TrainConfig:
         agent.stop_at = time.time() + 60.0 * settings.session.minutes
     if checkpoint.latest_checkpoint(folder.path) is not None:
         agent.resume = True
-    return TrainConfig(env=_env_cfg(task, gains, settings, recipe), agent=agent)
+    cfg = _env_cfg(task, gains, settings, recipe)
+    _check_task_numbers(folder, task_numbers(cfg))
+    return TrainConfig(env=cfg, agent=agent)
+
+
+def _check_task_numbers(folder: RunFolder, numbers: Mapping[str, float]) -> None:
+    """Refuse to go on with a run whose task has changed since it began, with a version of pronk.
+
+    Args:
+        folder: The run.
+        numbers: Those of the task now (`task_numbers`).
+    """
+    recorded = recorded_task_numbers(folder.read())
+    for name, value in numbers.items():
+        if recorded.get(name, value) != value:
+            raise PronkError(
+                f"--resume: the run in {folder.path} began with {name} {recorded[name]:g}, and the "
+                f"task of this pronk has {value:g}; train it to its end with the version that it "
+                "began with, or give a new --out."
+            )

@@ -31,7 +31,7 @@ from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
-from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY
+from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY, task_numbers
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from pronk.jump.train.training_progress import TrainingProgress, write_progress
@@ -99,11 +99,6 @@ class PronkRunner(MjlabOnPolicyRunner):
         super().__init__(env, train_cfg, log_dir, device)
         if compiles:
             self._step_graphs = StepGraphs(env.unwrapped)
-            self.note(
-                "warning: policies trained with --compile jumped shorter. A defect that may be the "
-                "cause is corrected, but none has been trained since "
-                '(docs/evidence/training.md, "Speed of one training").'
-            )
             for part in self._step_graphs.left_out:
                 self.note(f"note: --compile leaves {part} as it is: not all of it is pronk's own.")
         warning = check_cuda_graphs(env.unwrapped.sim, device)
@@ -373,10 +368,10 @@ class PronkRunner(MjlabOnPolicyRunner):
             provenance["by_joint"] = True
         if "strength" in env.cfg.events:
             provenance["weakest_drive"] = env.cfg.events["strength"].params["weakest"]
-        if "contact" in env.cfg.events:
-            provenance[CONTACT_DAMPING] = env.cfg.events["contact"].params["least"]
-        if "rotors" in env.cfg.events:
-            provenance[ROTOR_FREQUENCY] = env.cfg.events["rotors"].params["lowest_hz"]
+        # The scale of the actions is in the contract.
+        numbers = task_numbers(env.cfg)
+        for name in (CONTACT_DAMPING, ROTOR_FREQUENCY):
+            provenance[name] = numbers[name]
         if env.cfg.events["gains"].params.get("shape") == "ellipsoid":
             provenance["ellipsoid"] = True
         if self.cfg.get("recipe_sha256"):

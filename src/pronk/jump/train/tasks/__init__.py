@@ -25,7 +25,7 @@ from pronk.errors import PronkError
 from pronk.jump.train.gains import NAIVE, training_gains
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.rl.runner import PronkRunner
-from pronk.jump.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
+from pronk.jump.train.tasks.jump_env_cfg import play_cfg
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
 from pronk.jump.train.tasks.term_check import check_terms
 from pronk.robots import load_robot, robot_file_path
@@ -60,8 +60,6 @@ def load_task(robot: str) -> Task:
     env_file = folder / "env_cfgs.py"
     rl_file = folder / "rl_cfg.py"
     if not env_file.is_file():
-        if spec.source in ROBOTS:
-            return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
         raise PronkError(
             f"{robot} has no training task: expected {env_file} with a function env_cfg, as "
             f"docs/train-your-robot.md has one, or one of the robots {', '.join(ROBOTS)}."

@@ -41,7 +41,7 @@ def reward_weights(scale: RobotScale = MINI_CHEETAH) -> dict[str, RewardTermCfg]
     torque_square = scale.torque**2
     return {
         # Paper 45 | 45.
-        "tracking_linear": _term(rewards.tracking_linear, 2.25, variance=0.25),
+        "tracking_linear": _term(rewards.tracking_linear, 2.25, variance=0.25, jump_scale=1.0),
         # Paper 30 | 30, 1.5 here: turning was the last to be learned.
         "tracking_angular": _term(rewards.tracking_angular, 2.0, variance=0.25),
         # Not in the paper: the same with a wide kernel, since the narrow one has no slope for a

@@ -38,15 +38,16 @@ from pronk.jump.train.recipe import (
     ROTOR_FREQUENCY,
     TASK_NUMBERS,
     check_task_number,
+    recorded_task_numbers,
 )
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import (
-    draw_contact_damping,
-    draw_rotor_frequency,
     draw_weak_drives,
+    set_contact_damping,
+    set_rotor_frequency,
     without_randomization,
 )
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
@@ -118,10 +119,8 @@ def run_evaluation(
     )
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
-    if policy.contact_damping not in (None, 1.0):
-        draw_contact_damping(cfg, policy.contact_damping)
-    if policy.rotor_frequency is not None:
-        draw_rotor_frequency(cfg, policy.rotor_frequency)
+    set_contact_damping(cfg, policy.contact_damping)
+    set_rotor_frequency(cfg, policy.rotor_frequency)
     set_action_scale(cfg, policy)
     action: Any = cfg.actions[ACTION]
     _check_memory(plan, cfg.sim.mujoco.timestep, device)
@@ -203,11 +202,12 @@ class EvaluatedPolicy:
     """How it was trained to differ in its drives, as far as that is known."""
     action_scale: float | None = None
     """Change of a joint target with an action of 1 [rad]; None for that of the task."""
-    contact_damping: float | None = None
-    """Smallest share of the damping of the feet on the ground that was drawn. None: none; 1."""
-    rotor_frequency: float | None = None
-    """Lowest natural frequency of the rotors that its joints were measured on [Hz]. None: they were
-    measured on the links."""
+    contact_damping: float = 1.0
+    """Smallest share of the damping of the feet on the ground that was drawn; 1: none was drawn, as
+    of policies of which nothing is recorded."""
+    rotor_frequency: float = 0.0
+    """Lowest natural frequency of the rotors that its joints were measured on [Hz]; 0: they were
+    measured on the links, likewise."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -244,8 +244,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
     provenance = run.read() if run.provenance.is_file() else {}
     settings = provenance.get("settings", {})
     gains = provenance.get("gains", {})
-    recipe = provenance.get("recipe") or {}
-    task_numbers = _task_numbers(recipe.get("task", {}), run.provenance)
+    task_numbers = _task_numbers(recorded_task_numbers(provenance), run.provenance)
     about = {
         "file": str(file),
         "sha256": sha256(file),
@@ -262,8 +261,8 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         about=about,
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
-        contact_damping=task_numbers.get(CONTACT_DAMPING),
-        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY),
+        contact_damping=task_numbers.get(CONTACT_DAMPING, 1.0),
+        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY, 0.0),
     )
 
 
@@ -313,13 +312,13 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         about=about,
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
-        contact_damping=task_numbers.get(CONTACT_DAMPING),
-        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY),
+        contact_damping=task_numbers.get(CONTACT_DAMPING, 1.0),
+        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY, 0.0),
     )
 
 
 def _task_numbers(recorded: Mapping[str, Any], source: Path) -> dict[str, float]:
-    """Return the numbers of a recipe's `task` that are recorded of a training.
+    """Return the numbers of the task that are recorded of a training.
 
     Args:
         recorded: What is recorded; other entries and those that are None are left out.
