@@ -205,21 +205,30 @@ def test_a_jump_begins_with_a_walking_policy(finished_run: RunFolder, tmp_path: 
 def test_a_jump_does_not_begin_with_a_policy_of_other_actions(
     finished_run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The walking policy has the task's 0.35 rad, or by its record 0.42."""
+    """The walking policy has the task's 0.35 rad, or by its record 0.42, with which it was begun.
+
+    Runs of earlier versions recorded a scale in their recipe alone.
+    """
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("schema: pronk/recipe/1\ntask: {action_scale: 0.42}\n")
     start = RunFolder(tmp_path / "start")
     start.path.mkdir()
     shutil.copyfile(finished_run.path / "walk.pt", start.path / "walk.pt")
-    start.write(finished_run.read() | {"recipe": load_recipe(recipe).record()})
+    record = finished_run.read()
+    start.write(record | {"task": {"action_scale": 0.42}})
+    earlier = RunFolder(tmp_path / "earlier")
+    shutil.copytree(start.path, earlier.path)
+    del record["task"]
+    earlier.write(record | {"recipe": load_recipe(recipe).record()})
     out = tmp_path / "jump"
     words = ("jump", "--gains", "naive", *SMALL, "--out", out, "--init-checkpoint")
     assert train(*words, finished_run.path, "--recipe", recipe) == 2
     assert train(*words, start.path) == 2
     assert train(*words, start.path / "walk.pt") == 2
+    assert train(*words, earlier.path) == 2
     said = capsys.readouterr().err
     assert "0.35 rad there and 0.42 rad here" in said
-    assert said.count("0.42 rad there and 0.35 rad here") == 2
+    assert said.count("0.42 rad there and 0.35 rad here") == 3
     assert not out.exists()
 
 

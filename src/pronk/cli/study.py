@@ -330,7 +330,13 @@ def _range_text(low: float, high: float, unit: str) -> str:
 
 def _time_notes(plan: StudyPlan, estimate: TrainingTime | None) -> list[str]:
     """Return what the time of the trainings rests on, or why there is none."""
-    from pronk.jump.study.training_time import MEASURED_ENVS, RATES, SOURCE, START_S
+    from pronk.jump.study.training_time import (
+        COMPILED_RATES,
+        MEASURED_ENVS,
+        RATES,
+        SOURCE,
+        START_S,
+    )
 
     if estimate is None:
         return [
@@ -359,7 +365,10 @@ def _time_notes(plan: StudyPlan, estimate: TrainingTime | None) -> list[str]:
         )
     for arm in plan.arms:
         if arm.training is not None and arm.training.settings.devices.compile:
-            notes.append("--compile is not counted: it was measured for one training alone.")
+            compiled = ", ".join(
+                f"{rate:,.0f} each of {count}" for count, rate in COMPILED_RATES.items()
+            )
+            notes.append(f"--compile is not counted; with it {compiled} were measured.")
             break
     return notes
 
