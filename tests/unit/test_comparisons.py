@@ -89,7 +89,8 @@ def test_the_example_is_half_of_all_combinations_and_no_factor_hides_another() -
             assert total == 0, chosen
     # Only all four together are the same in every arm: a main effect and that of the other three.
     assert {math.prod(row_signs) for row_signs in signs} == {1}
-    assert config.training.options == "", "all layers are over the default recipe"
+    # All layers lie over one recipe, which was the default.
+    assert config.training.options.split() == ["--recipe", "../recipes/former_default.yaml"]
 
 
 def test_each_comparison_of_the_example_is_of_the_arms_with_a_factor_and_those_without() -> None:
