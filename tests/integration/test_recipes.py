@@ -24,7 +24,7 @@ from pronk.jump.train.recipe import (
 )
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import set_rotor_frequency
+from pronk.jump.train.tasks.jump_env_cfg import set_contact_damping, set_rotor_frequency
 from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import ROBOT, config
 
@@ -83,24 +83,36 @@ def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
     assert cfg.actions["joint_position"].scale == 0.42 != before
 
 
-def test_the_contact_of_the_feet_is_drawn_from_another_share_or_not(tmp_path: Path) -> None:
-    default = config(8, training_gains("naive", ROBOT))
-    cfg = task("task: {contact_damping: 0.6}", tmp_path)
-    assert cfg.events["contact"].params["least"] == 0.6
-    assert task_numbers(cfg) == {**task_numbers(default), "contact_damping": 0.6}
-    cfg = task("task: {contact_damping: 1}", tmp_path)
-    assert "contact" not in cfg.events
-    assert task_numbers(cfg) == {**task_numbers(default), "contact_damping": 1.0}
+@pytest.mark.parametrize(
+    ("name", "drawn", "nothing", "event", "parameter"),
+    [
+        ("contact_damping", 0.6, 1.0, "contact", "least"),
+        ("rotor_frequency", 60.0, 0.0, "rotors", "lowest_hz"),
+    ],
+)
+def test_contact_and_rotors_are_drawn_otherwise_or_not(
+    tmp_path: Path, name: str, drawn: float, nothing: float, event: str, parameter: str
+) -> None:
+    default = task_numbers(config(8, training_gains("naive", ROBOT)))
+    assert default[name] not in (drawn, nothing)
+    cfg = task(f"task: {{{name}: {drawn}}}", tmp_path)
+    assert cfg.events[event].params[parameter] == drawn
+    assert task_numbers(cfg) == {**default, name: drawn}
+    cfg = task(f"task: {{{name}: {nothing}}}", tmp_path)
+    assert event not in cfg.events
+    assert task_numbers(cfg) == {**default, name: nothing}
 
 
-def test_joints_are_measured_on_other_rotors_or_on_links(tmp_path: Path) -> None:
-    default = config(8, training_gains("naive", ROBOT))
-    cfg = task("task: {rotor_frequency: 60}", tmp_path)
-    assert cfg.events["rotors"].params["lowest_hz"] == 60.0
-    assert task_numbers(cfg) == {**task_numbers(default), "rotor_frequency": 60.0}
-    cfg = task("task: {rotor_frequency: 0}", tmp_path)
-    assert "rotors" not in cfg.events
-    assert task_numbers(cfg) == {**task_numbers(default), "rotor_frequency": 0.0}
+def test_an_event_of_somebody_else_with_such_a_name_stays() -> None:
+    cfg = config(8, training_gains("naive", ROBOT))
+    cfg.events["contact"] = cfg.events["friction"]
+    cfg.events["rotors"] = cfg.events["base_mass"]
+    numbers = task_numbers(cfg)
+    assert (numbers["contact_damping"], numbers["rotor_frequency"]) == (1.0, 0.0)
+    set_contact_damping(cfg, 1.0)
+    set_rotor_frequency(cfg, 0.0)
+    assert cfg.events["contact"] is cfg.events["friction"]
+    assert cfg.events["rotors"] is cfg.events["base_mass"]
 
 
 def test_rotors_without_inertia_are_refused(tmp_path: Path) -> None:

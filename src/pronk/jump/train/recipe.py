@@ -77,6 +77,8 @@ SOFTEST_HZ = 10.0
 25 N m/rad, and does not hold the robot up [Hz]."""
 TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY)
 """All entries of `task`."""
+EARLIER_DEFAULTS = {CONTACT_DAMPING: 1.0, ROTOR_FREQUENCY: 0.0}
+"""What runs and policies of before 29 November 2026 were trained with where they record nothing."""
 
 _Value = float | dict[str, float | tuple[float, float]]
 """A number, or one by phase: a number, or its values at the beginning and at the end."""
@@ -449,28 +451,23 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
 def task_numbers(cfg: ManagerBasedRlEnvCfg) -> dict[str, float]:
     """Return the `TASK_NUMBERS` of the configuration of an environment by name."""
     from pronk.jump.train.mdp.actions import NAME
+    from pronk.jump.train.tasks.jump_env_cfg import contact_damping, rotor_frequency
 
-    contact = cfg.events.get("contact")
-    rotors = cfg.events.get("rotors")
     return {
         ACTION_SCALE: float(cfg.actions[NAME].scale),
-        CONTACT_DAMPING: 1.0 if contact is None else contact.params.get("least", 1.0),
-        ROTOR_FREQUENCY: 0.0 if rotors is None else rotors.params.get("lowest_hz", 0.0),
+        CONTACT_DAMPING: contact_damping(cfg),
+        ROTOR_FREQUENCY: rotor_frequency(cfg),
     }
 
 
 def recorded_task_numbers(record: Mapping[str, Any]) -> dict[str, float]:
     """Return the `TASK_NUMBERS` that a run began with, as far as its provenance has them.
 
-    Runs begun before 29 November 2026 recorded those of their recipe alone. They drew no contact of
-    the feet and measured joints on links by default.
-
     Args:
-        record: The provenance.
+        record: The provenance. Runs of earlier versions recorded the numbers of their recipe alone.
     """
     recipe = record.get("recipe") or {}
-    defaults = {CONTACT_DAMPING: 1.0, ROTOR_FREQUENCY: 0.0}
-    return {**defaults, **recipe.get("task", {}), **record.get("task", {})}
+    return {**EARLIER_DEFAULTS, **recipe.get("task", {}), **record.get("task", {})}
 
 
 def check_task_number(name: str, value: object) -> None:

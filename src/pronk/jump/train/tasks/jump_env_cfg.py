@@ -186,12 +186,21 @@ def set_contact_damping(cfg: ManagerBasedRlEnvCfg, least: float) -> None:
         least: The share, above 0; with 1 nothing is drawn.
     """
     if least == 1.0:
-        cfg.events.pop("contact", None)
+        if contact_damping(cfg) < 1.0:
+            del cfg.events["contact"]
         return
     feet = SceneEntityCfg("robot", geom_names=".*_foot_collision")
     cfg.events["contact"] = EventTermCfg(
         func=events.randomize_contact, mode="startup", params={"least": least, "feet": feet}
     )
+
+
+def contact_damping(cfg: ManagerBasedRlEnvCfg) -> float:
+    """Return the smallest share of the damping of the feet that is drawn; 1 if nothing is."""
+    term = cfg.events.get("contact")
+    if term is None or term.func is not events.randomize_contact:
+        return 1.0
+    return float(term.params["least"])
 
 
 def set_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
@@ -206,7 +215,8 @@ def set_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
         PronkError: Joints without rotor inertia, whose rotors cannot swing on belts.
     """
     if lowest_hz == 0.0:
-        cfg.events.pop("rotors", None)
+        if rotor_frequency(cfg) > 0.0:
+            del cfg.events["rotors"]
         return
     articulation = cfg.scene.entities["robot"].articulation
     assert articulation is not None
@@ -222,6 +232,14 @@ def set_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
     cfg.events["rotors"] = EventTermCfg(
         func=events.randomize_rotors, mode="startup", params={"lowest_hz": lowest_hz}
     )
+
+
+def rotor_frequency(cfg: ManagerBasedRlEnvCfg) -> float:
+    """Return the lowest frequency that is drawn [Hz]; 0 if joints are measured on their links."""
+    term = cfg.events.get("rotors")
+    if term is None or term.func is not events.randomize_rotors:
+        return 0.0
+    return float(term.params["lowest_hz"])
 
 
 def play_cfg(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:

@@ -35,6 +35,7 @@ from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
     ACTION_SCALE,
     CONTACT_DAMPING,
+    EARLIER_DEFAULTS,
     ROTOR_FREQUENCY,
     TASK_NUMBERS,
     check_task_number,
@@ -261,8 +262,8 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         about=about,
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
-        contact_damping=task_numbers.get(CONTACT_DAMPING, 1.0),
-        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY, 0.0),
+        contact_damping=task_numbers[CONTACT_DAMPING],
+        rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
 
@@ -312,8 +313,8 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         about=about,
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
-        contact_damping=task_numbers.get(CONTACT_DAMPING, 1.0),
-        rotor_frequency=task_numbers.get(ROTOR_FREQUENCY, 0.0),
+        contact_damping=task_numbers[CONTACT_DAMPING],
+        rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
 
@@ -321,13 +322,14 @@ def _task_numbers(recorded: Mapping[str, Any], source: Path) -> dict[str, float]
     """Return the numbers of the task that are recorded of a training.
 
     Args:
-        recorded: What is recorded; other entries and those that are None are left out.
+        recorded: What is recorded; other entries and those that are None are left out. What is
+            missing is as in earlier versions.
         source: File that has it, for messages.
 
     Raises:
         ArtefactError: A number is impossible.
     """
-    numbers = {}
+    numbers = dict(EARLIER_DEFAULTS)
     for name in TASK_NUMBERS:
         value = recorded.get(name)
         if value is None:
