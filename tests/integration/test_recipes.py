@@ -24,7 +24,11 @@ from pronk.jump.train.recipe import (
 )
 from pronk.jump.train.settings import DrawSettings, TrainSettings
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import set_contact_damping, set_rotor_frequency
+from pronk.jump.train.tasks.jump_env_cfg import (
+    set_contact_damping,
+    set_decimation_spread,
+    set_rotor_frequency,
+)
 from pronk.jump.train.tasks.reward_weights import candidate_terms, reward_weights
 from training_env import ROBOT, config
 
@@ -88,15 +92,17 @@ def test_the_scale_of_the_actions_is_changed(tmp_path: Path) -> None:
     [
         ("contact_damping", 0.6, 1.0, "contact", "least"),
         ("rotor_frequency", 60.0, 0.0, "rotors", "lowest_hz"),
+        ("decimation_spread", 1.0, 0.0, "decimation", "added"),
     ],
 )
-def test_contact_and_rotors_are_drawn_otherwise_or_not(
+def test_contact_rotors_and_policy_steps_are_drawn_otherwise_or_not(
     tmp_path: Path, name: str, drawn: float, nothing: float, event: str, parameter: str
 ) -> None:
     default = task_numbers(config(8, training_gains("naive", ROBOT)))
     assert default[name] not in (drawn, nothing)
     cfg = task(f"task: {{{name}: {drawn}}}", tmp_path)
-    assert cfg.events[event].params[parameter] == drawn
+    expected = (-drawn, drawn) if parameter == "added" else drawn
+    assert cfg.events[event].params[parameter] == expected
     assert task_numbers(cfg) == {**default, name: drawn}
     cfg = task(f"task: {{{name}: {nothing}}}", tmp_path)
     assert event not in cfg.events
@@ -107,10 +113,14 @@ def test_an_event_of_somebody_else_with_such_a_name_stays() -> None:
     cfg = config(8, training_gains("naive", ROBOT))
     cfg.events["contact"] = cfg.events["friction"]
     cfg.events["rotors"] = cfg.events["base_mass"]
+    cfg.events["decimation"] = cfg.events["push"]
     numbers = task_numbers(cfg)
     assert (numbers["contact_damping"], numbers["rotor_frequency"]) == (1.0, 0.0)
+    assert numbers["decimation_spread"] == 0.0
     set_contact_damping(cfg, 1.0)
+    set_decimation_spread(cfg, 0)
     set_rotor_frequency(cfg, 0.0)
+    assert cfg.events["decimation"] is cfg.events["push"]
     assert cfg.events["contact"] is cfg.events["friction"]
     assert cfg.events["rotors"] is cfg.events["base_mass"]
 
@@ -169,6 +179,10 @@ def test_the_direction_of_a_lift_off_is_changed(tmp_path: Path) -> None:
         ("task: {contact_damping: 0}", "contact_damping|more than 0"),
         ("task: {contact_damping: 1.5}", "contact_damping|up to 1"),
         ("task: {rotor_frequency: -40}", "rotor_frequency|10 Hz or more"),
+        ("task: {decimation_spread: 0.5}", "decimation_spread|whole number"),
+        ("task: {decimation_spread: -1}", "decimation_spread|whole number"),
+        ("task: {decimation_spread: .inf}", "decimation_spread|finite"),
+        ("task: {decimation_spread: 4}", "decimation_spread|3 at most"),
         ("task: {rotor_frequency: .inf}", "rotor_frequency|finite"),
         ("task: {rotor_frequency: 4}", "rotor_frequency|10 Hz or more"),
     ],
@@ -278,7 +292,7 @@ def settings_of(cfg: Any) -> str:
         for name, term in cfg.rewards.items():
             weight = phase.weights.get(name, (term.weight, term.weight))
             rewards.append((name, weight, term.params, phase.jump_scales.get(name)))
-    drawn = (cfg.events.get("contact"), cfg.events.get("rotors"))
+    drawn = [cfg.events.get(name) for name in ("contact", "decimation", "rotors")]
     return repr((rewards, cfg.commands, cfg.actions, drawn))
 
 

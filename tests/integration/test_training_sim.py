@@ -313,7 +313,9 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     pytest.importorskip("onnxruntime")
     gains = training_gains("naive", ROBOT)
     recipe = tmp_path / "recipe.yaml"
-    numbers = "{action_scale: 0.42, contact_damping: 0.5, rotor_frequency: 40}"
+    numbers = (
+        "{action_scale: 0.42, contact_damping: 0.5, decimation_spread: 1, rotor_frequency: 40}"
+    )
     recipe.write_text(f"schema: pronk/recipe/1\ntask: {numbers}\n")
     folder = RunFolder(tmp_path / "run")
     folder.path.mkdir()
@@ -321,14 +323,14 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     shutil.copyfile(trained[0] / "model_7.pt", folder.path / "model_7.pt")
     cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
     apply_recipe(cfg, load_recipe(recipe))
-    drawn = {"contact_damping": 0.5, "rotor_frequency": 40.0}
+    drawn = {"contact_damping": 0.5, "decimation_spread": 1.0, "rotor_frequency": 40.0}
     contract = contract_for(cfg, jump=True, provenance=drawn)
     export_policy(trained[1], contract, tmp_path / "policy.onnx")
     plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
     for path in (folder.path, tmp_path / "policy.onnx"):
         policy = adapter.load_evaluated_policy(path, "cpu")
         assert (policy.action_scale, policy.contact_damping) == (0.42, 0.5)
-        assert policy.rotor_frequency == 40.0
+        assert (policy.decimation_spread, policy.rotor_frequency) == (1, 40.0)
     assert adapter.run_evaluation(policy, gains, plan, device="cpu").about["action_scale"] == 0.42
     plain = adapter.load_evaluated_policy(trained[0], "cpu")
     evaluation = adapter.run_evaluation(plain, gains, plan, device="cpu")
@@ -337,7 +339,12 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("rotor_frequency", -40.5), ("rotor_frequency", "soft"), ("contact_damping", 1.5)],
+    [
+        ("rotor_frequency", -40.5),
+        ("rotor_frequency", "soft"),
+        ("contact_damping", 1.5),
+        ("decimation_spread", 0.5),
+    ],
 )
 def test_impossible_numbers_that_a_policy_records_are_refused(
     trained: tuple[Path, Any], tmp_path: Path, name: str, value: object

@@ -8,7 +8,7 @@
       orientation: 1
     jump:                         # fields of `JumpSettings`, and `COMMAND_NUMBERS`
       late_s: 0.25
-    task:                         # `action_scale`, `contact_damping`, `rotor_frequency`
+    task:                         # numbers of the task: `TASK_NUMBERS`
       action_scale: 0.42
 
 What a recipe does not name stays as the task has it. `pronk train --recipe FILE` applies it to the
@@ -72,10 +72,13 @@ ROTOR_FREQUENCY = "rotor_frequency"
 """Another one: joints are measured on rotors behind belts or gears that give way. It is the lowest
 natural frequency of a rotor while its link is held that is drawn (`events.randomize_rotors`)
 [Hz]; with 0 joints are measured on their links."""
+DECIMATION_SPREAD = "decimation_spread"
+"""Another one: how many physics steps a policy step has more or less at most, a whole number; each
+policy step draws its own. With 0 all policy steps are alike."""
 SOFTEST_HZ = 10.0
 """Least `ROTOR_FREQUENCY`: at 10 Hz the belt of a knee of the Mini Cheetah is as soft as its drive,
 25 N m/rad, and does not hold the robot up [Hz]."""
-TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, ROTOR_FREQUENCY)
+TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, DECIMATION_SPREAD, ROTOR_FREQUENCY)
 """All entries of `task`."""
 EARLIER_DEFAULTS = {CONTACT_DAMPING: 1.0, ROTOR_FREQUENCY: 0.0}
 """What runs and policies of before 29 November 2026 were trained with where they record nothing."""
@@ -425,9 +428,13 @@ def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: flo
 
 
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
-    """Change the scale of the actions, the contact of the feet, and what encoders measure."""
+    """Change the numbers of the task."""
     from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
-    from pronk.jump.train.tasks.jump_env_cfg import set_contact_damping, set_rotor_frequency
+    from pronk.jump.train.tasks.jump_env_cfg import (
+        set_contact_damping,
+        set_decimation_spread,
+        set_rotor_frequency,
+    )
 
     action = cfg.actions[NAME]
     assert isinstance(action, DelayedJointPositionActionCfg)
@@ -437,25 +444,32 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
             check_task_number(name, value)
         except PronkError as error:
             raise ArtefactError(f"{source}: task: {error}") from None
-        if name == ACTION_SCALE:
-            action.scale = value
-        elif name == ROTOR_FREQUENCY:
-            try:
+        try:
+            if name == ACTION_SCALE:
+                action.scale = value
+            elif name == CONTACT_DAMPING:
+                set_contact_damping(cfg, value)
+            elif name == DECIMATION_SPREAD:
+                set_decimation_spread(cfg, int(value))
+            else:
                 set_rotor_frequency(cfg, value)
-            except PronkError as error:
-                raise ArtefactError(f"{source}: task: {name}: {error}") from None
-        else:
-            set_contact_damping(cfg, value)
+        except PronkError as error:
+            raise ArtefactError(f"{source}: task: {name}: {error}") from None
 
 
 def task_numbers(cfg: ManagerBasedRlEnvCfg) -> dict[str, float]:
     """Return the `TASK_NUMBERS` of the configuration of an environment by name."""
     from pronk.jump.train.mdp.actions import NAME
-    from pronk.jump.train.tasks.jump_env_cfg import contact_damping, rotor_frequency
+    from pronk.jump.train.tasks.jump_env_cfg import (
+        contact_damping,
+        decimation_spread,
+        rotor_frequency,
+    )
 
     return {
         ACTION_SCALE: float(cfg.actions[NAME].scale),
         CONTACT_DAMPING: contact_damping(cfg),
+        DECIMATION_SPREAD: float(decimation_spread(cfg)),
         ROTOR_FREQUENCY: rotor_frequency(cfg),
     }
 
@@ -490,6 +504,10 @@ def check_task_number(name: str, value: object) -> None:
                 f"{name} is {value:g}; expected {SOFTEST_HZ:g} Hz or more, or 0, with which joints "
                 "are measured on their links."
             )
+        return
+    if name == DECIMATION_SPREAD:
+        if not (0.0 <= value < math.inf and value == int(value)):
+            raise PronkError(f"{name} is {value:g}; expected a whole number of physics steps.")
         return
     if not 0.0 < value < math.inf:
         raise PronkError(f"{name} is {value:g}; expected more than 0, and finite.")

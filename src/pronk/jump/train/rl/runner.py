@@ -31,7 +31,12 @@ from pronk.jump.train.mdp.commands import motion_command
 from pronk.jump.train.mdp.reward_manager import StackedRewardManager
 from pronk.jump.train.mdp.step_graphs import StepGraphs
 from pronk.jump.train.phases import PHASES, curriculum, phase_at
-from pronk.jump.train.recipe import CONTACT_DAMPING, ROTOR_FREQUENCY, task_numbers
+from pronk.jump.train.recipe import (
+    CONTACT_DAMPING,
+    DECIMATION_SPREAD,
+    ROTOR_FREQUENCY,
+    task_numbers,
+)
 from pronk.jump.train.rl import checkpoint
 from pronk.jump.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 from pronk.jump.train.training_progress import TrainingProgress, write_progress
@@ -370,7 +375,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             provenance["weakest_drive"] = env.cfg.events["strength"].params["weakest"]
         # The scale of the actions is in the contract.
         numbers = task_numbers(env.cfg)
-        for name in (CONTACT_DAMPING, ROTOR_FREQUENCY):
+        for name in (CONTACT_DAMPING, DECIMATION_SPREAD, ROTOR_FREQUENCY):
             provenance[name] = numbers[name]
         if env.cfg.events["gains"].params.get("shape") == "ellipsoid":
             provenance["ellipsoid"] = True

@@ -52,6 +52,9 @@ EPISODE_S = 20.0
 """Longest episode at the nominal policy rate [s]."""
 DELAY_STEPS = 1
 """Half-width of the command delay about the matched one [physics steps]. Not in the paper."""
+DECIMATION_SPREAD = 2
+"""Physics steps that a policy step has more or less at most (D1, A1); fewer where it would be left
+without one."""
 LEAST_CONTACT_DAMPING = 0.4
 """Smallest share of the damping of the feet on the ground that is drawn for a robot. Not in the
 paper: policies of one contact alone walked 0.04 to 0.30 m/s too fast or too slow at 2 m/s on the
@@ -138,6 +141,7 @@ def jump_env_cfg(
         ),
     )
     set_contact_damping(cfg, LEAST_CONTACT_DAMPING)
+    set_decimation_spread(cfg, min(DECIMATION_SPREAD, robot.decimation - 1))
     return cfg
 
 
@@ -201,6 +205,41 @@ def contact_damping(cfg: ManagerBasedRlEnvCfg) -> float:
     if term is None or term.func is not events.randomize_contact:
         return 1.0
     return float(term.params["least"])
+
+
+def set_decimation_spread(cfg: ManagerBasedRlEnvCfg, steps: int) -> None:
+    """Draw the number of physics steps of each policy step about the nominal one (D1, A1).
+
+    Args:
+        cfg: Configuration of the environment, which is changed.
+        steps: How many physics steps a policy step has more or less at most; with 0 all policy
+            steps are alike.
+
+    Raises:
+        PronkError: A policy step could be left without a physics step.
+    """
+    if steps >= cfg.decimation:
+        raise PronkError(
+            f"{steps} physics steps less are more than a policy step of {cfg.decimation} has to "
+            f"spare; expected {cfg.decimation - 1} at most."
+        )
+    if steps == 0:
+        if decimation_spread(cfg) > 0:
+            del cfg.events["decimation"]
+        return
+    cfg.events["decimation"] = EventTermCfg(
+        func=events.randomize_decimation,
+        mode="step",
+        params={"nominal": cfg.decimation, "added": (-steps, steps)},
+    )
+
+
+def decimation_spread(cfg: ManagerBasedRlEnvCfg) -> int:
+    """Return how many physics steps a policy step has more or less at most; 0 if none is drawn."""
+    term = cfg.events.get("decimation")
+    if term is None or term.func is not events.randomize_decimation:
+        return 0
+    return int(term.params["added"][1])
 
 
 def set_rotor_frequency(cfg: ManagerBasedRlEnvCfg, lowest_hz: float) -> None:
@@ -426,11 +465,6 @@ def _events(
                 "resistance": (0.03, 0.1),
                 "rated": rated,
             },
-        ),
-        "decimation": EventTermCfg(  # D1, A1
-            func=events.randomize_decimation,
-            mode="step",
-            params={"nominal": robot.decimation, "added": (-2, 2)},
         ),
         # Mild; the paper has none.
         "push": EventTermCfg(

@@ -35,6 +35,7 @@ from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
     ACTION_SCALE,
     CONTACT_DAMPING,
+    DECIMATION_SPREAD,
     EARLIER_DEFAULTS,
     ROTOR_FREQUENCY,
     TASK_NUMBERS,
@@ -48,6 +49,7 @@ from pronk.jump.train.tasks import load_task
 from pronk.jump.train.tasks.jump_env_cfg import (
     draw_weak_drives,
     set_contact_damping,
+    set_decimation_spread,
     set_rotor_frequency,
     without_randomization,
 )
@@ -121,6 +123,8 @@ def run_evaluation(
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
     set_contact_damping(cfg, policy.contact_damping)
+    if policy.decimation_spread is not None:
+        set_decimation_spread(cfg, policy.decimation_spread)
     set_rotor_frequency(cfg, policy.rotor_frequency)
     set_action_scale(cfg, policy)
     action: Any = cfg.actions[ACTION]
@@ -206,6 +210,8 @@ class EvaluatedPolicy:
     contact_damping: float = 1.0
     """Smallest share of the damping of the feet on the ground that was drawn; 1: none was drawn, as
     of policies of which nothing is recorded."""
+    decimation_spread: int | None = None
+    """How many physics steps a policy step had more or less at most; None for that of the task."""
     rotor_frequency: float = 0.0
     """Lowest natural frequency of the rotors that its joints were measured on [Hz]; 0: they were
     measured on the links, likewise."""
@@ -263,6 +269,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
         contact_damping=task_numbers[CONTACT_DAMPING],
+        decimation_spread=_decimation_spread(task_numbers),
         rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
@@ -314,6 +321,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
         contact_damping=task_numbers[CONTACT_DAMPING],
+        decimation_spread=_decimation_spread(task_numbers),
         rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
@@ -340,6 +348,12 @@ def _task_numbers(recorded: Mapping[str, Any], source: Path) -> dict[str, float]
             raise ArtefactError(f"{source}: {error} Train again.") from None
         numbers[name] = value
     return numbers
+
+
+def _decimation_spread(numbers: Mapping[str, float]) -> int | None:
+    """Return the physics steps that a policy step had more or less; None if not recorded."""
+    spread = numbers.get(DECIMATION_SPREAD)
+    return None if spread is None else int(spread)
 
 
 def _common_scale(contract: Contract, path: Path) -> float:
