@@ -19,10 +19,9 @@ RATES = {1: 160_000.0, 3: 97_000.0, 4: 87_000.0, 5: 74_000.0}
 """Environment steps/s of each training, by the number of trainings on one H200 under MPS: one alone
 (docs/evidence/results.md, `benchmarks train`), twelve and sixteen at once on four H200, and five on
 one (the same page, many trainings at once). An environment step is one policy step of one robot."""
-COMPILED_RATES = {1: 229_000.0, 5: 80_000.0}
-"""The same with `--compile`: one alone (its default recipe had no rotors and no contact that is
-drawn; docs/evidence/training.md, "Speed of one training") and ten at once on two H200 (the same
-page, "The same layers trained with --compile")."""
+COMPILED_RATES = {1: 207_000.0, 5: 83_000.0}
+"""The same with `--compile`: one alone on its GPU and fifteen at once on the three others of the same
+host (docs/evidence/training.md, "Speed of one training")."""
 START_S = (40.0, 146.0)
 """Time of a training in which it takes no steps: building, compiling, checkpoints, export [s]. Of
 three on one H200 it was 36 to 41 s, of sixteen on four H200 146 s (1,366 s in all, less 1,220 s at
