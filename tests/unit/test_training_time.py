@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from command_line import accepted, refused
 from pronk.jump.study.training_time import (
+    COMPILED_RATES,
     RATES,
     START_S,
     TrainingSize,
@@ -24,8 +25,10 @@ from pronk.jump.study.training_time import (
 RECIPE_STEPS = 1080 * 24 * 4096
 
 
-def alike(count: int, iterations: int = 1080, envs: int = 4096) -> list[TrainingSize]:
-    size = TrainingSize(env_steps=iterations * 24 * envs, envs=envs)
+def alike(
+    count: int, iterations: int = 1080, envs: int = 4096, *, is_compiled: bool = False
+) -> list[TrainingSize]:
+    size = TrainingSize(env_steps=iterations * 24 * envs, envs=envs, is_compiled=is_compiled)
     return [size] * count
 
 
@@ -57,6 +60,28 @@ def test_what_was_measured_is_within_the_estimate(
     time = training_time(alike(trainings), gpus, per_gpu)
     assert 0.95 * time.low_s <= seconds <= 1.05 * time.high_s
     assert time.high_s < 1.2 * time.low_s
+
+
+@pytest.mark.parametrize(
+    ("trainings", "gpus", "per_gpu", "seconds"), [(15, 3, 5, 1425.0), (1, 1, 1, 549.0)]
+)
+def test_what_was_measured_with_compile_is_within_the_estimate(
+    trainings: int, gpus: int, per_gpu: int, seconds: float
+) -> None:
+    """By docs/evidence/training.md, "Three changes of the default recipe" and "Speed"."""
+    time = training_time(alike(trainings, is_compiled=True), gpus, per_gpu)
+    assert 0.95 * time.low_s <= seconds <= 1.05 * time.high_s
+    assert time.high_s < training_time(alike(trainings), gpus, per_gpu).low_s
+
+
+def test_compiled_trainings_beside_others_have_their_own_rate() -> None:
+    """Two on one GPU: the compiled one is over first, the other goes on alone."""
+    sizes = [*alike(1, is_compiled=True), *alike(1)]
+    both_s = RECIPE_STEPS / training_rate(2, is_compiled=True)
+    left = RECIPE_STEPS - both_s * training_rate(2)
+    expected = START_S[0] + both_s + left / RATES[1]
+    assert training_time(sizes, 1, 2).low_s == pytest.approx(expected)
+    assert training_rate(1, is_compiled=True) == COMPILED_RATES[1]
 
 
 def test_a_gpu_with_fewer_trainings_is_faster_for_each() -> None:
@@ -161,6 +186,12 @@ def test_the_plan_follows_from_the_file_and_the_gpus(tmp_path: Path) -> None:
     one_gpu = ("--gpus", "0", "--per-gpu", "4")
     all_long = plan(tmp_path, *one_gpu)[0]["training_seconds"][0]
     assert plan(tmp_path, *one_gpu, arms=one_arm)[0]["training_seconds"][0] < 0.9 * all_long
+    # With --compile.
+    compiled, text = plan(tmp_path, *gpus, training={"options": "--compile"})
+    expected = training_time(alike(8, is_compiled=True), 2, 4)
+    assert compiled["training_seconds"] == pytest.approx([expected.low_s, expected.high_s])
+    assert "87,000" not in text
+    assert f"{COMPILED_RATES[1]:,.0f}" in text
     # Robots, seeds, GPUs, trainings on each.
     robots, text = plan(tmp_path, *gpus, training={"envs": 1024})
     assert robots["training_seconds"][0] < 0.5 * plain["training_seconds"][0]

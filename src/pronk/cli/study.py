@@ -343,33 +343,38 @@ def _time_notes(plan: StudyPlan, estimate: TrainingTime | None) -> list[str]:
             "The time of trainings is estimated for GPUs alone. No rate was measured on the CPU, "
             "which is for tests."
         ]
-    rates = ", ".join(f"{rate:,.0f} each of {count}" for count, rate in RATES.items())
+    compiles = set()
+    for arm in plan.arms:
+        if arm.training is not None:
+            compiles.add(arm.training.settings.devices.compile)
+    rate_texts: list[str] = []
+    measured_numbers: list[int] = []
+    for is_compiled, rates in ((False, RATES), (True, COMPILED_RATES)):
+        if is_compiled in compiles:
+            text = ", ".join(f"{rate:,.0f} each of {count}" for count, rate in rates.items())
+            rate_texts.append(f"{text} with --compile" if is_compiled else text)
+            measured_numbers += rates
     notes = [
         f"Time: by steps/s measured with {MEASURED_ENVS:,} Mini Cheetahs in a training on H200 "
-        f"under MPS, by the number of trainings on a GPU: {rates} ({SOURCE}; of 2 interpolated), "
-        f"and {START_S[0]:.0f} to {START_S[1]:.0f} s of a training for building, compiling and "
-        "export. An environment step is one policy step of one robot. Other GPUs have other "
-        "rates. Trainings that are done already count too."
+        f"under MPS, by the number of trainings on a GPU: {'; '.join(rate_texts)} ({SOURCE}; other "
+        f"numbers interpolated), and {START_S[0]:.0f} to {START_S[1]:.0f} s of a training for "
+        "building, compiling and export. An environment step is one policy step of one robot. "
+        "Other GPUs have other rates. Trainings that are done already count too."
     ]
     at_once = min(estimate.per_gpu, -(-plan.trainings // estimate.gpus))
-    if at_once > max(RATES):
+    if at_once > max(measured_numbers):
         notes.append(
             f"{at_once} trainings on a GPU were not measured: taken to reach together what "
-            f"{max(RATES)} do."
+            f"{max(measured_numbers)} do."
         )
+    if len(compiles) > 1:
+        notes.append("Trainings with --compile beside others on one GPU were not measured.")
     if plan.config.training.envs != MEASURED_ENVS:
         notes.append(
             f"{counted(plan.config.training.envs, 'robot')} in a training: not measured; the time "
             f"is between that of as many iterations and that of as many environment steps of "
             f"{MEASURED_ENVS:,} robots."
         )
-    for arm in plan.arms:
-        if arm.training is not None and arm.training.settings.devices.compile:
-            compiled = ", ".join(
-                f"{rate:,.0f} each of {count}" for count, rate in COMPILED_RATES.items()
-            )
-            notes.append(f"--compile is not counted; with it {compiled} were measured.")
-            break
     return notes
 
 

@@ -190,7 +190,12 @@ class StudyPlan:
             for arm in self.arms:
                 if arm.training is not None:
                     training = arm.training
-                    sizes.append(TrainingSize(env_steps=training.env_steps, envs=training.envs))
+                    size = TrainingSize(
+                        env_steps=training.env_steps,
+                        envs=training.envs,
+                        is_compiled=training.settings.devices.compile,
+                    )
+                    sizes.append(size)
         return training_time(sizes, gpus, per_gpu)
 
     @property

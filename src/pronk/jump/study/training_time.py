@@ -20,13 +20,13 @@ RATES = {1: 160_000.0, 3: 97_000.0, 4: 87_000.0, 5: 74_000.0}
 (docs/evidence/results.md, `benchmarks train`), twelve and sixteen at once on four H200, and five on
 one (the same page, many trainings at once). An environment step is one policy step of one robot."""
 COMPILED_RATES = {1: 207_000.0, 5: 83_000.0}
-"""The same with `--compile`: one alone on its GPU and fifteen at once on the three others of the same
-host (docs/evidence/training.md, "Speed of one training")."""
+"""The same with `--compile`: one alone on its GPU, and fifteen at once on the three others of the
+same host (docs/evidence/training.md, "Speed of one training")."""
 START_S = (40.0, 146.0)
 """Time of a training in which it takes no steps: building, compiling, checkpoints, export [s]. Of
 three on one H200 it was 36 to 41 s, of sixteen on four H200 146 s (1,366 s in all, less 1,220 s at
 87,000 steps/s); docs/evidence/results.md."""
-SOURCE = "docs/evidence/results.md, many trainings at once"
+SOURCE = "docs/evidence/results.md, many trainings at once, and training.md"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +37,8 @@ class TrainingSize:
     """Environment steps: policy steps of all robots."""
     envs: int
     """Number of robots."""
+    is_compiled: bool = False
+    """Whether it is trained with `--compile`."""
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -68,7 +70,36 @@ class TrainingTime:
         return self.gpus * self.low_s / 3600.0, self.gpus * self.high_s / 3600.0
 
 
-def training_rate(count: int) -> float:
+@dataclass(kw_only=True)
+class _Running:
+    """A training that has a GPU."""
+
+    start_s: float
+    """Time until it takes steps [s]."""
+    steps: float
+    """Steps of 4,096 robots that are to be taken."""
+    is_compiled: bool
+
+    def remaining_s(self, count: int) -> float:
+        """Return the time until it begins to step, or else until it is over [s].
+
+        Args:
+            count: Number of trainings on its GPU.
+        """
+        if self.start_s > 0.0:
+            return self.start_s
+        return self.steps / training_rate(count, is_compiled=self.is_compiled)
+
+    def advance(self, interval_s: float, count: int) -> None:
+        """Let time pass, no more than `remaining_s`."""
+        if self.start_s > 0.0:
+            self.start_s = _less(self.start_s, interval_s)
+        else:
+            rate = training_rate(count, is_compiled=self.is_compiled)
+            self.steps = _less(self.steps, interval_s * rate)
+
+
+def training_rate(count: int, *, is_compiled: bool = False) -> float:
     """Return the rate of each training of 4,096 robots where some run on one GPU [steps/s].
 
     Between measured numbers the rate of all together is interpolated. More than were measured are
@@ -76,9 +107,11 @@ def training_rate(count: int) -> float:
 
     Args:
         count: Number of trainings on the GPU, 1 or more.
+        is_compiled: Whether they are trained with `--compile`.
     """
-    numbers = sorted(RATES)
-    together = [number * RATES[number] for number in numbers]
+    rates = COMPILED_RATES if is_compiled else RATES
+    numbers = sorted(rates)
+    together = [number * rates[number] for number in numbers]
     return float(np.interp(count, numbers, together)) / count
 
 
@@ -90,48 +123,45 @@ def training_time(trainings: Sequence[TrainingSize], gpus: int, per_gpu: int) ->
         gpus: Number of GPUs, 1 or more.
         per_gpu: Most trainings on one GPU at once, 1 or more.
     """
-    low_steps = [training.bounds[0] for training in trainings]
-    high_steps = [training.bounds[1] for training in trainings]
     return TrainingTime(
-        low_s=_wall_time(low_steps, gpus, per_gpu, START_S[0]),
-        high_s=_wall_time(high_steps, gpus, per_gpu, START_S[1]),
+        low_s=_wall_time(trainings, gpus, per_gpu, bound=0),
+        high_s=_wall_time(trainings, gpus, per_gpu, bound=1),
         gpus=gpus,
         per_gpu=per_gpu,
     )
 
 
-def _wall_time(steps: Sequence[float], gpus: int, per_gpu: int, start_s: float) -> float:
+def _wall_time(sizes: Sequence[TrainingSize], gpus: int, per_gpu: int, *, bound: int) -> float:
     """Return the time until the last of some trainings is over [s].
 
     Args:
-        steps: Steps of 4,096 robots that each takes, in the order in which they start.
+        sizes: The trainings in the order in which they start.
         gpus: Number of GPUs.
         per_gpu: Most trainings on one GPU at once.
-        start_s: Time of each in which it takes no steps, at its beginning [s].
+        bound: 0 for as few steps, and as short a start, as each may take, 1 for as many and as
+            long.
     """
-    waiting = list(steps)
-    # Of each training that runs: the time until it steps [s], and the steps that are left.
-    running: list[list[list[float]]] = [[] for _ in range(gpus)]
+    waiting = []
+    for size in sizes:
+        waiting.append(
+            _Running(start_s=START_S[bound], steps=size.bounds[bound], is_compiled=size.is_compiled)
+        )
+    gpu_trainings: list[list[_Running]] = [[] for _ in range(gpus)]
     now = 0.0
-    while waiting or any(running):
-        while waiting and min(len(trainings) for trainings in running) < per_gpu:
-            gpu = min(running, key=len)
-            gpu.append([start_s, waiting.pop(0)])
+    while waiting or any(gpu_trainings):
+        while waiting and min(len(running) for running in gpu_trainings) < per_gpu:
+            min(gpu_trainings, key=len).append(waiting.pop(0))
         # The time until something changes: a training begins to step, or is over.
         interval = math.inf
-        for trainings in running:
-            for until_steps, steps_to_go in trainings:
-                remaining = steps_to_go / training_rate(len(trainings))
-                interval = min(interval, until_steps if until_steps > 0.0 else remaining)
+        for running in gpu_trainings:
+            for training in running:
+                interval = min(interval, training.remaining_s(len(running)))
         now += interval
-        for trainings in running:
-            rate = training_rate(len(trainings)) if trainings else 0.0
-            for training in trainings:
-                if training[0] > 0.0:
-                    training[0] = _less(training[0], interval)
-                else:
-                    training[1] = _less(training[1], interval * rate)
-            trainings[:] = [training for training in trainings if max(training) > 0.0]
+        for running in gpu_trainings:
+            count = len(running)
+            for training in running:
+                training.advance(interval, count)
+            running[:] = [training for training in running if training.steps > 0.0]
     return now
 
 
