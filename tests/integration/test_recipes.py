@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,16 @@ def test_contact_rotors_and_policy_steps_are_drawn_otherwise_or_not(
     cfg = task(f"task: {{{name}: {nothing}}}", tmp_path)
     assert event not in cfg.events
     assert task_numbers(cfg) == {**default, name: nothing}
+
+
+@pytest.mark.parametrize(("decimation", "spread"), [(1, 0), (2, 1), (3, 2), (8, 2)])
+def test_a_policy_step_keeps_a_physics_step(decimation: int, spread: int) -> None:
+    robot_task = load_task("mini_cheetah")
+    robot = replace(robot_task.robot, decimation=decimation)
+    gains = training_gains("naive", ROBOT)
+    cfg = robot_task.env_cfg(robot, gains, iterations=dict.fromkeys(PHASES, 10), num_envs=8)
+    assert task_numbers(cfg)["decimation_spread"] == spread
+    assert cfg.decimation - spread >= 1
 
 
 def test_an_event_of_somebody_else_with_such_a_name_stays() -> None:
