@@ -87,7 +87,7 @@ def rewards_of_all_phases(*, compiles: bool) -> list[Any]:
 
 
 def test_compiled_rewards_are_the_same_in_every_phase() -> None:
-    """Weights, jump scales, lift-off kernel and step length change without compiling anew."""
+    """Weights, jump scales, lift-off kernel and step length change without compiling again."""
     plain = rewards_of_all_phases(compiles=False)
     fast = rewards_of_all_phases(compiles=True)
     for step, (expected, reward) in enumerate(zip(plain, fast, strict=True)):

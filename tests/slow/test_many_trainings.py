@@ -20,8 +20,10 @@ pytestmark = pytest.mark.train
 
 WORDS = (
     *("train", "walk", "--gains", "naive", "--seeds", "1-2", "--device", "cpu", "--jobs", "2"),
-    *("--envs", "4", "--save-interval", "1", "--phase", "walk=3"),
+    *("--envs", "4", "--save-interval", "1", "--phase", "walk=6"),
 )
+"""So many iterations that neither is over when the other one, which may start seconds later on a
+busy machine, has its first checkpoint."""
 
 
 def test_interrupted_trainings_go_on_and_a_broken_one_is_named(
