@@ -220,8 +220,8 @@ def set_decimation_spread(cfg: ManagerBasedRlEnvCfg, steps: int) -> None:
     """
     if steps >= cfg.decimation:
         raise PronkError(
-            f"{steps} physics steps less are more than a policy step of {cfg.decimation} has to "
-            f"spare; expected {cfg.decimation - 1} at most."
+            f"a policy step of {cfg.decimation} physics steps cannot have {steps} fewer; expected "
+            f"{cfg.decimation - 1} at most."
         )
     if steps == 0:
         if decimation_spread(cfg) > 0:
