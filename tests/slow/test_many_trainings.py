@@ -52,6 +52,7 @@ def test_interrupted_trainings_go_on_and_a_broken_one_is_named(
     assert again.exit_code == 2, again.output
     assert "naive, seed 2: failed" in again.output
     assert "not a checkpoint" in again.output
+    assert len(second.read()["sessions"]) == 1, "it did not begin"
     record = first.read()
     assert record["finished"]
     assert record["settings"]["seed"] == 1

@@ -91,6 +91,10 @@ def run_training(
     if record["finished"]:
         return record
     _check_processes(folder, settings, processes)
+    last_checkpoint = checkpoint.latest_checkpoint(folder.path)
+    if last_checkpoint is not None:
+        # A damaged one is refused before robots are built and anything is written.
+        checkpoint.read_checkpoint(last_checkpoint)
     report("building the robots and compiling kernels")
     return _train_session(folder, settings, hosts, processes)
 
