@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import statistics
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -158,20 +161,24 @@ def test_cuda_graphs_give_the_same_step(
     """Against steps that are only compiled, and steps as they are.
 
     Physics rounds otherwise in each run on a GPU, which grows where feet slip: some robots differ,
-    most do not, and means over robots differ by less than robots scatter. Episodes end in every
-    step: in one in which a robot falls in one run alone, that run alone would draw a new start, and
-    all noise after it would differ.
+    most do not, and means over robots differ by less than robots scatter, as do means of the log
+    over the steps. Episodes end in every step: in one in which a robot falls in one run alone, that
+    run alone would draw a new start, and all noise after it would differ.
     """
     size: dict[str, Any] = {"robots": MANY, "ends_in_every_step": True}
     recorded_steps = rollout(device="cuda:0", records=True, **size)
     monkeypatch.setattr(compiled.RecordedFunction, "graph_type", NoGraph)
     plain_steps = rollout(device="cuda:0", records=is_compiled, **size)
+    logs: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for step, (before, after) in enumerate(zip(plain_steps, recorded_steps, strict=True)):
         if is_compiled:
             assert before.keys() == after.keys()
         for name, measured in before.items():
             if measured.ndim == 0:
-                continue  # a mean over the few robots whose episodes end; one that slips changes it
+                # A mean over the few robots whose episodes end; one that slips changes it.
+                if name in after:
+                    logs[name].append((float(measured), float(after[name])))
+                continue
             plain = measured.double()
             recorded = after[name].double()
             tolerance = 1e-3 * (1.0 + plain.abs().mean())
@@ -179,6 +186,12 @@ def test_cuda_graphs_give_the_same_step(
             difference = (recorded.mean(dim=0) - plain.mean(dim=0)).abs().max()
             tolerance += 5.0 * standard_error(plain, recorded)
             assert difference <= tolerance, (step, name)
+    assert logs
+    for name, pairs in logs.items():
+        differences = [recorded - plain for plain, recorded in pairs]
+        mean_size = statistics.mean(abs(plain) for plain, _ in pairs)
+        error = statistics.stdev(differences) / math.sqrt(len(differences))
+        assert abs(statistics.mean(differences)) <= 0.02 * mean_size + 5.0 * error + 1e-6, name
     assert max(float(step["lift-offs"].max()) for step in plain_steps) >= 1.0
 
 

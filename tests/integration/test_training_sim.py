@@ -358,6 +358,20 @@ def test_impossible_numbers_that_a_policy_records_are_refused(
         adapter.load_evaluated_policy(tmp_path / "policy.onnx", "cpu")
 
 
+def test_numbers_that_the_task_of_the_robot_cannot_have_name_the_policy(
+    trained: tuple[Path, Any], tmp_path: Path
+) -> None:
+    """A policy step of four physics steps cannot have seven fewer."""
+    pytest.importorskip("onnxruntime")
+    gains = training_gains("naive", ROBOT)
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    contract = contract_for(cfg, jump=True, provenance={"decimation_spread": 7.0})
+    export_policy(trained[1], contract, tmp_path / "policy.onnx")
+    policy = adapter.load_evaluated_policy(tmp_path / "policy.onnx", "cpu")
+    with pytest.raises(ArtefactError, match=r"policy\.onnx.*4 physics steps.*3 at most"):
+        adapter.run_evaluation(policy, gains, SHORT, device="cpu")
+
+
 def test_scales_that_differ_by_joint_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     gains = training_gains("naive", ROBOT)

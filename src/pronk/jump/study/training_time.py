@@ -79,6 +79,7 @@ class _Running:
     steps: float
     """Steps of 4,096 robots that are to be taken."""
     is_compiled: bool
+    """Whether it is trained with `--compile`."""
 
     def remaining_s(self, count: int) -> float:
         """Return the time until it begins to step, or else until it is over [s].

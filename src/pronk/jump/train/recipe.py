@@ -80,8 +80,8 @@ SOFTEST_HZ = 10.0
 25 N m/rad, and does not hold the robot up [Hz]."""
 TASK_NUMBERS = (ACTION_SCALE, CONTACT_DAMPING, DECIMATION_SPREAD, ROTOR_FREQUENCY)
 """All entries of `task`."""
-EARLIER_DEFAULTS = {CONTACT_DAMPING: 1.0, ROTOR_FREQUENCY: 0.0}
-"""What runs and policies of before 29 November 2026 were trained with where they record nothing."""
+EARLIER_DEFAULTS = {CONTACT_DAMPING: 1.0, DECIMATION_SPREAD: 2.0, ROTOR_FREQUENCY: 0.0}
+"""What runs and policies of before 30 November 2026 were trained with where they record nothing."""
 
 _Value = float | dict[str, float | tuple[float, float]]
 """A number, or one by phase: a number, or its values at the beginning and at the end."""

@@ -52,9 +52,9 @@ EPISODE_S = 20.0
 """Longest episode at the nominal policy rate [s]."""
 DELAY_STEPS = 1
 """Half-width of the command delay about the matched one [physics steps]. Not in the paper."""
-DECIMATION_SPREAD = 2
-"""Physics steps that a policy step has more or less at most (D1, A1); fewer where it would be left
-without one."""
+DECIMATION_STEPS = 2
+"""Half-width of the number of physics steps of a policy step about the nominal one (D1, A1); less
+where a policy step would be left without one."""
 LEAST_CONTACT_DAMPING = 0.4
 """Smallest share of the damping of the feet on the ground that is drawn for a robot. Not in the
 paper: policies of one contact alone walked 0.04 to 0.30 m/s too fast or too slow at 2 m/s on the
@@ -141,7 +141,7 @@ def jump_env_cfg(
         ),
     )
     set_contact_damping(cfg, LEAST_CONTACT_DAMPING)
-    set_decimation_spread(cfg, min(DECIMATION_SPREAD, robot.decimation - 1))
+    set_decimation_spread(cfg, min(DECIMATION_STEPS, robot.decimation - 1))
     return cfg
 
 

@@ -108,7 +108,8 @@ def run_evaluation(
         progress: Called with the name of a stage and the fraction of it that is over.
 
     Raises:
-        PronkError: The robots need more memory than is free.
+        PronkError: The robots need more memory than is free, or the policy records numbers of a
+            task that the robot's cannot have.
     """
     progress("building", 0.0)
     task = load_task(policy.robot)
@@ -122,10 +123,12 @@ def run_evaluation(
     )
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
-    set_contact_damping(cfg, policy.contact_damping)
-    if policy.decimation_spread is not None:
+    try:
+        set_contact_damping(cfg, policy.contact_damping)
         set_decimation_spread(cfg, policy.decimation_spread)
-    set_rotor_frequency(cfg, policy.rotor_frequency)
+        set_rotor_frequency(cfg, policy.rotor_frequency)
+    except PronkError as error:
+        raise ArtefactError(f"{policy.about['file']}: {error}") from None
     set_action_scale(cfg, policy)
     action: Any = cfg.actions[ACTION]
     _check_memory(plan, cfg.sim.mujoco.timestep, device)
@@ -210,8 +213,8 @@ class EvaluatedPolicy:
     contact_damping: float = 1.0
     """Smallest share of the damping of the feet on the ground that was drawn; 1: none was drawn, as
     of policies of which nothing is recorded."""
-    decimation_spread: int | None = None
-    """How many physics steps a policy step had more or less at most; None for that of the task."""
+    decimation_spread: int = 2
+    """How many physics steps a policy step had more or less at most, likewise."""
     rotor_frequency: float = 0.0
     """Lowest natural frequency of the rotors that its joints were measured on [Hz]; 0: they were
     measured on the links, likewise."""
@@ -269,7 +272,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         draws=_draws_of(settings),
         action_scale=task_numbers.get(ACTION_SCALE),
         contact_damping=task_numbers[CONTACT_DAMPING],
-        decimation_spread=_decimation_spread(task_numbers),
+        decimation_spread=int(task_numbers[DECIMATION_SPREAD]),
         rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
@@ -321,7 +324,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         draws=_draws_of(contract.provenance),
         action_scale=_common_scale(contract, path),
         contact_damping=task_numbers[CONTACT_DAMPING],
-        decimation_spread=_decimation_spread(task_numbers),
+        decimation_spread=int(task_numbers[DECIMATION_SPREAD]),
         rotor_frequency=task_numbers[ROTOR_FREQUENCY],
     )
 
@@ -348,12 +351,6 @@ def _task_numbers(recorded: Mapping[str, Any], source: Path) -> dict[str, float]
             raise ArtefactError(f"{source}: {error} Train again.") from None
         numbers[name] = value
     return numbers
-
-
-def _decimation_spread(numbers: Mapping[str, float]) -> int | None:
-    """Return the physics steps that a policy step had more or less; None if not recorded."""
-    spread = numbers.get(DECIMATION_SPREAD)
-    return None if spread is None else int(spread)
 
 
 def _common_scale(contract: Contract, path: Path) -> float:
