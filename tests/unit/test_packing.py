@@ -10,7 +10,13 @@ import pytest
 
 from pronk.jump.study.local import LocalExecutor
 from pronk.jump.study.mps import LOG, PIPE, mps_daemon
-from pronk.jump.study.packing import GpuRates, free_memory_mib, packing_text
+from pronk.jump.study.packing import (
+    GpuRates,
+    RateReading,
+    free_memory_mib,
+    packing_text,
+    settled_rates,
+)
 from pronk.jump.study.schedule import time_left
 from study_cases import export_task, study_root
 
@@ -183,3 +189,19 @@ def test_the_rate_that_is_told_is_the_mean_of_what_was_measured() -> None:
     for rate in (80_000.0, 90_000.0, 100_000.0):
         rates.note([rate] * 4)
     assert "90,000 steps/s each, 360,000 together" in packing_text(rates)
+
+
+def test_rates_count_while_the_same_trainings_step() -> None:
+    def reading(written_at: float, rate: float, *, is_last: bool = False) -> RateReading:
+        return RateReading(written_at=written_at, steps_per_second=rate, is_last=is_last)
+
+    both = [reading(130.0, 120_000.0), reading(131.0, 124_000.0)]
+    assert settled_rates(both, same_since=100.0) == [120_000.0, 124_000.0]
+    # One of them began a moment ago.
+    assert not settled_rates(both, same_since=129.0)
+    # One of them writes its policy, and the other one has more of the GPU than it had beside it.
+    over = [reading(130.0, 120_000.0, is_last=True), reading(131.0, 160_000.0)]
+    assert not settled_rates(over, same_since=100.0)
+    # The other one ended while the iteration ran that this rate is of.
+    assert not settled_rates([reading(131.0, 140_000.0)], same_since=130.5)
+    assert settled_rates([reading(140.0, 164_000.0)], same_since=130.5) == [164_000.0]

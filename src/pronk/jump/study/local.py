@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import IO
 
 from pronk.jump.study.mps import mps_daemon
-from pronk.jump.study.packing import GpuRates, free_memory_mib, packing_text
+from pronk.jump.study.packing import (
+    GpuRates,
+    RateReading,
+    free_memory_mib,
+    packing_text,
+    settled_rates,
+)
 from pronk.jump.study.schedule import TaskEnd, end_of_log
 from pronk.jump.study.tasks import StudyTask, program, program_environment
 from pronk.jump.train.training_progress import PROGRESS_FILE, read_progress
@@ -21,9 +27,6 @@ from pronk.processes import exit_words
 
 CHECKPOINT_S = 120.0
 """Longest time that a training has to write its checkpoint when it is asked to end [s]."""
-SETTLE_S = 8.0
-"""Time from which all trainings on a GPU step until their rates count [s]: the first iterations are
-slower."""
 MEASURE_S = 5.0
 """Time between two looks at the rates of trainings when none waits [s]."""
 _MEMORY_S = 2.0
@@ -49,6 +52,8 @@ class _Gpu:
     free_at_first_mib: float | None = None
     """Memory that was free before the first training [MiB]; None if it cannot be read."""
     trainings: list[_Process] = field(default_factory=list)
+    last_ended_at: float = 0.0
+    """Unix time at which a training there ended last [s]; 0 if none has."""
 
 
 class LocalExecutor:
@@ -114,10 +119,10 @@ class LocalExecutor:
     def _measured(self, gpu: _Gpu) -> bool:
         """Note rates and memory of a GPU if all trainings there have shown them; say whether so.
 
-        Rates count from `SETTLE_S` after all trainings of the GPU have begun to step.
+        Rates count a while after the last training began to step there and the last one ended.
         """
-        rates = []
-        written_at = []
+        readings = []
+        same_since = gpu.last_ended_at
         for training in gpu.trainings:
             folder = self.root / training.task.folder
             moment = _progress_time(folder)
@@ -126,12 +131,17 @@ class LocalExecutor:
                 return False
             if training.stepping_since is None:
                 training.stepping_since = moment
-            rates.append(progress.steps_per_second)
-            written_at.append(moment)
-        if not rates:
+            same_since = max(same_since, training.stepping_since)
+            reading = RateReading(
+                written_at=moment,
+                steps_per_second=progress.steps_per_second,
+                is_last=progress.iteration >= progress.iterations,
+            )
+            readings.append(reading)
+        if not readings:
             return True
-        all_step_since = max(training.stepping_since or 0.0 for training in gpu.trainings)
-        if min(written_at) < all_step_since + SETTLE_S:
+        rates = settled_rates(readings, same_since)
+        if not rates:
             return False
         self.rates.note(rates)
         free = self._free_memory(gpu.name)
@@ -226,6 +236,7 @@ class LocalExecutor:
         for gpu in self._gpus:
             if process in gpu.trainings:
                 gpu.trainings.remove(process)
+                gpu.last_ended_at = time.time()
 
     def stop(self) -> None:
         """End all tasks, trainings at a checkpoint, and wait until they have ended."""

@@ -18,6 +18,39 @@ LEAST_GAIN = 0.03
 MEMORY_MARGIN = 1.15
 """Memory that has to be free for another training, relative to what one has used [1]. The memory of
 a training grows a little when the phase of jumps begins."""
+SETTLE_S = 8.0
+"""Time for which the same trainings have to step side by side until their rates count [s]: the
+first iterations are slower, and a rate is that of a whole iteration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateReading:
+    """What a training has written about its rate."""
+
+    written_at: float
+    """Unix time at which it was written [s]."""
+    steps_per_second: float
+    """Rate of the iteration before [steps/s]."""
+    is_last: bool
+    """Whether that was the last iteration, so that the training steps no more."""
+
+
+def settled_rates(readings: Sequence[RateReading], same_since: float) -> list[float]:
+    """Return the rates of trainings side by side [steps/s]; empty unless all of them count.
+
+    A training that steps no more leaves its share of the GPU to the others, and a rate that was
+    written before the last training ended was reached beside that one.
+
+    Args:
+        readings: What each training of a GPU has written last.
+        same_since: Unix time from which these trainings, and no others, have stepped there [s].
+    """
+    rates = []
+    for reading in readings:
+        if reading.is_last or reading.written_at < same_since + SETTLE_S:
+            return []
+        rates.append(reading.steps_per_second)
+    return rates
 
 
 @dataclass
