@@ -192,8 +192,15 @@ def test_the_rate_that_is_told_is_the_mean_of_what_was_measured() -> None:
 
 
 def test_rates_count_while_the_same_trainings_step() -> None:
-    def reading(written_at: float, rate: float, *, is_last: bool = False) -> RateReading:
-        return RateReading(written_at=written_at, steps_per_second=rate, is_last=is_last)
+    def reading(
+        written_at: float, rate: float, *, iteration_s: float = 1.0, is_last: bool = False
+    ) -> RateReading:
+        return RateReading(
+            written_at=written_at,
+            steps_per_second=rate,
+            iteration_s=iteration_s,
+            is_last=is_last,
+        )
 
     both = [reading(130.0, 120_000.0), reading(131.0, 124_000.0)]
     assert settled_rates(both, same_since=100.0) == [120_000.0, 124_000.0]
@@ -204,4 +211,5 @@ def test_rates_count_while_the_same_trainings_step() -> None:
     assert not settled_rates(over, same_since=100.0)
     # The other one ended while the iteration ran that this rate is of.
     assert not settled_rates([reading(131.0, 140_000.0)], same_since=130.5)
+    assert not settled_rates([reading(140.0, 140_000.0, iteration_s=12.0)], same_since=130.5)
     assert settled_rates([reading(140.0, 164_000.0)], same_since=130.5) == [164_000.0]

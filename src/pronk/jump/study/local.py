@@ -132,10 +132,12 @@ class LocalExecutor:
             if training.stepping_since is None:
                 training.stepping_since = moment
             same_since = max(same_since, training.stepping_since)
+            iterations_left = progress.iterations - progress.iteration
             reading = RateReading(
                 written_at=moment,
                 steps_per_second=progress.steps_per_second,
-                is_last=progress.iteration >= progress.iterations,
+                iteration_s=progress.seconds_left / max(iterations_left, 1),
+                is_last=iterations_left <= 0,
             )
             readings.append(reading)
         if not readings:

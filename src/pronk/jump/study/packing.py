@@ -20,7 +20,7 @@ MEMORY_MARGIN = 1.15
 a training grows a little when the phase of jumps begins."""
 SETTLE_S = 8.0
 """Time for which the same trainings have to step side by side until their rates count [s]: the
-first iterations are slower, and a rate is that of a whole iteration."""
+first iterations are slower."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,9 @@ class RateReading:
     written_at: float
     """Unix time at which it was written [s]."""
     steps_per_second: float
-    """Rate of the iteration before [steps/s]."""
+    """Rate of the iteration that had just ended [steps/s]."""
+    iteration_s: float
+    """Duration of that iteration [s]."""
     is_last: bool
     """Whether that was the last iteration, so that the training steps no more."""
 
@@ -38,8 +40,8 @@ class RateReading:
 def settled_rates(readings: Sequence[RateReading], same_since: float) -> list[float]:
     """Return the rates of trainings side by side [steps/s]; empty unless all of them count.
 
-    A training that steps no more leaves its share of the GPU to the others, and a rate that was
-    written before the last training ended was reached beside that one.
+    A training that steps no more leaves its share of the GPU to the others, and the rate of an
+    iteration that began before another training ended was reached beside that one.
 
     Args:
         readings: What each training of a GPU has written last.
@@ -47,7 +49,8 @@ def settled_rates(readings: Sequence[RateReading], same_since: float) -> list[fl
     """
     rates = []
     for reading in readings:
-        if reading.is_last or reading.written_at < same_since + SETTLE_S:
+        is_early = reading.written_at < same_since + max(SETTLE_S, reading.iteration_s)
+        if reading.is_last or is_early:
             return []
         rates.append(reading.steps_per_second)
     return rates
