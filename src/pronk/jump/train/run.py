@@ -91,10 +91,6 @@ def run_training(
     if record["finished"]:
         return record
     _check_processes(folder, settings, processes)
-    last_checkpoint = checkpoint.latest_checkpoint(folder.path)
-    if last_checkpoint is not None:
-        # A damaged one is refused before robots are built and anything is written.
-        checkpoint.read_checkpoint(last_checkpoint)
     report("building the robots and compiling kernels")
     return _train_session(folder, settings, hosts, processes)
 
@@ -122,7 +118,10 @@ def check_training(
 
 
 def _check_processes(folder: RunFolder, settings: TrainSettings, processes: int) -> None:
-    """Refuse to go on with another number of processes, and so of robots, than the run has."""
+    """Refuse to go on with another number of processes, and so of robots, than the run has.
+
+    A damaged checkpoint is refused here as well, before robots are built and anything is written.
+    """
     last_checkpoint = checkpoint.latest_checkpoint(folder.path)
     if last_checkpoint is None:
         return
