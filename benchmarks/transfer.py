@@ -32,7 +32,11 @@ from pronk.jump.train.gains import TrainingGains, training_gains
 from pronk.jump.train.mdp import actions
 from pronk.jump.train.phases import TASKS
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import DELAY_STEPS
+from pronk.jump.train.tasks.jump_env_cfg import (
+    DELAY_STEPS,
+    decimation_spread,
+    set_decimation_spread,
+)
 from pronk.jump.trial.training_sim import adapter
 from pronk.jump.trial.training_sim.evaluation import JUMPS, WALKS, Evaluation, EvaluationPlan
 from pronk.jump.trial.training_sim.run import evaluate_policy
@@ -96,10 +100,10 @@ def environment(
         law=DriveLaw(),
     )
     cfg = task.env_cfg(fine, gains, iterations=TASKS["all"], seed=plan.seed)
-    cfg = adapter.evaluation_cfg(cfg, plan, "noise")
-    adapter.set_action_scale(cfg, subject)
+    adapter.set_task_numbers(cfg, subject)
     # What is drawn in physics steps of training.
-    cfg.events["decimation"].params["added"] = (-2 * parts, 2 * parts)
+    set_decimation_spread(cfg, parts * decimation_spread(cfg))
+    cfg = adapter.evaluation_cfg(cfg, plan, "noise")
     action: Any = cfg.actions[actions.NAME]
     middle = action.delay_steps[1] - DELAY_STEPS
     action.delay_steps = (max(0, middle - parts * DELAY_STEPS), middle + parts * DELAY_STEPS)

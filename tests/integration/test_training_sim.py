@@ -35,6 +35,7 @@ from pronk.jump.trial.protocol import Case
 from pronk.jump.trial.training_sim import adapter
 from pronk.jump.trial.training_sim.evaluation import NEVER, EvaluationPlan
 from pronk.jump.trial.training_sim.run import TERM, evaluate_policy
+from pronk.policy.contract import Contract
 from pronk.policy.script import STILL, Script
 from pronk.robots import load_robot
 
@@ -249,19 +250,23 @@ def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> N
             adapter.load_evaluated_policy(tmp_path / name, "cpu")
 
 
+def naive_contract(provenance: dict[str, Any]) -> Contract:
+    """Return the contract of a policy with jump input, trained with the nominal gains."""
+    gains = training_gains("naive", ROBOT)
+    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
+    return contract_for(cfg, jump=True, provenance=provenance)
+
+
 def test_an_exported_policy_does_what_its_checkpoint_does(
     trained: tuple[Path, Any], tmp_path: Path
 ) -> None:
     pytest.importorskip("onnxruntime")
-    gains = training_gains("naive", ROBOT)
-    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
-    contract = contract_for(cfg, jump=True, provenance={})
     path = tmp_path / "policy.onnx"
-    export_policy(trained[1], contract, path)
+    export_policy(trained[1], naive_contract({}), path)
     exported = adapter.load_evaluated_policy(path, "cpu")
     original = adapter.load_evaluated_policy(trained[0], "cpu")
     assert exported.jump
-    assert exported.knows(gains)
+    assert exported.knows(training_gains("naive", ROBOT))
     # More robots than cores, fewer robots than cores, each with its own output.
     for count in (33, 1):
         for _ in range(2):
@@ -329,8 +334,7 @@ def test_a_policy_is_evaluated_with_the_actions_contacts_and_rotors_of_its_recip
     plan = replace(SHORT, robots=1, walk_s=0.9, jumps=())
     for path in (folder.path, tmp_path / "policy.onnx"):
         policy = adapter.load_evaluated_policy(path, "cpu")
-        assert (policy.action_scale, policy.contact_damping) == (0.42, 0.5)
-        assert (policy.decimation_spread, policy.rotor_frequency) == (1, 40.0)
+        assert policy.task_numbers == {"action_scale": 0.42, **drawn}
     assert adapter.run_evaluation(policy, gains, plan, device="cpu").about["action_scale"] == 0.42
     plain = adapter.load_evaluated_policy(trained[0], "cpu")
     evaluation = adapter.run_evaluation(plain, gains, plan, device="cpu")
@@ -350,12 +354,10 @@ def test_impossible_numbers_that_a_policy_records_are_refused(
     trained: tuple[Path, Any], tmp_path: Path, name: str, value: object
 ) -> None:
     pytest.importorskip("onnxruntime")
-    gains = training_gains("naive", ROBOT)
-    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
-    contract = contract_for(cfg, jump=True, provenance={name: value})
-    export_policy(trained[1], contract, tmp_path / "policy.onnx")
+    path = tmp_path / "policy.onnx"
+    export_policy(trained[1], naive_contract({name: value}), path)
     with pytest.raises(ArtefactError, match=f"policy.onnx.*{name}.*{value}"):
-        adapter.load_evaluated_policy(tmp_path / "policy.onnx", "cpu")
+        adapter.load_evaluated_policy(path, "cpu")
 
 
 def test_numbers_that_the_task_of_the_robot_cannot_have_name_the_policy(
@@ -363,20 +365,16 @@ def test_numbers_that_the_task_of_the_robot_cannot_have_name_the_policy(
 ) -> None:
     """A policy step of four physics steps cannot have seven fewer."""
     pytest.importorskip("onnxruntime")
-    gains = training_gains("naive", ROBOT)
-    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
-    contract = contract_for(cfg, jump=True, provenance={"decimation_spread": 7.0})
-    export_policy(trained[1], contract, tmp_path / "policy.onnx")
-    policy = adapter.load_evaluated_policy(tmp_path / "policy.onnx", "cpu")
+    path = tmp_path / "policy.onnx"
+    export_policy(trained[1], naive_contract({"decimation_spread": 7.0}), path)
+    policy = adapter.load_evaluated_policy(path, "cpu")
     with pytest.raises(ArtefactError, match=r"policy\.onnx.*4 physics steps.*3 at most"):
-        adapter.run_evaluation(policy, gains, SHORT, device="cpu")
+        adapter.run_evaluation(policy, training_gains("naive", ROBOT), SHORT, device="cpu")
 
 
 def test_scales_that_differ_by_joint_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
-    gains = training_gains("naive", ROBOT)
-    cfg = load_task("mini_cheetah").env_cfg(ROBOT, gains, iterations=TASKS["all"])
-    contract = contract_for(cfg, jump=True, provenance={})
+    contract = naive_contract({})
     scales = (0.3, *contract.action_scale[1:])
     path = tmp_path / "policy.onnx"
     export_policy(trained[1], msgspec.structs.replace(contract, action_scale=scales), path)

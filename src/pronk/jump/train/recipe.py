@@ -429,15 +429,6 @@ def _set_angle_vertical(cfg: ManagerBasedRlEnvCfg, recipe: Recipe, vertical: flo
 
 def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
     """Change the numbers of the task."""
-    from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
-    from pronk.jump.train.tasks.jump_env_cfg import (
-        set_contact_damping,
-        set_decimation_spread,
-        set_rotor_frequency,
-    )
-
-    action = cfg.actions[NAME]
-    assert isinstance(action, DelayedJointPositionActionCfg)
     for name, value in recipe.task.items():
         source = recipe.source_of("task", name)
         try:
@@ -445,16 +436,39 @@ def _change_task(cfg: ManagerBasedRlEnvCfg, recipe: Recipe) -> None:
         except PronkError as error:
             raise ArtefactError(f"{source}: task: {error}") from None
         try:
-            if name == ACTION_SCALE:
-                action.scale = value
-            elif name == CONTACT_DAMPING:
-                set_contact_damping(cfg, value)
-            elif name == DECIMATION_SPREAD:
-                set_decimation_spread(cfg, int(value))
-            else:
-                set_rotor_frequency(cfg, value)
+            set_task_number(cfg, name, value)
         except PronkError as error:
             raise ArtefactError(f"{source}: task: {name}: {error}") from None
+
+
+def set_task_number(cfg: ManagerBasedRlEnvCfg, name: str, value: float) -> None:
+    """Change one of the `TASK_NUMBERS` of the configuration of an environment.
+
+    Args:
+        cfg: The configuration, which is changed.
+        name: Name of the number.
+        value: The number, which `check_task_number` accepts.
+
+    Raises:
+        PronkError: The task of this robot cannot have it.
+    """
+    from pronk.jump.train.mdp.actions import NAME, DelayedJointPositionActionCfg
+    from pronk.jump.train.tasks.jump_env_cfg import (
+        set_contact_damping,
+        set_decimation_spread,
+        set_rotor_frequency,
+    )
+
+    if name == ACTION_SCALE:
+        action = cfg.actions[NAME]
+        assert isinstance(action, DelayedJointPositionActionCfg)
+        action.scale = value
+    elif name == CONTACT_DAMPING:
+        set_contact_damping(cfg, value)
+    elif name == DECIMATION_SPREAD:
+        set_decimation_spread(cfg, int(value))
+    else:
+        set_rotor_frequency(cfg, value)
 
 
 def task_numbers(cfg: ManagerBasedRlEnvCfg) -> dict[str, float]:

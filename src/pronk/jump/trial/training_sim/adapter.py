@@ -34,25 +34,17 @@ from pronk.jump.train.phases import TASKS
 from pronk.jump.train.provenance import RunFolder
 from pronk.jump.train.recipe import (
     ACTION_SCALE,
-    CONTACT_DAMPING,
-    DECIMATION_SPREAD,
     EARLIER_DEFAULTS,
-    ROTOR_FREQUENCY,
     TASK_NUMBERS,
     check_task_number,
     recorded_task_numbers,
+    set_task_number,
 )
 from pronk.jump.train.rl.checkpoint import read_checkpoint, uses_jump_input
 from pronk.jump.train.rl.networks import EstimatorActor
 from pronk.jump.train.settings import DrawSettings
 from pronk.jump.train.tasks import load_task
-from pronk.jump.train.tasks.jump_env_cfg import (
-    draw_weak_drives,
-    set_contact_damping,
-    set_decimation_spread,
-    set_rotor_frequency,
-    without_randomization,
-)
+from pronk.jump.train.tasks.jump_env_cfg import draw_weak_drives, without_randomization
 from pronk.jump.train.tasks.jump_rl_cfg import jump_rl_cfg
 from pronk.jump.train.versions import package_versions
 from pronk.jump.trial.training_sim.evaluation import Evaluation, EvaluationPlan
@@ -123,13 +115,7 @@ def run_evaluation(
     )
     if draws.weakest_drive not in (None, 1.0):
         draw_weak_drives(cfg, draws.weakest_drive)
-    try:
-        set_contact_damping(cfg, policy.contact_damping)
-        set_decimation_spread(cfg, policy.decimation_spread)
-        set_rotor_frequency(cfg, policy.rotor_frequency)
-    except PronkError as error:
-        raise ArtefactError(f"{policy.about['file']}: {error}") from None
-    set_action_scale(cfg, policy)
+    set_task_numbers(cfg, policy)
     action: Any = cfg.actions[ACTION]
     _check_memory(plan, cfg.sim.mujoco.timestep, device)
     env = ManagerBasedRlEnv(cfg=evaluation_cfg(cfg, plan, randomization), device=device)
@@ -154,11 +140,17 @@ def run_evaluation(
     return replace(evaluation, about=about, before=before or {})
 
 
-def set_action_scale(cfg: ManagerBasedRlEnvCfg, policy: EvaluatedPolicy) -> None:
-    """Give an environment the scale of the actions that a policy was trained with."""
-    if policy.action_scale is not None:
-        action: Any = cfg.actions[ACTION]
-        action.scale = policy.action_scale
+def set_task_numbers(cfg: ManagerBasedRlEnvCfg, policy: EvaluatedPolicy) -> None:
+    """Give an environment the numbers of the task that a policy was trained with.
+
+    Raises:
+        ArtefactError: The task of the robot cannot have one of them.
+    """
+    for name, value in policy.task_numbers.items():
+        try:
+            set_task_number(cfg, name, value)
+        except PronkError as error:
+            raise ArtefactError(f"{policy.about['file']}: {name}: {error}") from None
 
 
 def _check_memory(plan: EvaluationPlan, dt: float, device: str) -> None:
@@ -208,16 +200,8 @@ class EvaluatedPolicy:
     """File, hash, and provenance."""
     draws: DrawSettings = field(default_factory=DrawSettings)
     """How it was trained to differ in its drives, as far as that is known."""
-    action_scale: float | None = None
-    """Change of a joint target with an action of 1 [rad]; None for that of the task."""
-    contact_damping: float = 1.0
-    """Smallest share of the damping of the feet on the ground that was drawn; 1: none was drawn, as
-    of policies of which nothing is recorded."""
-    decimation_spread: int = 2
-    """How many physics steps a policy step had more or less at most, likewise."""
-    rotor_frequency: float = 0.0
-    """Lowest natural frequency of the rotors that its joints were measured on [Hz]; 0: they were
-    measured on the links, likewise."""
+    task_numbers: Mapping[str, float]
+    """The `TASK_NUMBERS` that it was trained with, by name; what is missing is as in the task."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Return whether it was trained with these nominal gains."""
@@ -270,10 +254,7 @@ def load_evaluated_policy(path: Path, device: str, robot: str | None = None) -> 
         robot=robot or run.robot(settings.get("robot", "mini_cheetah")),
         about=about,
         draws=_draws_of(settings),
-        action_scale=task_numbers.get(ACTION_SCALE),
-        contact_damping=task_numbers[CONTACT_DAMPING],
-        decimation_spread=int(task_numbers[DECIMATION_SPREAD]),
-        rotor_frequency=task_numbers[ROTOR_FREQUENCY],
+        task_numbers=task_numbers,
     )
 
 
@@ -322,10 +303,7 @@ def _exported_policy(path: Path, device: str, robot: str | None) -> EvaluatedPol
         robot=robot,
         about=about,
         draws=_draws_of(contract.provenance),
-        action_scale=_common_scale(contract, path),
-        contact_damping=task_numbers[CONTACT_DAMPING],
-        decimation_spread=int(task_numbers[DECIMATION_SPREAD]),
-        rotor_frequency=task_numbers[ROTOR_FREQUENCY],
+        task_numbers={**task_numbers, ACTION_SCALE: _common_scale(contract, path)},
     )
 
 
